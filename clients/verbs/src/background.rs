@@ -1,5 +1,5 @@
-//! `scanhub background`: shows, resets, freezes, thaws, saves and loads the background model of a sensor. Files are
-//! handled here; the hub gets models only.
+//! `scanhub background`: shows, resets, freezes, thaws, saves and loads the background model of a sensor. The verb
+//! reads and writes the files; the hub receives only models.
 
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -68,15 +68,15 @@ pub enum ModelRequest {
 }
 
 impl BackgroundArgs {
-    /// Sends the request to the hub and writes a line to stdout. Reads the model to load before it installs handlers
-    /// for signals, because a flag would not end the read of a terminal.
+    /// Sends the request to the hub and writes a line to stdout. Reads the model to load before it installs signal
+    /// handlers, because a flag would not interrupt a read from a terminal.
     ///
     /// # Errors
     ///
     /// - The errors of [`saved_model`].
-    /// - [`Kind::Configuration`] if the hub refuses a model.
+    /// - [`Kind::Configuration`] if the hub rejects a model.
     /// - [`Kind::Output`] if a file exists or cannot be written.
-    /// - [`Kind::Failed`] if there is no model yet to be saved.
+    /// - [`Kind::Failed`] if there is no model to save yet.
     /// - The errors of [`ControlArgs::run`](crate::control::ControlArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let json = context.json;
@@ -134,7 +134,7 @@ impl BackgroundArgs {
     }
 }
 
-/// What is shown: a model, and when it was kept for the next hub.
+/// Model to print, with the time at which the hub saved it for its next run.
 #[derive(Serialize)]
 struct StoredModel<M> {
     #[serde(flatten)]
@@ -143,7 +143,7 @@ struct StoredModel<M> {
     kept_wall_ns: Option<u64>,
 }
 
-/// The time since 1970.
+/// Returns the time since 1970.
 fn wall() -> Duration {
     SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default()
 }
@@ -155,8 +155,8 @@ fn shown(sensor: &str, shown: Option<ResponseModel>) -> Result<ResponseModel, Fa
     })
 }
 
-/// Writes `model` to `file`, which may replace an existing file if `force`, and reports it to `printed`. Standard output as
-/// `file` is `printed` itself.
+/// Writes `model` to `file`, and reports that to `printed`. Replaces an existing file if `force` is set. If `file` is
+/// standard output, the model goes to `printed`.
 fn save(
     file: &Path,
     force: bool,
@@ -202,7 +202,7 @@ fn save(
     })
 }
 
-/// Class `saved`.
+/// JSON line of class `saved`.
 #[derive(Serialize)]
 struct SavedJson<'a> {
     class: &'static str,
@@ -213,10 +213,13 @@ struct SavedJson<'a> {
     count: u16,
 }
 
-/// The model for `sensor` in `file`, `-` is `input`. It has to be saved from that sensor unless `any_sensor`.
+/// Reads the model for `sensor` from `file`; `-` stands for `input`. The model must be saved from this sensor, unless
+/// `any_sensor` is set.
 ///
-/// [`Kind::Input`] with place and reason if it cannot be read or is no model, [`Kind::Configuration`] if it is another
-/// sensor's.
+/// # Errors
+///
+/// - [`Kind::Input`] with position and reason if the file cannot be read or is not a model.
+/// - [`Kind::Configuration`] if the model belongs to another sensor.
 pub fn saved_model(
     file: &Path,
     sensor: &str,
@@ -245,7 +248,8 @@ pub fn saved_model(
     Err(Failure::new(Kind::Configuration, message, "--any-sensor accepts it anyway"))
 }
 
-/// The file that is stdin or stdout.
+/// Name that stands for stdin or stdout.
 const STANDARD_STREAM: &str = "-";
-/// Far more bytes than a model of 401 beams has as text, and as it would be if people had laid it out.
+/// Maximum length of a model file in bytes. A model of 401 beams is far shorter, even if it is formatted with
+/// indentation.
 const MAX_FILE_LEN: u64 = 1 << 20;

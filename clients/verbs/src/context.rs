@@ -1,4 +1,4 @@
-//! The parts of the process that a verb uses: its output, the domain that the user named, and signals.
+//! Parts of the process that a verb uses: its output, the selected domain, and signals.
 
 use std::fs::File;
 use std::io::IsTerminal;
@@ -9,13 +9,13 @@ use std::sync::atomic::AtomicBool;
 use scanhub_schema::Failure;
 use scanhub_shm::{Domain, Environment};
 
-/// The parts of the process that a verb uses. The program creates one for the verb that it runs.
+/// Parts of the process that a verb uses. The program creates one context for the verb that it runs.
 pub struct Context {
     /// Whether to print one JSON object per line.
     pub json: bool,
-    /// The domain that the user named.
+    /// Domain that the user selected.
     pub domain: DomainOptions,
-    /// Standard output. It has no buffer, so each write is one line or one raw sample.
+    /// Standard output. It is not buffered, so each write is one line or one raw sample.
     pub out: File,
     /// Whether `out` is a terminal, where a line may be redrawn.
     pub is_terminal: bool,
@@ -43,7 +43,7 @@ impl Context {
 pub struct DomainOptions {
     /// Name of the domain.
     pub name: String,
-    /// Directory of the hub, if it is not at one of the usual locations.
+    /// Directory of the hub, if it is not in one of the usual locations.
     pub root: Option<PathBuf>,
 }
 
@@ -61,34 +61,35 @@ impl DomainOptions {
     ///
     /// # Errors
     ///
-    /// As for [`places`](Self::locations).
+    /// As for [`locations`](Self::locations).
     pub fn of_hub(&self) -> Result<Domain, Failure> {
         Domain::of_hub(&self.name, self.root.as_deref(), &Environment::of_process())
     }
 
-    /// Returns the domain in which a program publishes: the running one, otherwise that of a hub that starts now.
+    /// Returns the domain in which a program publishes: the running one, or otherwise the one of a hub that starts now.
     ///
     /// # Errors
     ///
-    /// As for [`places`](Self::locations).
+    /// As for [`locations`](Self::locations).
     pub fn of_publisher(&self) -> Result<Domain, Failure> {
         scanhub_shm::publisher_domain(&self.name, self.root.as_deref(), &Environment::of_process())
     }
 }
 
-/// Signals that a verb handles. Each function installs a handler that sets the returned flag; the signals do not end the process
-/// any more. It fails if a handler cannot be installed.
+/// Signals that a verb handles. Each function installs a handler that sets the returned flag, so the signals no longer
+/// end the process. It returns an error if a handler cannot be installed.
 pub trait Signals {
     /// Returns a flag for SIGINT and SIGTERM.
     fn stop(&self) -> Result<Arc<AtomicBool>, Failure>;
-    /// Returns a flag for all signals that ask a process to end, including those of a terminal that is closed. A verb uses it if
-    /// it must restore or finish something in any case.
+    /// Returns a flag for all signals that request a process to end, including the one of a closed terminal. For verbs
+    /// that must always restore or finish something.
     fn any_stop(&self) -> Result<Arc<AtomicBool>, Failure>;
     /// Returns a flag for SIGUSR1, which requests a report.
     fn report(&self) -> Result<Arc<AtomicBool>, Failure>;
 }
 
-/// One flag in place of the signals that end a process, for a program that runs a verb in a thread. It never requests a report.
+/// One flag for all signals that end a process, for a program that runs a verb in a thread. A report is never
+/// requested.
 impl Signals for Arc<AtomicBool> {
     fn stop(&self) -> Result<Arc<AtomicBool>, Failure> {
         Ok(self.clone())

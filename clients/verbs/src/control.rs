@@ -1,5 +1,5 @@
-//! `scanhub control`: asks the hub to pause a sensor, to resume its stream, or to restart the session with it. It ends
-//! when the link has accepted the request; `info` shows the progress.
+//! `scanhub control`: requests the hub to pause a sensor, to resume its stream, or to restart its session. The verb
+//! ends when the link has accepted the request; `info` shows the progress.
 
 use std::io::Write;
 

@@ -1,5 +1,5 @@
-//! Asks in a thread of its own which sensors the hub has: the answer takes milliseconds, a datagram only microseconds.
-//! Refuses to know which sensors are wanted.
+//! Search for the sensors of a hub, in a background thread, because a list takes milliseconds and a datagram only
+//! microseconds.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -9,39 +9,40 @@ use std::time::{Duration, Instant, SystemTime};
 use scanhub_schema::{Failure, PublisherKind, Topic};
 use scanhub_shm::Domain;
 
-/// The calls of the sensors of a hub that came.
+/// Lists of the sensors of the current hub.
 #[derive(Default)]
 pub struct Discovery {
-    /// When the hub came, and how often its sensors were called.
+    /// Time at which the hub appeared, and the number of lists since then.
     hub: Option<(Instant, usize)>,
-    /// The call that is under way, and how long after the hub it began.
+    /// Current list, and the age of the hub when it was started.
     task: Option<(BackgroundTask<Answer>, Duration)>,
-    /// They answered once.
+    /// Whether a list has succeeded or failed since the hub appeared. Later failures are ignored.
     has_reply: bool,
-    /// The last change of the services that the call under way includes, and that the last answer includes.
+    /// Time of the last change of the domain's services, for the current list and for the last complete list.
     task_change: Option<SystemTime>,
     reply_change: Option<SystemTime>,
 }
 
 type Answer = Result<Vec<(String, Topic)>, Failure>;
 
-/// What was answered.
+/// Result of a list.
 pub struct DiscoveryReply {
-    /// The sensors that have topics, sorted.
+    /// Names of the sensors that have topics, sorted.
     pub sensors: Vec<String>,
-    /// Who has made their topics.
+    /// Kinds of publisher that have created the topics of a sensor.
     publisher_kinds: Vec<(String, PublisherKind)>,
-    /// So long after the hub came it was asked.
+    /// Age of the hub when the list was started.
     pub age: Duration,
 }
 
-/// When the sensors of a hub that came are called: it makes their topics one after the other.
+/// Ages of a hub at which its sensors are listed. The hub creates its topics one after the other, so the first lists
+/// may be incomplete.
 const DISCOVERY_TIMES: [Duration; 4] =
     [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(5)];
-/// And so often from then on: a tracker, or a sensor of another machine, comes when it likes.
+/// Interval between later lists. A tracker or a remote sensor may appear at any time.
 const REPEAT_INTERVAL: Duration = Duration::from_secs(10);
 
-/// How long after the hub came it is called when it was called so often.
+/// Returns the age of the hub at which the next list is due after `calls` lists.
 fn due_after(calls: usize) -> Duration {
     let last = DISCOVERY_TIMES[DISCOVERY_TIMES.len() - 1];
     let more = u32::try_from((calls + 1).saturating_sub(DISCOVERY_TIMES.len())).unwrap_or(u32::MAX);
@@ -51,15 +52,16 @@ fn due_after(calls: usize) -> Duration {
         .unwrap_or_else(|| last.saturating_add(REPEAT_INTERVAL.saturating_mul(more)))
 }
 
-/// Directory of a domain that contains a file for each service, and its age from which on all its files are complete.
+/// Directory of a domain with one file for each service.
 const SERVICES_DIRECTORY: &str = "services";
+/// Time after which all files of a new service are complete.
 const COMPLETE_AFTER: Duration = Duration::from_secs(5);
 
-/// Every sixth list is made even if nothing has changed: a list lacks services that could not be opened, as without
-/// descriptors.
+/// Number of lists after which one is made even without a change. Services that could not be opened, for example
+/// because descriptors ran out, are missing in a list.
 const RELIST_PERIOD: usize = 6;
 
-/// So often an answer is looked for.
+/// Interval at which the caller polls for the result.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 impl DiscoveryReply {
@@ -71,35 +73,37 @@ impl DiscoveryReply {
         DiscoveryReply { sensors, publisher_kinds, age }
     }
 
-    /// Whether `sensor` has `topic`, now or when all its topics are made: a name has all topics of the maker of one.
+    /// Returns whether `sensor` has `topic` now or after all its topics are created. A publisher creates all topics of
+    /// its kind.
     pub fn may_have(&self, sensor: &str, topic: Topic) -> bool {
         self.publisher_kinds.iter().any(|(name, kind)| name == sensor && *kind == topic.publisher_kind())
     }
 }
 
 impl Discovery {
-    /// A hub came; answers about the one before are of no use.
+    /// Restarts the search for a new hub. Results about the previous hub are dropped.
     pub fn on_hub_started(&mut self, now: Instant) {
         *self = Discovery { hub: Some((now, 0)), ..Discovery::default() };
     }
 
-    /// The hub is gone: nobody waits for what it has.
+    /// Drops the current list, because the hub has exited.
     pub fn on_hub_ended(&mut self) {
         self.task = None;
     }
 
-    /// There was a hub.
+    /// Returns whether there was a hub.
     pub fn has_seen_hub(&self) -> bool {
         self.hub.is_some()
     }
 
-    /// Starts to list the sensors of the hub in `domain` if a list is due. Returns the last list, once, when it is complete.
-    /// While the services of the domain stay as they were at the last list, there is no new one. A list executes a million
-    /// instructions for each service. It was half of the work of a gateway.
+    /// Starts a list of the sensors of the hub in `domain` if one is due. Returns the result of a list once, when it is
+    /// complete. A list is skipped while the services of the domain are unchanged, because it executes a million
+    /// instructions for each service. Without that, it was half of a gateway's CPU time.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`](scanhub_schema::Kind) if no list succeeded yet. A later failure keeps the known sensors.
+    /// Returns [`Kind::Failed`](scanhub_schema::Kind) if no list has succeeded yet. A later failure keeps the known
+    /// sensors.
     pub fn poll(&mut self, domain: &Domain, now: Instant) -> Result<Option<DiscoveryReply>, Failure> {
         if let Some((task, age)) = &self.task {
             let Some(answer) = task.result() else { return Ok(None) };
@@ -116,7 +120,7 @@ impl Discovery {
         let age = now - *started;
         if age >= due_after(*calls) {
             let changed = last_change(domain);
-            // The first answers also tell callers that a sensor is missing.
+            // Callers also use the first lists to report a missing sensor.
             let may_skip = *calls > DISCOVERY_TIMES.len() && !calls.is_multiple_of(RELIST_PERIOD);
             if may_skip && changed.is_some() && changed == self.reply_change {
                 *calls += 1;
@@ -131,20 +135,21 @@ impl Discovery {
         Ok(None)
     }
 
-    /// After which time there may be an answer.
+    /// Returns the time after which to poll again; `None` if no list is running.
     pub fn time_left(&self) -> Option<Duration> {
         self.task.as_ref().map(|_| POLL_INTERVAL)
     }
 }
 
-/// Returns the time at which a service of `domain` was last created or removed. `None` if the time is unknown, or so
-/// recent that a service may still be incomplete, which a list does not include.
+/// Returns the time at which a service of `domain` was last created or removed. Returns `None` if the time is unknown,
+/// or so recent that a service may still be incomplete and missing from a list.
 fn last_change(domain: &Domain) -> Option<SystemTime> {
     let changed = std::fs::metadata(domain.root().join(SERVICES_DIRECTORY)).ok()?.modified().ok()?;
     changed.elapsed().is_ok_and(|age| age >= COMPLETE_AFTER).then_some(changed)
 }
 
-/// Slow work in a thread of its own, so that a sending thread waits only for samples. Dropped, it loses its result.
+/// Slow work in a separate thread, so that a sending thread waits only for samples. The result is discarded if this is
+/// dropped.
 #[derive(Debug)]
 pub struct BackgroundTask<T>(Receiver<T>);
 
@@ -152,7 +157,7 @@ pub struct BackgroundTask<T>(Receiver<T>);
 const STOP_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 impl<T: Send + 'static> BackgroundTask<T> {
-    /// Starts the work. Returns `None` if the system has no thread; try again later.
+    /// Starts the work. Returns `None` if no thread can be created; the caller tries again later.
     pub fn begin(work: impl FnOnce() -> T + Send + 'static) -> Option<BackgroundTask<T>> {
         let (done, result) = channel();
         let thread = thread::Builder::new().name("errand".into()).spawn(move || {
@@ -161,12 +166,12 @@ impl<T: Send + 'static> BackgroundTask<T> {
         thread.ok().map(|_| BackgroundTask(result))
     }
 
-    /// Returns the result once, after the work has ended.
+    /// Returns the result once the work has ended. Returns it only once.
     pub fn result(&self) -> Option<T> {
         self.0.try_recv().ok()
     }
 
-    /// Waits for the result, and returns it. Returns `None` if `stop` is set before.
+    /// Waits for the result, and returns it. Returns `None` if `stop` is set first.
     pub fn wait(&self, stop: &AtomicBool) -> Option<T> {
         while !stop.load(Ordering::Relaxed) {
             match self.0.recv_timeout(STOP_CHECK_INTERVAL) {
@@ -220,7 +225,7 @@ mod tests {
         assert_eq!([0, 1, 2].map(&mut lists_at), [true; 3]);
         let old = SystemTime::now() - Duration::from_secs(60);
         std::fs::File::open(&services).unwrap().set_modified(old).unwrap();
-        // The call at 36 s is the sixth.
+        // The list at 36 s is the sixth.
         assert_eq!([6, 16, 26, 36].map(&mut lists_at), [true, true, false, true]);
         std::fs::write(services.join("another"), "").unwrap();
         assert_eq!([46, 56].map(&mut lists_at), [true; 2], "a service may be incomplete");

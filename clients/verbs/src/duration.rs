@@ -6,7 +6,7 @@ use std::time::Duration;
 ///
 /// # Errors
 ///
-/// Returns a message for the user if `text` is not a duration, or longer than a year.
+/// Returns a message for the user if `text` is not a duration, or is longer than a year.
 pub fn parse(text: &str) -> Result<Duration, String> {
     let wrong = || format!("{text:?} is no duration: write it like 10s, 250ms or 5m");
     let unit = text.find(|c: char| c.is_ascii_alphabetic()).ok_or_else(wrong)?;
@@ -27,7 +27,7 @@ pub fn parse(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// Longest duration, a year. It can be added to any time without an overflow.
+/// Maximum duration: a year. It can be added to any time without an overflow.
 const MAX_DURATION: Duration = Duration::from_secs(365 * 24 * 3600);
 
 #[cfg(test)]

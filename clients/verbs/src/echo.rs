@@ -1,4 +1,4 @@
-//! `scanhub echo`: samples as text, JSON, CSV or bytes.
+//! `scanhub echo`: prints samples as text, JSON, CSV or bytes.
 
 use clap::Args;
 use scanhub_client::streams::Sample;
@@ -45,14 +45,15 @@ Examples:
 
 impl EchoArgs {
     /// Writes the samples of topics to stdout as they arrive. Notices go to stderr without `--json`. Ends at the
-    /// limits, by a signal, or when the reader has closed stdout.
+    /// limits, by a signal, or when the reader closes stdout.
     ///
     /// # Errors
     ///
-    /// - [`Kind::Usage`] if there is no such topic or the format does not go with the topics.
+    /// - [`Kind::Usage`] if a topic does not exist, or the format does not suit the topics.
     /// - [`Kind::NoTopic`] if a sensor does not exist; the message lists the sensors.
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
-    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run before its end.
+    /// - [`Kind::Timeout`] if no sample arrives in time, or fewer than `-n` within `--for`.
+    /// - [`Kind::Interrupted`] if a signal stops a bounded run before its end.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let Selection { named, of_all } = Selection::parse(&self.topics)?;
@@ -78,13 +79,13 @@ impl EchoArgs {
 /// Format of the samples.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Format {
-    /// A line of text; notices go to `notes`.
+    /// Lines of text; notices go to `notes`.
     Text,
-    /// A JSON object per line, also for notices and summary.
+    /// JSON lines, also for notices and summary.
     Json,
-    /// Columns, scans only; notices and summary go to `notes`.
+    /// Comma-separated values, for scans only; notices and summary go to `notes`.
     Csv(ScanColumns),
-    /// The bytes of the payloads, one after the other; notices and summary go to `notes`.
+    /// Bytes of the payloads without separators; notices and summary go to `notes`.
     Raw,
 }
 
@@ -92,7 +93,7 @@ struct Echo<'a> {
     format: Format,
     out: Output<'a>,
     notes: Output<'a>,
-    /// Number of beams in the last line of column names.
+    /// Number of beams when the column names were last written.
     beams: Option<usize>,
 }
 
@@ -128,7 +129,8 @@ impl Echo<'_> {
         }
     }
 
-    /// A line of columns; the names of the columns first, and again if their number changes.
+    /// Writes a line of values. Writes the column names before the first one, and again when the number of beams
+    /// changes.
     fn csv(&mut self, columns: ScanColumns, header: &Header, scan: &Scan) -> Result<(), ExitReason> {
         if self.beams != Some(scan.beams()) {
             self.beams = Some(scan.beams());

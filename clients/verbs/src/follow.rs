@@ -1,4 +1,4 @@
-//! Receives the topics of a verb: [`TopicRun`] returns what arrives, one [`Event`] after the other, until the bounds are reached.
+//! Subscription loop of the verbs: [`TopicRun`] returns each [`Event`] of its topics until the limits are reached.
 
 use std::collections::VecDeque;
 use std::rc::Rc;
@@ -17,7 +17,7 @@ pub use crate::receive_stats::ReceiveStats;
 use crate::receive_stats::{LineLossCounter, Loss};
 use crate::{json, text};
 
-/// Limits after which a verb ends by itself: arguments of every verb that follows topics.
+/// Limits at which a verb ends by itself. They are arguments of every verb that subscribes to topics.
 #[derive(clap::Args, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RunLimits {
     /// Stop after this number of samples
@@ -32,62 +32,63 @@ pub struct RunLimits {
 }
 
 impl RunLimits {
-    /// Returns whether the run ends by itself. Then it fails if there is no hub at its start, or if it is interrupted.
+    /// Returns whether the run ends by itself. Such a run fails if no hub runs at its start, or if it is interrupted.
     pub fn is_bounded(&self) -> bool {
         self.count.is_some() || self.run_for.is_some()
     }
 }
 
-/// An event of a run that follows topics.
+/// An event of a run.
 #[expect(
     clippy::large_enum_variant,
     reason = "nearly every event is a sample, which a box would only slow down"
 )]
 pub enum Event {
-    /// The run follows this topic from now on.
+    /// The run will subscribe to this topic when it is available.
     Added(Rc<TopicName>),
-    /// The hub has the topic. The run receives what is sent from now on.
+    /// The run has subscribed to the topic. It receives samples that are sent from now on.
     Subscribed(Rc<TopicName>),
-    /// A sample, or one that stands for a silence and does not count. Drop it before the next event.
+    /// A sample, or a stand-in for a silence, which does not count. Drop it before the next call.
     Sample(Rc<TopicName>, Sample, Arrival),
-    /// Something went wrong, or right again, in these topics. If there are none, nothing is known of the topics yet.
+    /// A problem of these topics, or its end. The list is empty if the run has no topics yet.
     Notice(Vec<Rc<TopicName>>, Notice),
-    /// The run cannot follow this topic for lack of memory, descriptors or places, and will try again
+    /// The run cannot subscribe to this topic because memory, descriptors or slots ran out. It will try again
     /// ([`TopicRun::tolerating_shortage`]).
     ResourceExhausted(Rc<TopicName>, Failure),
-    /// A status of a sensor ([`TopicRun::with_lines`]).
+    /// A status of a sensor, for a run [`with_lines`](TopicRun::with_lines).
     Line(String, Box<Status>),
-    /// Comes after each round of samples, and about ten times a second if there are none.
+    /// End of a round over all topics. There are about ten per second even without samples.
     Tick(Instant),
 }
 
 /// Time at which this process received a sample.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Arrival {
-    /// CLOCK_MONOTONIC, in ns.
+    /// Time on CLOCK_MONOTONIC in ns.
     pub monotonic_ns: u64,
-    /// The wall clock, in ns since 1970.
+    /// Wall clock time in ns since 1970.
     pub wall_ns: u64,
 }
 
-/// A problem of a stream, or its end.
+/// A problem of a topic, or its end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Notice {
-    /// Number of samples that were sent and not received.
+    /// Number of samples that were published but not received.
     Missed(u64),
-    /// The topic has been silent for longer than its samples are apart.
+    /// No sample has arrived for longer than the topic allows.
     Stale,
-    /// No hub runs in the domain when the verb starts, so the verb waits for one. The failure names the places that were
-    /// searched, and the hubs of other users.
+    /// No hub runs in the domain, so the verb waits for one. The failure names the searched locations and the hubs of
+    /// other users.
     NoHub(Failure),
-    /// The hub of the domain has ended.
+    /// The hub of the domain has exited.
     HubGone,
     /// A hub runs in the domain again.
     HubBack,
 }
 
 impl Notice {
-    /// Writes the notice for `names`, or for the domain if `names` is empty: lines of JSON to `out`, or text to `notes`.
+    /// Writes the notice for `names`, or for the domain if `names` is empty, as JSON lines to `out` or as text to
+    /// `notes`.
     pub fn report(
         &self,
         names: &[Rc<TopicName>],
@@ -102,19 +103,19 @@ impl Notice {
     }
 }
 
-/// The topics that a verb follows, in the first of several domains in which a hub runs.
+/// The topics to which a verb subscribes, in the first of several domains in which a hub runs.
 pub struct TopicRun<'a> {
     session: Session,
     topics: Vec<TopicState>,
-    /// The lines of the followed sensors, for a run with lines.
+    /// Lines of the sensors, for a run with lines.
     lines: Option<Vec<LineState>>,
-    /// Number of `topics` whose lines are followed.
+    /// Number of `topics` whose lines were added to `lines`.
     topics_with_line: usize,
-    /// Which topics of each sensor of the hub the run follows.
+    /// Topics to which the run subscribes for each sensor of the hub.
     all_sensor_topics: &'a [Topic],
     paused_topics: Vec<Topic>,
     discovery: Discovery,
-    /// Whether the run receives samples before it looks for the hub.
+    /// Whether the run receives samples before it checks the hub.
     receives_first: bool,
     tolerates_shortage: bool,
     limits: &'a RunLimits,
@@ -122,18 +123,18 @@ pub struct TopicRun<'a> {
     next_step: Step,
     round: Round,
     events: VecDeque<Event>,
-    /// Result of a run that has ended. `next` returns it after all `events`.
+    /// Result of a run that has ended. `next` returns it after the remaining `events`.
     end: Option<Result<(), ExitReason>>,
     started: Instant,
     last_sample: Instant,
     hub_started_at: Option<Instant>,
-    /// Time at which the run first saw a hub, and not only a listener.
+    /// Time at which the run first found a hub, not only a listener.
     hub_running_since: Option<Instant>,
-    /// When the run looked last which sensors there are.
+    /// Time of the last list of sensors.
     listed_at: Option<Instant>,
     is_waiting_reported: bool,
     received: u64,
-    /// End of the pause in which the run subscribes to no topic, because memory, descriptors or places are short.
+    /// End of the pause without new subscriptions after memory, descriptors or slots ran out.
     short_until: Option<Instant>,
 }
 
@@ -151,13 +152,13 @@ enum Step {
 /// Progress of a round over all topics.
 #[derive(Default)]
 struct Round {
-    /// The topic that has its turn.
+    /// Index of the current topic.
     topic: usize,
-    /// Number of samples that it gave.
+    /// Number of samples received from it in this round.
     taken: usize,
-    /// The round has subscribed to a topic.
+    /// Whether this round has subscribed to a topic.
     subscribed: bool,
-    /// Samples may be waiting after this round.
+    /// Whether samples may still wait after this round.
     more: bool,
 }
 
@@ -173,30 +174,31 @@ struct TopicState {
     name: Rc<TopicName>,
     source: Source,
     stats: ReceiveStats,
-    /// CLOCK_MONOTONIC since when samples are received as they are sent, in ns.
+    /// Time on CLOCK_MONOTONIC in ns since which samples are received as they are sent.
     since_ns: u64,
 }
 
-/// The serial line of a sensor. Bounds do not count its statuses, and the run does not fail without them.
+/// Serial line of a sensor. Its statuses do not count for the limits, and an error in receiving them does not end the
+/// run.
 struct LineState {
     sensor: String,
-    /// `None` if its statuses cannot be received.
+    /// Reader of the statuses; `None` after an error.
     source: Option<TopicReader<Status>>,
     losses: LineLossCounter,
 }
 
-/// Samples taken from one topic before the next one has its turn.
+/// Maximum number of samples from one topic before the next topic.
 const BATCH_SIZE: usize = 32;
-/// Time in which a listener announces the sensors of other machines. It announces them once a second.
+/// Time in which every listener has announced its remote sensors. It announces them once a second.
 const ANNOUNCEMENT_TIMEOUT: Duration = Duration::from_secs(3);
-/// Interval at which the run lists the sensors while one is missing. A look takes milliseconds, in which samples wait.
+/// Interval between lists of sensors while a sensor is missing. A list takes milliseconds, during which samples wait.
 const LIST_INTERVAL: Duration = Duration::from_millis(500);
-/// Pause after a shortage, in which the run subscribes to no topic: a try takes as long as receiving a thousand samples.
+/// Pause without new subscriptions after a shortage. An attempt takes as long as receiving a thousand samples.
 const SHORTAGE_PAUSE: Duration = Duration::from_secs(1);
 
 impl<'a> TopicRun<'a> {
-    /// Makes a run that follows `names`, and the topics `of_all` of each sensor that the hub has, in the first live one of `places`,
-    /// until `bounds` are reached or `stop` is set.
+    /// Creates a run that subscribes to `names`, and to the topics `of_all` of each sensor, in the first of `locations`
+    /// in which a hub runs. The run ends when `limits` are reached or `stop` is set.
     pub fn new(
         names: &[TopicName],
         of_all: &'a [Topic],
@@ -233,12 +235,12 @@ impl<'a> TopicRun<'a> {
         }
     }
 
-    /// Follows the statuses of the sensors, too. They count the losses on the serial lines.
+    /// Adds subscriptions to the statuses of the sensors. They have counters of the losses on the serial lines.
     pub fn with_lines(self) -> TopicRun<'a> {
         TopicRun { lines: Some(Vec::new()), ..self }
     }
 
-    /// Receives zones with the early warnings of their sensors.
+    /// Receives early warnings together with the zones of their sensors.
     pub fn with_early(mut self) -> TopicRun<'a> {
         for topic in self.topics.iter_mut().filter(|topic| topic.name.topic == Topic::Zones) {
             topic.source = Source::zones_with_early(&topic.name.sensor);
@@ -246,18 +248,19 @@ impl<'a> TopicRun<'a> {
         self
     }
 
-    /// Is woken by `wait`, for the shortest latency: the run receives before it looks for the hub, which takes longer.
+    /// Minimizes the latency: the run waits by `wait`, and receives samples before it checks the hub, which takes
+    /// longer.
     pub fn receiving_first(self, wait: Wait) -> TopicRun<'a> {
         TopicRun { session: self.session.waiting_by(wait), receives_first: true, ..self }
     }
 
-    /// Goes on if it cannot follow a topic for lack of memory, descriptors or places, with [`Event::ResourceExhausted`]. Otherwise, the run
-    /// fails.
+    /// Continues with [`Event::ResourceExhausted`] if memory, descriptors or slots for a topic run out. Otherwise, such
+    /// a run fails.
     pub fn tolerating_shortage(self) -> TopicRun<'a> {
         TopicRun { tolerates_shortage: true, ..self }
     }
 
-    /// Subscribes to `topic` again, or ends its subscriptions until it is wanted again.
+    /// Starts or ends the subscriptions to `topic`.
     pub fn set_subscribed(&mut self, topic: Topic, is_subscribed: bool) {
         self.paused_topics.retain(|paused| *paused != topic);
         if !is_subscribed {
@@ -265,17 +268,21 @@ impl<'a> TopicRun<'a> {
         }
     }
 
-    /// Returns whether the run has received all samples that waited before the last [`Event::Tick`].
+    /// Returns whether the run had received all waiting samples at the last [`Event::Tick`].
     pub fn is_caught_up(&self) -> bool {
         !self.round.more
     }
 
-    /// Waits for the next event, and returns it; `None` after the last one. At `wake_at` there is a [`Event::Tick`], whatever comes.
+    /// Waits for the next event, and returns it. Returns `None` after the last one. An [`Event::Tick`] follows at
+    /// `wake_at` in any case.
     ///
     /// # Errors
     ///
-    /// [`Kind::NoTopic`] with the names of the sensors; [`Kind::NoHub`] if the run is bounded and no hub runs at its start;
-    /// [`Kind::Timeout`]; [`Kind::Interrupted`] if it is bounded and was stopped before; [`Kind::ResourceExhausted`].
+    /// - [`Kind::NoTopic`] if a sensor or topic does not exist; the message names the sensors.
+    /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
+    /// - [`Kind::Timeout`] if the samples do not arrive in time.
+    /// - [`Kind::Interrupted`] if a bounded run is stopped before its end.
+    /// - [`Kind::ResourceExhausted`] if memory, descriptors or slots run out.
     pub fn next(&mut self, wake_at: Option<Instant>) -> Result<Option<Event>, ExitReason> {
         loop {
             if let Some(event) = self.events.pop_front() {
@@ -290,12 +297,12 @@ impl<'a> TopicRun<'a> {
         }
     }
 
-    /// Writes a `summary` of each topic at the end of the run, unless the reader of the output has closed it. `end` is the result
-    /// of the run.
+    /// Calls `summary` for each topic at the end of the run, unless the reader has closed the output. `end` is the
+    /// result of the run, which is returned.
     ///
     /// # Errors
     ///
-    /// Those of `summary`, or else `end`.
+    /// The error of `summary`, or otherwise the one in `end`.
     pub fn finish(
         mut self,
         end: Result<(), ExitReason>,
@@ -355,7 +362,7 @@ impl<'a> TopicRun<'a> {
         Ok(())
     }
 
-    /// Looks for news of the hub, and for the sensors of a new one.
+    /// Checks whether the hub has started or exited, and for new sensors.
     fn check_hub(&mut self) -> Result<(), ExitReason> {
         let change = self.session.check_hub()?;
         if let Some(holder) = change.ended {
@@ -367,7 +374,7 @@ impl<'a> TopicRun<'a> {
                 self.notice(Notice::HubBack, |name| publishes(name, holder));
             }
             self.hub_started_at = Some(Instant::now());
-            // Samples that the new hub sent before this moment waited for the run, and arrive late.
+            // Samples that the new hub sent before now have waited, so their arrival times are too late.
             let now_ns = clock::now_ns();
             for topic in self.topics.iter_mut().filter(|topic| topic.source.subscribed()) {
                 topic.since_ns = now_ns;
@@ -377,7 +384,7 @@ impl<'a> TopicRun<'a> {
         self.discover()
     }
 
-    /// Follows the sensors of the hub that are not followed yet, if the run follows all.
+    /// Adds topics of new sensors, if the run subscribes to all sensors.
     fn discover(&mut self) -> Result<(), ExitReason> {
         let Some(domain) = self.session.domain().filter(|_| !self.all_sensor_topics.is_empty()) else {
             return Ok(());
@@ -402,7 +409,7 @@ impl<'a> TopicRun<'a> {
         Ok(())
     }
 
-    /// Receives one sample of the topic that has its turn, or ends its turn.
+    /// Receives one sample of the current topic, or goes to the next topic.
     fn receive(&mut self) -> Result<(), ExitReason> {
         let is_short = self.is_short();
         let round = &mut self.round;
@@ -413,7 +420,8 @@ impl<'a> TopicRun<'a> {
             round.next_topic();
             return Ok(());
         }
-        // Subscribing takes a thousand times as long as receiving: samples of other topics come before the next subscription.
+        // Subscribing takes a thousand times as long as receiving, so receive from other topics before the next
+        // subscription.
         if !was_subscribed && (round.subscribed || is_short) {
             round.more |= round.subscribed;
             round.next_topic();
@@ -461,7 +469,7 @@ impl<'a> TopicRun<'a> {
         Ok(())
     }
 
-    /// Follows the lines of all sensors that are followed by now, and receives their statuses.
+    /// Subscribes to the statuses of all sensors of the run, and receives them.
     fn receive_lines(&mut self) {
         let Some(lines) = &mut self.lines else { return };
         for topic in self.topics[self.topics_with_line..].iter().filter(|topic| !topic.name.is_robot()) {
@@ -474,7 +482,7 @@ impl<'a> TopicRun<'a> {
                     Ok(None) => break,
                     Ok(Some(status)) => {
                         line.note(status.header().boot, &status.counters);
-                        // A copy: the hub lends four samples of a topic at most.
+                        // Copy the status, because a subscriber can borrow at most four samples of a topic.
                         self.events.push_back(Event::Line(sensor.clone(), Box::new(*status)));
                     }
                     Err(_) => *source = None,
@@ -483,13 +491,13 @@ impl<'a> TopicRun<'a> {
         }
     }
 
-    /// Returns what the line of `sensor` took away in the run.
+    /// Returns the losses on the line of `sensor` during the run.
     fn loss(&self, sensor: &str) -> Loss {
         let line = self.lines.iter().flatten().find(|line| line.sensor == sensor);
         line.map(|line| line.losses.loss()).unwrap_or_default()
     }
 
-    /// Ends the run at its bounds, and finds the reason for a silence.
+    /// Ends the run at its limits, and reports silences.
     fn check(&mut self) -> Result<(), ExitReason> {
         if self.limits.count == Some(0) {
             self.end = Some(Ok(()));
@@ -540,16 +548,17 @@ impl<'a> TopicRun<'a> {
         Ok(())
     }
 
-    /// Fails if the run follows a sensor that the hub does not have: a hub that is up has all its topics.
+    /// Fails if the run has a topic or sensor that the hub does not have. A hub that has started has created all its
+    /// topics.
     fn check_sensors(&mut self) -> Result<(), ExitReason> {
-        // A topic that is not wanted now is not missing: asking costs more than following.
+        // Paused topics are not missing. Skip the list if possible, because it costs more than receiving.
         let (paused_topics, topics) = (&self.paused_topics, &self.topics);
         let is_missing =
             |topic: &TopicState| !paused_topics.contains(&topic.name.topic) && !topic.source.subscribed();
         if !topics.is_empty() && !topics.iter().any(is_missing) {
             return Ok(());
         }
-        // A list of the sensors needs a descriptor, too.
+        // Listing the sensors also needs a descriptor.
         if self.session.domain().is_none() || self.is_short() {
             return Ok(());
         }
@@ -561,12 +570,12 @@ impl<'a> TopicRun<'a> {
         if self.session.hub_is_starting() {
             return Ok(());
         }
-        // A hub that starts after a listener creates its topics first.
+        // A hub that starts after a listener still needs time to create its topics.
         let is_hub_running = self.session.hub_is_running();
         self.hub_running_since =
             if is_hub_running { self.hub_running_since.or(Some(Instant::now())) } else { None };
         let published = match self.session.domain().map(scanhub_shm::published_topics).transpose() {
-            // Since the pause after the last shortage, the run has not tried to subscribe again.
+            // After the last shortage, the run has not yet tried to subscribe again.
             Err(failure) if failure.kind == Kind::ResourceExhausted && self.tolerates_shortage => {
                 return Ok(());
             }
@@ -575,7 +584,7 @@ impl<'a> TopicRun<'a> {
         let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
         sensors.dedup();
         let wants_all = topics.iter().all(|topic| topic.name.is_robot());
-        // Those of the hub, or without a hub those of other machines.
+        // Only sensors of the hub count, or remote sensors if there is no hub.
         let may_come =
             self.may_start(if is_hub_running { DomainHolder::Hub } else { DomainHolder::Listener });
         if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == is_hub_running) {
@@ -605,7 +614,8 @@ impl<'a> TopicRun<'a> {
         Ok(())
     }
 
-    /// Returns whether `who` may still start: another machine at any time, or the hub after a listener.
+    /// Returns whether a publisher of this kind may still appear: a listener at any time in an unbounded run, and the
+    /// hub after a listener.
     fn may_start(&self, holder: DomainHolder) -> bool {
         let unbounded = !self.limits.is_bounded();
         match holder {
@@ -616,7 +626,7 @@ impl<'a> TopicRun<'a> {
         }
     }
 
-    /// Tells `notice` of the topics that it `concerns`.
+    /// Adds `notice` for the topics for which `concerns` returns true.
     fn notice(&mut self, notice: Notice, concerns: impl Fn(&TopicName) -> bool) {
         let names: Vec<_> =
             self.topics.iter().map(|topic| &topic.name).filter(|name| concerns(name)).cloned().collect();
@@ -657,7 +667,7 @@ impl TopicState {
     }
 }
 
-/// Follows the lines of the sensors of a verdict over several.
+/// Adds the lines of the sensors in a combined verdict.
 fn follow_parts(lines: &mut Vec<LineState>, sample: &Sample) {
     if let Sample::Robot(update) = sample
         && update.robot.sensors().count() != lines.len()
@@ -673,12 +683,12 @@ fn follow_line(lines: &mut Vec<LineState>, sensor: &str) {
     }
 }
 
-/// Returns who publishes the sensor that is called so.
+/// Returns the kind of process that publishes `sensor`.
 fn holder_of(sensor: &str) -> DomainHolder {
     if is_remote(sensor) { DomainHolder::Listener } else { DomainHolder::Hub }
 }
 
-/// Returns whether `who` publishes `name`. The sensors of a robot may come from any publisher.
+/// Returns whether `holder` publishes `name`. The sensors of a robot may come from any publisher.
 fn publishes(name: &TopicName, holder: DomainHolder) -> bool {
     name.is_robot() || holder_of(&name.sensor) == holder
 }

@@ -1,4 +1,4 @@
-//! `scanhub hz`: rate, jitter, minimum, maximum and loss of topics, once a second, as they arrive here.
+//! `scanhub hz`: prints rate, jitter, extremes and losses of topics on arrival, once a second.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -32,7 +32,7 @@ pub struct HzArgs {
     pub limits: RunLimits,
 }
 
-/// Parses the time span of a line. A shorter one could never hold two samples that are far enough apart for a rate.
+/// Parses the time span of a line. In a shorter one, no two samples would be far enough apart for a rate.
 fn parse_window(text: &str) -> Result<Duration, String> {
     match duration::parse(text)? {
         window if window >= MIN_WINDOW => Ok(window),
@@ -44,7 +44,7 @@ const MIN_WINDOW: Duration = Duration::from_millis(500);
 
 impl HzArgs {
     /// Writes a line per topic and second to stdout, and summaries at the end. Notices go to stderr without `--json`.
-    /// Ends as [`EchoArgs::run`](crate::echo::EchoArgs::run) does.
+    /// Ends in the same way as [`EchoArgs::run`](crate::echo::EchoArgs::run).
     ///
     /// # Errors
     ///
@@ -80,8 +80,8 @@ struct Hz<'a> {
     notes: Output<'a>,
 }
 
-/// A topic, and since when of CLOCK_MONOTONIC its samples are received as they are sent, in ns: what it keeps for late
-/// joiners comes before that, and at no rate.
+/// A topic, with the time on CLOCK_MONOTONIC in ns since which its samples are received as they are sent. Earlier
+/// samples come from the history, so their arrival times have no rate.
 struct TopicWindow {
     name: Rc<TopicName>,
     since_ns: u64,
@@ -117,7 +117,7 @@ impl Hz<'_> {
         Ok(())
     }
 
-    /// Takes samples of `name` into account from now on.
+    /// Counts samples of `name` that are sent from now on.
     fn begin(&mut self, name: &TopicName) {
         let now_ns = clock::now_ns();
         self.windows.iter_mut().filter(|it| *it.name == *name).for_each(|it| it.since_ns = now_ns);
@@ -160,12 +160,12 @@ impl Hz<'_> {
     }
 }
 
-/// What the line of a sensor took away within the window.
+/// Losses on the line of a sensor within the window.
 struct LineWindow {
     sensor: String,
-    /// When statuses came, and what was lost by then, the newest last.
+    /// Arrival of each status, and the lost scans up to then, the newest last.
     lost: VecDeque<(Instant, Option<u64>)>,
-    /// The last one.
+    /// Last status.
     status: Status,
 }
 
@@ -175,7 +175,7 @@ impl LineWindow {
     }
 
     fn note(&mut self, now: Instant, status: &Status, length: Duration) {
-        // A restarted hub counts from 0.
+        // Counters of a restarted hub start at 0.
         if self.lost.back().is_some_and(|(_, lost)| *lost > status.lost_on_line()) {
             self.lost.clear();
         }
@@ -192,7 +192,8 @@ impl LineWindow {
     }
 }
 
-/// Class `hz`. Rate, jitter and extremes are null while the arrivals span less than [`scanhub_schema::MIN_RATE_SPAN`].
+/// JSON line of class `hz`. Rate, jitter and extremes are null while the arrivals span less than
+/// [`scanhub_schema::MIN_RATE_SPAN`].
 #[derive(Serialize)]
 struct HzJson<'a> {
     class: &'static str,
@@ -245,54 +246,54 @@ impl<'a> HzJson<'a> {
     }
 }
 
-/// The arrivals of the last seconds.
+/// Arrivals within the last `length`.
 struct Window {
     length: Duration,
     arrivals: VecDeque<(Instant, u64)>,
 }
 
-/// What a window says; times between arrivals in ms.
+/// Statistics of a window. Times between arrivals are in ms.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Rate {
     /// Arrivals per second.
     hz: f64,
-    /// Standard deviation of the times between arrivals.
+    /// Standard deviation of the time between arrivals.
     jitter_ms: f64,
-    /// The shortest time between two arrivals.
+    /// Shortest time between two arrivals.
     min_ms: f64,
-    /// The longest time between two arrivals.
+    /// Longest time between two arrivals.
     max_ms: f64,
 }
 
 impl Window {
-    /// Remembers `length` of time.
+    /// Creates an empty window of this `length`.
     fn new(length: Duration) -> Window {
         Window { length, arrivals: VecDeque::new() }
     }
 
-    /// Something arrived, `missed` before it did not.
+    /// Adds an arrival at `now`, before which `missed` samples did not arrive.
     fn add(&mut self, now: Instant, missed: u64) {
         self.arrivals.push_back((now, missed));
     }
 
-    /// Forgets what is older than the window.
+    /// Removes arrivals that are older than the window.
     fn slide(&mut self, now: Instant) {
         while self.arrivals.front().is_some_and(|(at, _)| now - *at > self.length) {
             self.arrivals.pop_front();
         }
     }
 
-    /// Arrivals in the window.
+    /// Returns the number of arrivals in the window.
     fn received(&self) -> u64 {
         self.arrivals.len() as u64
     }
 
-    /// What did not arrive between those in the window.
+    /// Returns the number of samples that did not arrive within the window.
     fn missed(&self) -> u64 {
         self.arrivals.iter().map(|(_, missed)| missed).sum()
     }
 
-    /// Returns the time from the first arrival in the window to the last.
+    /// Returns the time between the first and the last arrival in the window.
     fn span(&self) -> Duration {
         match (self.arrivals.front(), self.arrivals.back()) {
             (Some((first, _)), Some((last, _))) => *last - *first,

@@ -1,4 +1,4 @@
-//! `scanhub info`: the state of the links and their sensors, from the last status that each has published.
+//! `scanhub info`: prints the state of links and their sensors, from the last status of each.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -29,7 +29,7 @@ impl InfoArgs {
     ///
     /// - [`Kind::NoHub`] within a second if no hub runs.
     /// - [`Kind::NoTopic`] if the sensor does not exist; the message lists the sensors.
-    /// - [`Kind::Timeout`] if a sensor's status does not arrive.
+    /// - [`Kind::Timeout`] if the status of a sensor does not arrive.
     /// - [`Kind::Interrupted`] if a signal stops the run.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
@@ -54,7 +54,7 @@ impl InfoArgs {
     }
 }
 
-/// The sensors to tell of. One that is not there may belong to a hub that is just starting.
+/// Returns the sensors to print. Waits for a missing one as long as the hub may still be starting.
 fn selected_sensors(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure> {
     let deadline = Instant::now() + STARTUP_GRACE;
     loop {
@@ -70,7 +70,7 @@ fn selected_sensors(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>
     }
 }
 
-/// The last status of each of `sensors`, or none for one whose status does not come in time.
+/// Returns the last status of each of `sensors`; `None` if it does not arrive in time.
 pub(crate) fn statuses(
     domain: &Domain,
     sensors: &[String],
@@ -97,10 +97,10 @@ pub(crate) fn statuses(
     }
 }
 
-/// Maximum wait for a status. The hub gives the last one to a new subscriber within 100 ms, unless the machine is busy.
+/// Maximum wait for a status. A new subscriber gets the last one within 100 ms, unless the machine is busy.
 const STATUS_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The history comes without a wake-up.
+/// Interval between polls. The hub sends the history without waking the subscriber.
 const RETRY_INTERVAL: Duration = Duration::from_millis(10);
 
 fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
@@ -138,7 +138,8 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
     rows
 }
 
-/// The number of an LMS's measuring mode, or the name of another scanner's, of which some have only one.
+/// Returns the measuring mode of an LMS as a number, or the mode of another scanner by name. Some of those have only
+/// one mode, and then `None` is returned.
 fn mode(status: &Status) -> Option<String> {
     match status.mode {
         Status::MODE_UNKNOWN if status.family() == Some(Family::Lms) => Some("unknown".into()),
@@ -147,7 +148,7 @@ fn mode(status: &Status) -> Option<String> {
     }
 }
 
-/// What the line takes away: lately, and since the hub's start.
+/// Returns the losses on the line, in the last 10 s and since the hub's start.
 fn line(status: &Status) -> String {
     if let Some((discarded, read)) = status.discarded_and_read() {
         return format!("{discarded} of {read} bytes were in no intact telegram, and no scans arrive");
@@ -195,5 +196,5 @@ fn counters(status: &Status) -> Vec<Vec<String>> {
         .collect()
 }
 
-/// Of the labels: the longest counter's name and its indent.
+/// Width of the labels: the longest counter name with its indent.
 const LABEL_WIDTH: usize = 21;

@@ -1,4 +1,5 @@
-//! The classes of `--json`: which keys, in which order. A contract with scripts and other languages: add, never change.
+//! Classes of `--json`: their keys, and the order of the keys. They are a contract with scripts and other languages, so
+//! keys may be added but never changed.
 
 mod results;
 
@@ -16,10 +17,10 @@ use crate::output::{ExitReason, Output};
 use crate::receive_stats::ReceiveStats;
 
 pub use results::*;
-// A background model as a line is what a file of it is.
+// The line of class `background` is equal to a file with a model.
 pub(crate) use scanhub_schema::as_json as background;
 
-/// What all samples of telegrams begin with.
+/// Keys at the start of every line about a sample.
 #[derive(Serialize)]
 struct SampleKeys<'a> {
     class: &'static str,
@@ -50,14 +51,14 @@ impl<'a> SampleKeys<'a> {
         }
     }
 
-    /// Of no telegram.
+    /// Returns the keys of a line about a silence, which belongs to no telegram.
     fn for_silence(class: &'static str, sensor: &'a str) -> SampleKeys<'a> {
         let (seq, topic_seq, stamp_ns, wall_ns, boot, quality) = (None, None, None, None, None, None);
         SampleKeys { class, sensor, seq, topic_seq, stamp_ns, wall_ns, boot, quality, reasons: Vec::new() }
     }
 }
 
-/// What they end with: which flags are set, if any is.
+/// Key at the end of a line about a sample: the flags that are set. It is absent if there are none.
 #[derive(Serialize)]
 pub struct FlagNames {
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -71,7 +72,7 @@ impl FlagNames {
     }
 }
 
-/// Class `telegram`.
+/// Returns the line of class `telegram`.
 pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct TelegramJson<'a> {
@@ -85,7 +86,7 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
         command: Option<u8>,
         #[serde(skip_serializing_if = "Option::is_none")]
         kind: Option<&'static str>,
-        /// `null` where the family has no checksum.
+        /// Whether the checksums are correct; `null` if the family has none.
         #[serde(skip_serializing_if = "Option::is_none")]
         checked: Option<Option<bool>>,
         #[serde(skip_serializing_if = "Option::is_none")]
@@ -112,7 +113,7 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
     }
 }
 
-/// Class `scan`.
+/// Returns the line of class `scan`.
 pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct TelegramJson<'a> {
@@ -151,14 +152,14 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         codes: scan,
         intensities: scan.intensities(),
         angles_deg: scan,
-        // What comes without exact angles was on no grid.
+        // A scan without exact angles was measured without a grid, so it has no collisions.
         collisions: (!has_grid_only(scan)).then_some(scan.collisions),
         incomplete: scan.is_incomplete(),
         flags: FlagNames::of(header),
     }
 }
 
-/// A pose, in a status.
+/// Pose in a status.
 #[derive(Serialize)]
 struct PoseJson {
     x_m: f64,
@@ -167,14 +168,14 @@ struct PoseJson {
     upside_down: bool,
 }
 
-/// Whether topic `marks` is available, in a status, and the command or setting that makes it so.
+/// Availability of topic `marks` in a status, with the command or setting that makes it available.
 #[derive(Serialize)]
 struct MarksAvailability {
     available: Option<bool>,
     remedy: Option<String>,
 }
 
-/// Class `status`; what is not known is null.
+/// Returns the line of class `status`. Unknown values are null.
 pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct TelegramJson<'a> {
@@ -238,10 +239,10 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
     }
 }
 
-/// Returns the command, or the setting of link `sensor`, that makes topic `marks` available. `None` if it is
+/// Returns the command, or the setting of link `sensor`, that makes topic `marks` available. Returns `None` if it is
 /// available, or if that is unknown or impossible.
 pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
-    // The name on the machine of the sensor.
+    // Name on the machine to which the sensor is connected.
     let name = sensor.rsplit('.').next().unwrap_or(sensor);
     if status.family()?.has_reflector_levels() {
         let mode = status.missing_reflector_mode()?;
@@ -251,7 +252,7 @@ pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
     }
 }
 
-/// Class `notice`: a line for each of `names`, or one without a name.
+/// Writes lines of class `notice`: one for each of `names`, or one without a name if there are none.
 pub(crate) fn notices(
     output: &mut Output<'_>,
     names: &[Rc<TopicName>],
@@ -283,7 +284,7 @@ pub(crate) fn notices(
     })
 }
 
-/// Class `summary`.
+/// Returns the line of class `summary`.
 pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct TelegramJson<'a> {
@@ -310,7 +311,7 @@ pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Ser
     }
 }
 
-/// Class `control`.
+/// Returns the line of class `control`.
 pub(crate) fn control<'a>(sensor: &'a str, verb: Verb) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct TelegramJson<'a> {
@@ -322,7 +323,7 @@ pub(crate) fn control<'a>(sensor: &'a str, verb: Verb) -> impl Serialize + 'a {
     TelegramJson { class: "control", sensor, verb: verb.name(), outcome: "taken" }
 }
 
-/// Class `error`, as the line that a program writes when a verb failed; without its end.
+/// Returns the line of class `error`, which a program writes when a verb has failed, without the line feed.
 pub fn error(failure: &Failure) -> String {
     #[derive(Serialize)]
     struct TelegramJson<'a> {
@@ -368,7 +369,7 @@ fn intensities<S: Serializer>(intensities: &Intensities<'_>, serializer: S) -> R
     serializer.collect_seq(intensities.iter())
 }
 
-/// Exact angles, where there is a range.
+/// Serializes the exact angle of each beam that has a range.
 fn angles<S: Serializer>(scan: &Scan, serializer: S) -> Result<S::Ok, S::Error> {
     let angle = |i| scan.range(i).map(|_| (scan.angle_deg(i) * 1e4).round() / 1e4);
     serializer.collect_seq((0..scan.beams()).map(angle))
@@ -414,7 +415,7 @@ mod tests {
         let measured =
             r#""ranges":[1000,null,null,null,7],"codes":[[1,"no_return"],[2,"too_bright"],[3,"beyond"]]"#;
         assert_eq!(line(&header(), &scan), [BEGIN, before, measured, "}"].concat());
-        // Field bits are no intensities; reflector levels are.
+        // Field bits do not count as intensities, but reflector levels do.
         scan.arrays().upper.copy_from_slice(&[0, 0, 0, 0, 3]);
         assert_eq!(line(&header(), &scan), [BEGIN, before, measured, "}"].concat());
         scan.intensity_bits = 3;

@@ -1,5 +1,5 @@
-//! `scanhub latency`: measures how old samples are on arrival, and in which span that time passed. Other programs measure
-//! the same if they use the client library and wait in the same way.
+//! `scanhub latency`: measures the age of samples on arrival, and the spans of which it consists. Other programs get
+//! the same results if they use the client library and wait in the same way.
 
 mod spans;
 
@@ -71,11 +71,12 @@ const LINE_INTERVAL: Duration = Duration::from_secs(1);
 
 impl LatencyArgs {
     /// Writes the conditions, a line for each topic once a second, and the result of each topic at the end. Each line
-    /// covers the run so far. Without `--json`, conditions and notices go to stderr. The result has bars on a terminal.
+    /// covers the run up to then. Without `--json`, conditions and notices go to stderr. On a terminal, the result
+    /// includes bars.
     ///
     /// # Errors
     ///
-    /// - [`Kind::Check`] if a topic is older than `--max-p99` permits, or its age is unknown.
+    /// - [`Kind::Check`] if the age of a topic exceeds `--max-p99`, or is unknown.
     /// - The errors of [`echo`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
@@ -159,7 +160,7 @@ impl Latency<'_> {
                 Event::Sample(name, sample, arrival) => self.sample(&name, &sample, arrival),
                 Event::Notice(names, notice) => {
                     if notice == Notice::HubBack {
-                        // Samples that the new hub sent before this moment waited for this process.
+                        // Samples that the new hub sent before now have waited for this process.
                         let now_ns = clock::now_ns();
                         self.topics.iter_mut().for_each(|(_, spans)| spans.begin(now_ns));
                     }
@@ -210,7 +211,8 @@ impl Latency<'_> {
     }
 }
 
-/// Returns the line of class `latency`. A span without a known time is null. The keys are a contract: add, never change.
+/// Returns the line of class `latency`. A span without a known time is null. The keys are a contract: they may be
+/// added, but never changed.
 fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct LatencyJson<'a> {
@@ -246,7 +248,7 @@ fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
     }
 }
 
-/// Writes the age of a topic so far in one line.
+/// Writes the ages of a topic up to now in one line.
 fn brief(line: &mut Vec<u8>, name: &TopicName, spans: &Spans) -> io::Result<()> {
     let topic = name.to_string();
     match spans.ages(Span::Age).quantiles() {
@@ -265,7 +267,7 @@ fn brief(line: &mut Vec<u8>, name: &TopicName, spans: &Spans) -> io::Result<()> 
     }
 }
 
-/// Writes the result of a topic: a row for each span with a known time, and the ages as bars if `has_bars`.
+/// Writes the result of a topic: a row for each span with known times, and the ages as bars if `has_bars` is set.
 fn full(out: &mut Output<'_>, name: &TopicName, spans: &Spans, has_bars: bool) -> Result<(), ExitReason> {
     let heads = ["us", "count", "min", "p50", "p90", "p99", "p99.9", "max"].map(str::to_owned).to_vec();
     let row = |span: Span| {
@@ -342,7 +344,7 @@ fn us(ns: u64) -> String {
     format!("{:.1}", ns as f64 / 1e3)
 }
 
-/// Returns an edge between bars as a whole number of a unit.
+/// Formats an edge between bars as a whole number of a unit.
 fn time(ns: u64) -> String {
     match ns {
         0..1_000_000 => format!("{} us", ns / 1_000),
@@ -351,16 +353,17 @@ fn time(ns: u64) -> String {
     }
 }
 
-/// Conditions of a measurement: priority and memory of the process, and resolution of the clock. Line of class
-/// `conditions`.
+/// Conditions of a measurement, as a line of class `conditions`: priority and memory of the process, and the cost of
+/// reading the clock.
 #[derive(Clone, Debug, Serialize)]
 #[serde(tag = "class", rename = "conditions")]
 struct Conditions {
     wait: &'static str,
-    /// Whether the thread has SCHED_FIFO with the lowest priority, which precedes all threads without one.
+    /// Whether the thread has SCHED_FIFO with the lowest priority, which precedes all threads without real-time
+    /// priority.
     realtime: bool,
     memory_locked: bool,
-    /// Time that one read of the clock takes.
+    /// Duration of one read of the clock in ns.
     clock_read_ns: f64,
     clock_resolution_ns: u64,
     /// Requests that the system refused, with the reason and a remedy.
@@ -368,8 +371,8 @@ struct Conditions {
 }
 
 impl Conditions {
-    /// Takes real-time priority for the calling thread and locks the memory of its process if `is_realtime` and as far
-    /// as permitted, so that other programs do not add to the latency. Both stay.
+    /// Requests real-time priority for the calling thread and locks the memory of its process, if `is_realtime` is set
+    /// and as far as permitted, so that other programs do not add latency. Both remain in effect.
     fn take(wait: Wait, is_realtime: bool) -> Conditions {
         let processors = thread::available_parallelism().map_or(1, usize::from);
         let normal = Conditions {
@@ -389,7 +392,7 @@ impl Conditions {
 
     fn with_realtime(self, wait: Wait, processors: usize) -> Conditions {
         let priority = may_spin(wait, processors).and_then(|()| take_priority());
-        // Later mappings are not locked: beyond the limit, mapping the topics would fail.
+        // Do not lock later mappings: beyond the limit, mapping the topics would fail.
         let locked = mlockall(MlockAllFlags::CURRENT).map_err(|error| {
             format!("memory is not locked: {}; `ulimit -l unlimited` permits it", io::Error::from(error))
         });
@@ -414,7 +417,8 @@ impl Conditions {
     }
 }
 
-/// Refuses priority for a thread that never sleeps, unless the hub has its own processor.
+/// Returns an error if priority for a thread that never sleeps would stop the hub, because there are too few
+/// processors.
 fn may_spin(wait: Wait, processors: usize) -> Result<(), String> {
     if wait == Wait::Spin && processors < MIN_PROCESSORS {
         return Err(format!(
@@ -424,10 +428,10 @@ fn may_spin(wait: Wait, processors: usize) -> Result<(), String> {
     Ok(())
 }
 
-/// One for the thread that spins, one for the hub, and one for everything else.
+/// Minimum number of processors: one for the spinning thread, one for the hub, and one for everything else.
 const MIN_PROCESSORS: usize = 3;
 
-/// Takes the lowest real-time priority for the calling thread, or returns the reason and a remedy.
+/// Requests the lowest real-time priority for the calling thread. The error has the reason and a remedy.
 fn take_priority() -> Result<(), String> {
     let fifo = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, fifo).map_err(|error| {
@@ -439,7 +443,8 @@ fn take_priority() -> Result<(), String> {
     })
 }
 
-/// Measures the time that one read of the clock takes, in ns: the best of several runs, which was not interrupted.
+/// Measures the duration of one read of the clock in ns. It is the minimum of several runs, so interruptions do not
+/// count.
 fn clock_read_ns() -> f64 {
     const RUNS: usize = 8;
     const READS: u32 = 256;
@@ -542,7 +547,7 @@ front/scan: simulated
 
     #[test]
     fn explains_refused_requests() {
-        // On a separate thread, because a thread keeps its priority.
+        // Use a separate thread, because the thread keeps its priority.
         let take = || Conditions::take(Wait::Spin, false).with_realtime(Wait::Spin, 2);
         let taken = thread::spawn(take).join().expect("no panic");
         assert!(!taken.realtime);

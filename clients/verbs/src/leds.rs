@@ -1,6 +1,6 @@
-//! `scanhub leds`: shows the zone verdict and the mark count of a sensor as lights, in the terminal and on LEDs of the machine.
-//! The lights never show a better state than is known: the red light is on at the start, at the end, and while the hub is
-//! silent.
+//! `scanhub leds`: shows the zone verdict and the mark count of a sensor as lights, in the terminal and on LEDs of the
+//! machine. The lights never show a better state than the known one: the red light is on at the start, at the end, and
+//! while the hub is silent.
 
 mod device;
 
@@ -54,14 +54,14 @@ Examples:
 green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector mark";
 
 impl LedsArgs {
-    /// Shows the lights on stdout and on the LEDs until the limits are reached or a signal stops it. Notices go to
-    /// stderr without `--json`. The red light is on after every end of the run. An LED that fails during the run is
-    /// reported and tried again, while the others continue.
+    /// Shows the lights on stdout and on the LEDs until the limits are reached or a signal ends the run. Notices go to
+    /// stderr without `--json`. The red light is on after the run, however it ends. If an LED fails during the run,
+    /// that is reported, and the verb tries it again while the others continue.
     ///
     /// # Errors
     ///
     /// - [`Kind::Configuration`] if an LED does not exist or its light is unknown.
-    /// - [`Kind::Failed`] if an LED may not be switched.
+    /// - [`Kind::Failed`] if this user may not switch an LED.
     /// - The errors of [`echo`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
@@ -95,7 +95,8 @@ impl LedsArgs {
         verb_result(end.and(panel.show_unwatched()))
     }
 
-    /// Returns the light and the name of each `--led`. Each name is unique: an LED for two lights would be ambiguous.
+    /// Returns light and name of each `--led`. A name may occur only once, because an LED for two lights would be
+    /// ambiguous.
     fn selected_leds(&self) -> Result<Vec<(Light, &str)>, Failure> {
         let mut selected: Vec<(Light, &str)> = Vec::new();
         for led in &self.leds {
@@ -126,26 +127,26 @@ const LED_FORM: &str = "green=NAME, yellow=NAME, red=NAME or mark=NAME, with a N
 /// Form of the lights on stdout.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum LightDisplay {
-    /// A line of text for each change.
+    /// Lines of text, one for each change.
     Lines,
-    /// A JSON object for each change.
+    /// JSON lines, one for each change.
     Json,
-    /// One line that is redrawn.
+    /// One line, which is redrawn.
     Terminal {
         /// Whether lights that are on have their color.
         colors: bool,
     },
 }
 
-/// The lights and their state.
+/// The lights with their state, and the devices that show them.
 struct LightPanel<'a> {
     sensor: &'a str,
     display: LightDisplay,
     states: LightStates,
     verdict: WorstVerdictHold,
-    /// Age of the mark count, which does not depend on the zones.
+    /// Staleness of the mark count, independent of the zones.
     marks: StalenessTimer,
-    /// Text on the loss of each sensor whose line loses data.
+    /// Name of each sensor whose line loses data, with a text about the loss.
     losses: Vec<(String, String)>,
     devices: Vec<(Light, String, Device)>,
     out: Output<'a>,
@@ -153,7 +154,7 @@ struct LightPanel<'a> {
 }
 
 impl LightPanel<'_> {
-    /// Opens the LEDs, and shows that nothing is known yet.
+    /// Opens the LEDs, and shows the unknown state.
     fn open(&mut self, args: &LedsArgs, selected: &[(Light, &str)]) -> Result<(), ExitReason> {
         for &(light, name) in selected {
             let (device, trigger) = Device::open(&args.led_root, name)?;
@@ -171,13 +172,13 @@ impl LightPanel<'_> {
         self.show(LightStates { verdict, marks, worst }, false)
     }
 
-    /// Shows `states` if they differ from those that are shown, or `always`.
+    /// Shows `states` if they differ from the shown ones or `always` is set.
     fn show(&mut self, states: LightStates, always: bool) -> Result<(), ExitReason> {
         if self.states == states && !always {
             return Ok(());
         }
         self.states = states;
-        // The LEDs come first: output may be slow.
+        // Switch the LEDs first, because output may be slow.
         self.switch(Instant::now())?;
         self.draw()
     }
@@ -192,7 +193,7 @@ impl LightPanel<'_> {
         changes.into_iter().try_for_each(|(light, name, event)| self.report(light, &name, event))
     }
 
-    /// Reports that an LED failed or is back.
+    /// Reports that an LED failed or works again.
     fn report(&mut self, light: Light, name: &str, event: DeviceEvent) -> Result<(), ExitReason> {
         let (state, failure) = match event {
             DeviceEvent::Failed(failure) => ("failed", Some(failure)),
@@ -205,7 +206,7 @@ impl LightPanel<'_> {
         self.note(&failure.map_or(format!("{name} has recovered"), |failure| failure.to_string()))
     }
 
-    /// Writes a line to `notes`. The lights are redrawn below it.
+    /// Writes a line to `notes`. The lights are redrawn after it.
     fn note(&mut self, what: &str) -> Result<(), ExitReason> {
         self.clear_line()?;
         self.notes.line(|line| write!(line, "{what}"))
@@ -219,7 +220,7 @@ impl LightPanel<'_> {
             LightDisplay::Json => self.out.json(&LedsJson::new(sensor, states, reason)),
             LightDisplay::Lines => self.out.line(|line| states.line(line, sensor, reason, false)),
             LightDisplay::Terminal { colors } => {
-                // A line that wraps could not be redrawn, so the terminal cuts it.
+                // A wrapped line could not be redrawn, so let the terminal cut it.
                 let mut line = [CLEAR_LINE, b"\x1b[?7l"].concat();
                 states.line(&mut line, sensor, reason, colors)?;
                 line.extend(b"\x1b[?7h");
@@ -228,7 +229,8 @@ impl LightPanel<'_> {
         }
     }
 
-    /// Returns a possible reason of the verdict: the loss on the line of the sensor whose verdict it is, or of any other.
+    /// Returns a possible reason for the verdict: a loss on the line of the sensor that determines it, or otherwise of
+    /// another sensor.
     fn reason(&self) -> Option<String> {
         let sensor_name = self.states.worst.as_deref();
         let of_worst = self.losses.iter().find(|(sensor, _)| Some(sensor.as_str()) == sensor_name);
@@ -244,10 +246,10 @@ impl LightPanel<'_> {
         }
     }
 
-    /// Turns the red light on, because the sensor is not watched from now on.
+    /// Turns the red light on, because the sensor is no longer watched.
     fn show_unwatched(&mut self) -> Result<(), ExitReason> {
         self.show(LightStates::UNKNOWN, false)?;
-        // An LED may have failed when it was switched.
+        // Switch again, because an LED may have failed before.
         self.switch(Instant::now())?;
         match self.display {
             LightDisplay::Terminal { .. } => self.out.raw(b"\n"),
@@ -278,7 +280,7 @@ impl LightPanel<'_> {
                 self.verdict.take((update.robot.verdict(), worst), now);
             }
             Sample::Marks(sample) => {
-                // A number of marks expires like a verdict that is known.
+                // A mark count becomes stale like a known verdict.
                 let fresh = self.marks.update(sample.header(), Verdict::Clear, clock::now());
                 marks = (fresh && sample.is_available()).then(|| sample.marks().len());
             }
@@ -287,7 +289,7 @@ impl LightPanel<'_> {
         self.show_known(marks, now)
     }
 
-    /// Redraws when a line starts or stops to lose data, but not when the amount changes.
+    /// Redraws when a line starts or stops losing data, but not when the amount changes.
     fn line(&mut self, sensor: &str, status: &Status) -> Result<(), ExitReason> {
         let known = self.losses.iter().position(|(name, _)| name == sensor);
         let loss = status.line_loss();
@@ -302,7 +304,7 @@ impl LightPanel<'_> {
     }
 
     fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), ExitReason> {
-        // Only the newest sample counts.
+        // Missed samples do not matter, because the lights show only the newest one.
         if matches!(notice, Notice::Missed(_)) {
             return Ok(());
         }
@@ -317,7 +319,7 @@ impl LightPanel<'_> {
         }
     }
 
-    /// Turns off marks that are too old, shows a verdict that has lasted, and tries LEDs again that failed.
+    /// Turns off stale marks, shows a better verdict that has lasted long enough, and tries failed LEDs again.
     fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         let marks = if self.marks.silence(clock::now()) { None } else { self.states.marks };
         self.show_known(marks, now)?;
@@ -325,7 +327,7 @@ impl LightPanel<'_> {
     }
 }
 
-/// Line of class `leds`.
+/// JSON line of class `leds`.
 #[derive(Serialize)]
 struct LedsJson<'a> {
     class: &'static str,
@@ -363,7 +365,7 @@ impl<'a> LedsJson<'a> {
     }
 }
 
-/// Line of class `led`: an LED failed, or is back.
+/// JSON line of class `led`: an LED failed or works again.
 #[derive(Serialize)]
 struct LedJson<'a> {
     class: &'static str,
@@ -380,13 +382,13 @@ const CLEAR_LINE: &[u8] = b"\r\x1b[K";
 /// A light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Light {
-    /// Nothing is inside any circle.
+    /// No object is in any zone.
     Green,
-    /// Something is inside, but not inside the smallest circle.
+    /// An object is in a zone, but not in the smallest one.
     Yellow,
-    /// Something is inside the smallest circle, or it is not known.
+    /// An object is in the smallest zone, or the verdict is unknown.
     Red,
-    /// A reflector mark is seen.
+    /// The sensor detects a reflector mark.
     Mark,
 }
 
@@ -394,7 +396,7 @@ impl Light {
     /// All lights, in the order of all output.
     const ALL: [Light; 4] = [Light::Green, Light::Yellow, Light::Red, Light::Mark];
 
-    /// The light's name in all output and on the command line.
+    /// Returns the light's name in all output and on the command line.
     fn name(self) -> &'static str {
         match self {
             Light::Green => "green",
@@ -404,7 +406,7 @@ impl Light {
         }
     }
 
-    /// Color on a terminal (ECMA-48, SGR).
+    /// Returns the light's color code on a terminal (ECMA-48, SGR).
     fn color(self) -> u8 {
         match self {
             Light::Green => 32,
@@ -415,22 +417,22 @@ impl Light {
     }
 }
 
-/// Known state of a sensor, which decides what lights are on.
+/// Known state of a sensor, which determines the lights.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct LightStates {
     /// Verdict of the zones.
     verdict: Verdict,
     /// Number of marks in the last scan; `None` if it is unknown.
     marks: Option<usize>,
-    /// The sensor that the verdict is from, if there are several.
+    /// Sensor that determines the verdict, if there are several.
     worst: Option<String>,
 }
 
 impl LightStates {
-    /// No sensor is watched: the red light is on.
+    /// State without a watched sensor: the red light is on.
     const UNKNOWN: LightStates = LightStates { verdict: Verdict::Unknown, marks: None, worst: None };
 
-    /// Returns whether `light` is on. An unknown verdict counts as stop.
+    /// Returns whether `light` is on. For the unknown verdict, the red light is on.
     fn is_on(&self, light: Light) -> bool {
         match light {
             Light::Green => self.verdict == Verdict::Clear,
@@ -440,7 +442,7 @@ impl LightStates {
         }
     }
 
-    /// Writes the lights of `sensor` and a possible `reason`, readable with colors and without.
+    /// Writes the lights of `sensor` and a possible `reason`. The line is readable with and without `colors`.
     fn line(&self, line: &mut Vec<u8>, sensor: &str, reason: Option<&str>, colors: bool) -> io::Result<()> {
         write!(line, "{sensor}")?;
         for light in Light::ALL {
@@ -467,25 +469,25 @@ impl LightStates {
     }
 }
 
-/// A verdict, and the sensor that it is from, if there are several.
+/// A verdict, and the sensor that determines it if there are several.
 type SensorVerdict = (Verdict, Option<String>);
 
-/// Holds a verdict for some time, so that the lights do not flicker. It shows the worst verdict of that time: a worse one at
-/// once, a better one after it has lasted.
+/// Worst verdict of the last `hold`, so that the lights do not flicker. A worse verdict is shown at once, and a better
+/// one after it has lasted for `hold`.
 struct WorstVerdictHold {
     hold: Duration,
     current: SensorVerdict,
-    /// Worse verdicts before, with the time of their last end.
+    /// Earlier verdicts that were worse, each with the time at which it last ended.
     previous: Vec<(SensorVerdict, Instant)>,
 }
 
 impl WorstVerdictHold {
-    /// A verdict counts for `hold` after its end. The first one is unknown.
+    /// Creates a hold in which a verdict counts until `hold` after its end. The first verdict is unknown.
     fn new(hold: Duration) -> WorstVerdictHold {
         WorstVerdictHold { hold, current: (Verdict::Unknown, None), previous: Vec::new() }
     }
 
-    /// Takes a new verdict at `now`.
+    /// Adds a new verdict at `now`.
     fn take(&mut self, new_verdict: SensorVerdict, now: Instant) {
         let is_worse = |verdict: Verdict| verdict != new_verdict.0 && verdict.worse(new_verdict.0) == verdict;
         self.previous.retain(|((verdict, _), _)| is_worse(*verdict));
@@ -507,7 +509,7 @@ impl WorstVerdictHold {
         )
     }
 
-    /// Returns when it may change without a new verdict.
+    /// Returns the next time at which the shown verdict can change without a new one.
     fn changes_at(&self) -> Option<Instant> {
         self.previous.iter().filter_map(|(_, until)| until.checked_add(self.hold)).min()
     }
@@ -565,7 +567,7 @@ mod tests {
 
     const HOLD_MS: u64 = 300;
 
-    /// What is shown after each of these times and verdicts, and at each time without one.
+    /// Returns the shown verdict after each step. A step is a time in ms, with a new verdict or without one.
     fn shown_verdicts(steps: &[(u64, Option<Verdict>)]) -> Vec<Verdict> {
         let (mut hold, start) = (WorstVerdictHold::new(Duration::from_millis(HOLD_MS)), Instant::now());
         let at = |ms| start + Duration::from_millis(ms);

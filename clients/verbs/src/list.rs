@@ -1,4 +1,4 @@
-//! `scanhub list`: what the running hub publishes, and which domains of this user are live.
+//! `scanhub list`: prints the topics of the running hub, or the live domains of this user.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -26,16 +26,16 @@ pub struct ListArgs {
 
 impl ListArgs {
     /// Writes the topics of every sensor of the hub to stdout, with rate, subscribers, payload type and revision. As
-    /// text, the problem of each sensor that has one follows.
+    /// text, the problems of sensors follow.
     ///
     /// With `--domains`, writes every live domain instead: those below `--root`, or all. Hubs that this user cannot
-    /// reach follow, with a command that reaches them.
+    /// reach follow, each with a command that reaches it.
     ///
     /// # Errors
     ///
     /// - [`Kind::NoHub`](scanhub_schema::Kind) within a second if no hub runs.
-    /// - [`Kind::Interrupted`](scanhub_schema::Kind) if a signal requests the end.
-    /// - The errors of [`Domain::candidates`], and that of a write to stdout.
+    /// - [`Kind::Interrupted`](scanhub_schema::Kind) if a signal ends the run.
+    /// - The errors of [`Domain::candidates`], and the error of a write to stdout.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (json, out) = (context.json, &mut context.out);
         match (self.domains, &context.domain.root) {
@@ -62,13 +62,13 @@ fn topics(json: bool, locations: &[Domain], out: &mut dyn Write, stop: &AtomicBo
             .iter_mut()
             .filter(|line| line.sensor == sensor && line.topic.spec().publish_rate == PublishRate::Scan)
         {
-            // Of families other than LMS a telegram is no scan, and how many come is told by `hz`.
+            // Except for an LMS, a telegram is not a scan. `hz` measures the rate of such telegrams.
             let is_of_scans =
                 |status: &&Status| line.topic != Topic::Telegram || status.family() == Some(Family::Lms);
             line.hz = status.as_ref().filter(is_of_scans).and_then(Status::rate_hz);
         }
         if let Some(status) = status.filter(|status| !status.last_error().is_empty()) {
-            // A port that is in use or forbidden is not absent; the message has the reason.
+            // A port that is in use or forbidden is not absent, and the message states the reason.
             let state = match status.state() {
                 Some(State::Absent) => String::new(),
                 state => format!("{}: ", state.map_or("unknown", State::name)),
@@ -89,7 +89,7 @@ fn topics(json: bool, locations: &[Domain], out: &mut dyn Write, stop: &AtomicBo
     )
 }
 
-/// Writes every live domain below `bases`, and those of `hubs` below another directory. Hubs that this user cannot reach
+/// Writes every live domain below `bases`, and those of `hubs` in other directories. Hubs that this user cannot reach
 /// follow.
 fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Write) -> Result<(), Failure> {
     #[derive(Serialize)]
@@ -99,7 +99,7 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
         root: PathBuf,
         pid: u32,
     }
-    /// A hub whose files this user cannot read, or does not find.
+    /// A hub whose files this user cannot read or find.
     #[derive(Serialize)]
     struct UnreachableHubJson<'a> {
         class: &'static str,
@@ -114,7 +114,7 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
             let Some(domain) = entry.file_name().to_str().and_then(|name| Domain::at(name, base).ok()) else {
                 continue;
             };
-            // Another user's domain is not one of this user's.
+            // A domain of another user is not listed here.
             if let Ok(Some(pid)) = publisher_pid(domain.root()) {
                 let root = domain.root().to_owned();
                 lines.push(DomainJson { class: "domain", domain: domain.name().to_owned(), root, pid });
@@ -176,8 +176,9 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
     }))
 }
 
-/// Class `topic`; the rate is the hub's own measurement of the scans, null where it does not say one and for topics that
-/// come at their own time. Marks and foreground are sent while somebody listens.
+/// JSON line of class `topic`. The rate is the hub's own measurement of the scans. It is null if the hub does not
+/// report one, and for topics that are not published once per scan. Marks and foreground are published only while they
+/// have a subscriber.
 #[derive(Serialize)]
 struct TopicJson {
     class: &'static str,

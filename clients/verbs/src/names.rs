@@ -1,10 +1,11 @@
-//! Names of topics on the command line: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`, and the error if one does not exist.
+//! Names of topics on the command line: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`, and the failures for names that do
+//! not exist.
 
 use std::fmt;
 
 use scanhub_schema::{Failure, Kind, PublisherKind, ROBOT, Topic, check_any_sensor};
 
-/// One topic of one sensor.
+/// A topic of a sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TopicName {
     /// The sensor's name.
@@ -51,14 +52,15 @@ impl fmt::Display for TopicName {
     }
 }
 
-/// Returns the index of a program that publishes as `name` next to a hub. Links of a hub have indexes below 128.
+/// Returns the index of a program that publishes as `name` next to a hub. It is at least 128; links of a hub have lower
+/// indexes.
 pub fn position(name: &str) -> u8 {
     const FIRST_INDEX: u8 = 128;
     let sum = name.bytes().fold(0u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(byte.into()));
     FIRST_INDEX + (sum % u32::from(u8::MAX - FIRST_INDEX)) as u8
 }
 
-/// Returns the result of a check of a name on the command line. Its error is [`Kind::Usage`].
+/// Converts the error of a check to [`Kind::Usage`], because the name is from the command line.
 pub fn as_argument(checked: Result<(), Failure>) -> Result<(), Failure> {
     checked.map_err(|failure| Failure { kind: Kind::Usage, ..failure })
 }
@@ -68,22 +70,22 @@ fn topics() -> String {
     format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
 }
 
-/// Returns a hint with the topic that `word` may be a misspelling of. Empty if there is none.
+/// Returns a hint with the topic of which `word` may be a misspelling. The hint is empty if there is none.
 fn nearest(sensor: &str, word: &str) -> String {
     let topic = most_similar(word, Topic::ALL.into_iter().map(Topic::name));
     topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
 }
 
-/// Returns the most similar name in `known`, if `word` may be a misspelling of it.
+/// Returns the name in `known` that is most similar to `word`, if `word` may be a misspelling of it.
 fn most_similar<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let near = |known: &str| strsim::jaro_winkler(known, word);
     known.max_by(|a, b| near(a).total_cmp(&near(b))).filter(|known| near(known) > MIN_SIMILARITY)
 }
 
-/// Similarity above which a word may be a misspelling of another: 1 is equal, 0 has nothing in common.
+/// Minimum similarity of a misspelled word. 1 means equal, and 0 that nothing agrees.
 const MIN_SIMILARITY: f64 = 0.8;
 
-/// Returns the failure that the sensor of `name` has only other `topics`, now and later.
+/// Returns the failure for a topic that the sensor of `name` will never have, because it has other `topics`.
 pub fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
     let names = topics.iter().map(|topic| format!("{}/{}", name.sensor, topic.name()));
     let hint = format!("there are {}", names.collect::<Vec<_>>().join(", "));
@@ -93,7 +95,7 @@ pub fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
     Failure::new(Kind::NoTopic, format!("there is no topic {name}{publisher}"), hint)
 }
 
-/// Returns the failure that the hub has no `sensor`, with its `sensors`.
+/// Returns the failure for a `sensor` that the hub does not have. The hint lists its `sensors`.
 pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     let hint = match sensors {
         [] => "it has no sensors: `scanhub run --link NAME=PORT`".to_owned(),
@@ -106,7 +108,7 @@ pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
 }
 
-/// Selection of topics by one word of the command line.
+/// Selection of topics by one argument of the command line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TopicPattern {
     /// The sensor; `None` for all sensors.
@@ -150,17 +152,17 @@ impl TopicPattern {
     }
 }
 
-/// Selection of topics by several words of the command line.
+/// Selection of topics by all arguments of the command line.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Selection {
-    /// Topics of named sensors, each once, in the order of the words.
+    /// Topics of named sensors, each once, in the order of the arguments.
     pub(crate) named: Vec<TopicName>,
     /// Topics of all sensors, each once, in the order of [`Topic::ALL`].
     pub(crate) of_all: Vec<Topic>,
 }
 
 impl Selection {
-    /// Parses the words `texts`. Without words, the selection is empty.
+    /// Parses the arguments `texts`. The selection is empty if there are none.
     ///
     /// # Errors
     ///
@@ -170,7 +172,7 @@ impl Selection {
         let mut of_all = Vec::new();
         for text in texts {
             let pattern = TopicPattern::parse(text)?;
-            // The maker of a named sensor is unknown until its topics exist, so `SENSOR/*` selects the topics of a
+            // The publisher of a named sensor is unknown until its topics exist, so `SENSOR/*` selects the topics of a
             // link.
             let may_have =
                 |topic: Topic| pattern.sensor.is_none() || topic.publisher_kind() == PublisherKind::Link;
@@ -192,7 +194,7 @@ impl Selection {
     }
 }
 
-/// Word for all sensors, or all topics.
+/// Argument that stands for all sensors or all topics.
 const WILDCARD: &str = "*";
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! Lines on stdout and stderr. Each line is written with one call, so a killed verb leaves no partial line. A verb
-//! whose reader closes the output ends without an error.
+//! Lines on stdout and stderr. Each line is written with one call, so a killed verb leaves no partial line. A verb ends
+//! without an error if the reader of its output closes it.
 
 use std::io::{self, ErrorKind, Write};
 use std::os::fd::AsFd;
@@ -10,7 +10,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_schema::{Failure, Kind, escape_json};
 use serde::Serialize;
 
-/// Reason for the early end of a verb.
+/// Reason why a verb ends early.
 #[derive(Debug)]
 pub enum ExitReason {
     /// The reader of the output closed it.
@@ -40,12 +40,12 @@ impl From<io::Error> for ExitReason {
     }
 }
 
-/// Converts the end of a verb to its result. A reader that closes the output is normal use, as in
-/// `scanhub echo front/scan | head`.
+/// Converts the end of a verb to its result. A reader that closes the output is not an error, as in `scanhub echo
+/// front/scan | head`.
 ///
 /// # Errors
 ///
-/// Returns the failure of any other end.
+/// Returns the failure for any other reason.
 pub fn verb_result(result: Result<(), ExitReason>) -> Result<(), Failure> {
     match result {
         Ok(()) | Err(ExitReason::ReaderClosed) => Ok(()),
@@ -53,19 +53,19 @@ pub fn verb_result(result: Result<(), ExitReason>) -> Result<(), Failure> {
     }
 }
 
-/// Writer of whole lines. It reuses its buffer.
+/// Writer of whole lines, which reuses its buffer.
 pub struct Output<'a> {
     out: &'a mut dyn Write,
     line: Vec<u8>,
 }
 
 impl<'a> Output<'a> {
-    /// Creates an output of lines to `out`.
+    /// Creates an output that writes lines to `out`.
     pub fn new(out: &'a mut dyn Write) -> Output<'a> {
         Output { out, line: Vec::with_capacity(8192) }
     }
 
-    /// Writes a JSON line. Its control characters are escaped, so they have no effect on a terminal.
+    /// Writes a JSON line. Control characters are escaped, so they have no effect on a terminal.
     ///
     /// # Errors
     ///
@@ -77,8 +77,8 @@ impl<'a> Output<'a> {
         self.end()
     }
 
-    /// Writes the line of text that `build` makes without a line feed. Control characters, which move a terminal's
-    /// cursor or change its colors, become `?`: ports, types and errors may come from another machine.
+    /// Writes the line of text that `build` creates without a line feed. Control characters, which move a terminal's
+    /// cursor or change its colors, become `?`, because ports, types and errors may come from another machine.
     ///
     /// # Errors
     ///
@@ -114,7 +114,7 @@ fn escape_controls(text: &mut [u8]) {
     for at in 0..text.len() {
         let byte = text[at];
         if byte == b'\n' {
-            // A message and its remedy are in one line.
+            // A message and its remedy are printed on one line.
             text[at] = b' ';
         } else if byte < 0x20 || byte == 0x7f {
             text[at] = b'?';
@@ -125,7 +125,7 @@ fn escape_controls(text: &mut [u8]) {
     }
 }
 
-/// Writes `rows` as columns for users, each as wide as its widest cell. Numbers are aligned to the right.
+/// Writes `rows` as columns, each as wide as its widest cell. Numbers are aligned to the right.
 ///
 /// # Errors
 ///
@@ -159,15 +159,15 @@ pub fn colors() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
-/// Returns the number of columns of the terminal `out`. `None` if it is not a terminal, or has no known size.
+/// Returns the number of columns of the terminal `out`, or `None` if it is not a terminal or has no known size.
 #[cfg(feature = "record")]
 pub fn columns(out: impl AsFd) -> Option<usize> {
     let size = rustix::termios::tcgetwinsize(out).ok()?;
     Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }
 
-/// Joins `parts` with two spaces in at most `columns` columns. If they do not fit, whole parts are left out, the lowest
-/// rank first, because a cut number would read as another number. The last part stays, however long it is.
+/// Joins `parts` with two spaces in at most `columns` columns. If they do not fit, whole parts are dropped, the lowest
+/// rank first, because a truncated number would look like another number. The last part stays, even if it is too long.
 #[cfg(feature = "record")]
 pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
     let length =
@@ -181,16 +181,17 @@ pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
 }
 
 /// Writer that drops a line instead of waiting for a slow reader, so that the output does not delay the samples. It
-/// writes each piece at once or not at all.
+/// writes each piece completely or not at all.
 pub struct LossyWriter<'a, W> {
     to: &'a mut W,
-    /// Whether the verb ends. Then no samples can be delayed, and the writer waits for the reader up to `wait_budget`.
+    /// Whether the verb is ending. The writer may then wait for the reader, up to `wait_budget`, because no samples are
+    /// delayed.
     stop: &'a AtomicBool,
-    /// Time for which the writer may still wait.
+    /// Remaining time that the writer may wait.
     wait_budget: Duration,
 }
 
-/// Maximum delay of the end by a reader, over all lines. It is enough for a reader that reads at all.
+/// Maximum time for which a reader may delay the end, over all lines. It is enough for every reader that still reads.
 const MAX_READER_DELAY: Duration = Duration::from_secs(1);
 
 impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
@@ -200,7 +201,7 @@ impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
     }
 
     /// Returns whether a piece can be written without waiting. The system reports a pipe as writable if a page is free,
-    /// which is more than a line has (pipe(7), PIPE_BUF). The result is also true if the write will return an error.
+    /// which is more than a line needs (pipe(7), PIPE_BUF). The result is also true if the write will return an error.
     fn has_room(&mut self) -> bool {
         let budget = if self.stop.load(Ordering::Relaxed) { self.wait_budget } else { Duration::ZERO };
         let started = Instant::now();
@@ -219,9 +220,9 @@ impl<W: Write + AsFd> Write for LossyWriter<'_, W> {
             return Ok(bytes.len());
         }
         match self.to.write(bytes) {
-            // Another process may have made the descriptor nonblocking.
+            // Another process may have set the descriptor to nonblocking.
             Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(bytes.len()),
-            // A log on a full disk must not end the verb.
+            // A full disk must not end the verb.
             Err(error) if error.kind() != ErrorKind::BrokenPipe && !self.stop.load(Ordering::Relaxed) => {
                 Ok(bytes.len())
             }
@@ -282,7 +283,7 @@ mod tests {
         for _ in 0..1000 {
             lossy.write_all(&line).unwrap();
         }
-        // At the end, the writer waits once.
+        // At the end, the writer uses its wait budget once.
         stop.store(true, Ordering::Relaxed);
         for _ in 0..1000 {
             lossy.write_all(&line).unwrap();

@@ -1,20 +1,20 @@
-//! Counts of received and missed samples of one topic, how long it may be silent, and what the line of its sensor lost.
+//! Counters of received and missed samples of a topic, its staleness, and the losses on its sensor's line.
 
 use std::time::{Duration, Instant};
 
 use scanhub_schema::{Counter, Counters, PublishRate, Topic};
 
-/// Counts of one topic in one run.
+/// Counters of one topic in one run.
 #[derive(Clone, Debug)]
 pub struct ReceiveStats {
     topic: Topic,
-    /// Samples received.
+    /// Number of received samples.
     pub(crate) received: u64,
-    /// Samples sent meanwhile and not received: missing numbers.
+    /// Number of samples that were published during the run but not received, from gaps in their sequence numbers.
     pub(crate) missed: u64,
-    /// Number of samples received as they were sent, and the time of the first of them.
+    /// Number of samples that were received as they were sent, and arrival of the first one.
     live: Option<(u64, Instant)>,
-    /// Losses on the sensor's line in the run, if its statuses are followed.
+    /// Losses on the sensor's line during the run, if the run receives its statuses.
     pub(crate) loss: Loss,
     first: Option<Instant>,
     last: Option<Instant>,
@@ -23,7 +23,7 @@ pub struct ReceiveStats {
 }
 
 impl ReceiveStats {
-    /// Makes the counts of a topic without samples.
+    /// Creates the counters of a topic without samples.
     pub(crate) fn new(topic: Topic) -> ReceiveStats {
         ReceiveStats {
             topic,
@@ -38,8 +38,8 @@ impl ReceiveStats {
         }
     }
 
-    /// A sample came, `missed` before it did not; scans are `period_us` apart. One that `is_of_before` was sent before
-    /// anybody waited for it here, and its arrival says nothing about the rate.
+    /// Counts a sample after `missed` missed ones. Scans are `period_us` apart. A sample that `is_of_before` was sent
+    /// before the run subscribed, so its arrival is not used for the rate.
     pub(crate) fn count(&mut self, now: Instant, missed: u64, period_us: u32, is_of_before: bool) {
         self.received += 1;
         if !is_of_before {
@@ -52,7 +52,7 @@ impl ReceiveStats {
         self.is_stale_reported = false;
     }
 
-    /// Time between the first and the last sample.
+    /// Returns the time between the first and the last sample in seconds.
     pub(crate) fn seconds(&self) -> f64 {
         match (self.first, self.last) {
             (Some(first), Some(last)) => (last - first).as_secs_f64(),
@@ -60,14 +60,14 @@ impl ReceiveStats {
         }
     }
 
-    /// Returns the samples per second from the first sample that was received as it was sent to the last one. `None` if these
-    /// are less than [`scanhub_schema::MIN_RATE_SPAN`] apart.
+    /// Returns the rate in samples per second, from the first sample that was received as it was sent to the last one.
+    /// Returns `None` if these are less than [`scanhub_schema::MIN_RATE_SPAN`] apart.
     pub(crate) fn hz(&self) -> Option<f64> {
         let ((live, first), last) = (self.live?, self.last?);
         scanhub_schema::rate_hz(live - 1, last - first)
     }
 
-    /// The silence since the last sample became too long just now; said once per silence.
+    /// Returns whether the topic has become stale since the last call. Returns true once per silence.
     pub(crate) fn take_silence(&mut self, now: Instant) -> bool {
         let Some(last) = self.last else { return false };
         if self.is_stale_reported || now - last < self.deadline() {
@@ -77,32 +77,34 @@ impl ReceiveStats {
         true
     }
 
-    /// What comes each second may be late by two; of scans ten may be missing before it is worth a word.
+    /// Returns the time without a sample after which the topic is stale. A sample that is published every second may be
+    /// two seconds late, and ten scans may be missing.
     fn deadline(&self) -> Duration {
         match self.topic.spec().publish_rate {
             PublishRate::Second => Duration::from_secs(3),
-            // It comes when there is a new one.
+            // It is published only after a change.
             PublishRate::Change => Duration::MAX,
             PublishRate::Scan => (self.period * 10).max(Duration::from_secs(1)),
         }
     }
 }
 
-/// Losses on the line of a sensor in one run, from the counters of its statuses. They start at 0 when the hub restarts.
+/// Losses on a sensor's line during one run, from the counters in its statuses. The counters start at 0 when the hub
+/// restarts.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct LineLossCounter {
-    /// The hub's `boot`, its counters when the run first received them, and the last ones.
+    /// The hub's `boot`, its counters in the first status that this run received, and those in the last one.
     current_run: Option<(u64, Counters, Counters)>,
-    /// Sums of the hubs before that one.
+    /// Sums of earlier runs of the hub.
     previous_runs: Sums,
 }
 
-/// Losses on a line in a run; `None` if they are not known.
+/// Losses on a line; `None` if they are unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Loss {
-    /// Share of the bytes that were in nothing, 0 to 1.
+    /// Share of the bytes that were damaged, 0 to 1.
     pub(crate) damaged: Option<f64>,
-    /// Scans that must have been sent and did not arrive.
+    /// Number of scans that the scanner must have sent, but that did not arrive at the hub.
     pub(crate) lost_on_line: Option<u64>,
 }
 
@@ -115,13 +117,13 @@ struct Sums {
 }
 
 impl LineLossCounter {
-    /// Takes the counters of a status from the hub with this `boot`.
+    /// Adds the counters in a status of the hub with this `boot`.
     pub(crate) fn note(&mut self, boot: u64, counters: &Counters) {
         match &mut self.current_run {
             Some((life, _, last)) if *life == boot => *last = *counters,
             Some(_) => {
                 self.previous_runs = self.sums();
-                // The hub started during the run, so all its counts belong to the run.
+                // The hub was started during this run, so all its counts belong to the run.
                 self.current_run = Some((boot, Counters::default(), *counters));
             }
             None => self.current_run = Some((boot, *counters, *counters)),
@@ -197,7 +199,7 @@ mod tests {
         assert_eq!(line.loss(), Loss { damaged: None, lost_on_line: None });
         line.note(1, &counters(2000, 600, 10, 3));
         assert_eq!(line.loss(), Loss { damaged: Some(0.1), lost_on_line: Some(3) });
-        // Another life of the hub counts from 0.
+        // The counters of another run of the hub start at 0.
         line.note(2, &counters(1000, 100, 5, 2));
         assert_eq!(line.loss(), Loss { damaged: Some(0.1), lost_on_line: Some(5) });
         line.note(2, &counters(3000, 700, 50, 20));

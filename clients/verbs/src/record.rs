@@ -1,13 +1,14 @@
-//! `scanhub record`: writes what the hub publishes to MCAP files.
+//! `scanhub record`: writes the topics of a hub to MCAP files.
 //!
 //! The path of a sample, from top to bottom:
 //!
-//! 1. The topics: `RecordArgs::run` follows the selected ones, and `Recorder::run` receives their samples.
-//! 2. The queue (`Queue`) is bounded. A sample that finds no room is left out, counted, reported, and becomes part of a
+//! 1. The topics: `RecordArgs::run` subscribes to the selected ones, and `Recorder::run` receives their samples.
+//! 2. The queue (`Queue`) is bounded. A sample without room is dropped, counted and reported, and becomes part of a
 //!    `Gap` in the file.
-//! 3. The disk thread (`Disk::run`) takes the whole queue ten times a second. It alone touches the disk, so a slow, full or
-//!    missing disk does not delay any live topic.
-//! 4. The file (`Part`) makes a chunk of it and writes it. `Files` names the files and removes old ones.
+//! 3. The disk thread (`DiskWriter::run`) takes the whole queue ten times a second. Only this thread accesses the disk,
+//!    so a slow, full or missing disk does not delay any live topic.
+//! 4. The file (`RecordingFile`) builds a chunk from the entries and writes it. `Files` names the files and removes old
+//!    ones.
 //! 5. The report (`Report`) prints the progress of the disk thread and the result.
 
 mod disk;
@@ -88,7 +89,8 @@ Examples:
 The files are MCAP: any MCAP reader opens them, `scanhub replay FILE` plays them. Ctrl-C finishes the file. On a full
 disk it waits and continues; it reports what is missing, which is a gap in the file's numbers.";
 
-/// Recorded by default: telegrams, from which everything else can be computed again, and the most important results.
+/// Topics that are recorded by default: telegrams, from which all others can be computed again, and the most important
+/// results.
 const DEFAULT_TOPICS: [Topic; 9] = [
     Topic::Telegram,
     Topic::Marks,
@@ -101,31 +103,30 @@ const DEFAULT_TOPICS: [Topic; 9] = [
     Topic::Obstacles,
 ];
 
-/// Interval at which the receiving thread reads the progress of the disk thread.
+/// Interval at which the receiving thread polls the progress of the disk thread.
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Hint for a file that has no end.
+/// Hint for a file without an end.
 const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";
 
 impl RecordArgs {
-    /// Returns whether stdout carries the recording, and nothing else.
+    /// Returns whether the recording goes to stdout, which then carries nothing else.
     pub fn is_to_stdout(&self) -> bool {
         self.output.as_deref() == Some(Path::new("-"))
     }
 
-    /// Records until the bounds are reached or a signal arrives, and then finishes the file. Another signal meanwhile
-    /// ends the run at once. Progress goes to stdout, or to stderr if stdout carries the recording. Notices go to
-    /// stderr without `--json`. Lines that their reader does not take are dropped, so that they do not delay the
-    /// recording.
+    /// Records until the limits are reached or a signal arrives, and then finishes the file. Another signal during that
+    /// ends the run at once. Progress goes to stdout, or to stderr if the recording goes to stdout. Notices go to
+    /// stderr without `--json`. Lines are dropped if their reader is slow, so that they do not delay the recording.
     ///
     /// # Errors
     ///
-    /// - [`Kind::Usage`] if the topics or stdout cannot be recorded.
-    /// - [`Kind::Output`] if no file can be made, and [`Kind::Failed`] if its end cannot be written; [`Kind::ResourceExhausted`] if either
-    ///   is for lack of space.
+    /// - [`Kind::Usage`] if the topics cannot be recorded, or not to stdout.
+    /// - [`Kind::Output`] if no file can be created, and [`Kind::Failed`] if its end cannot be written. If space is
+    ///   short, both are [`Kind::ResourceExhausted`].
     /// - The errors of [`echo`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        // The file is finished, no matter which signal ends the run.
+        // Whichever signal ends the run, the file is finished.
         let (locations, stop) = (context.domain.locations()?, context.signals.any_stop()?);
         let stderr = self.is_to_stdout().then(|| context.notes.try_clone()).transpose();
         let mut stderr = stderr.map_err(no_stderr)?;
@@ -150,18 +151,17 @@ impl RecordArgs {
             following.finish(end, |name, stats| recorder.summary(name, stats))
         });
 
-        // The recording is kept if the hub or the reader of the lines went away.
+        // The recording is kept if the hub exited or the reader of the lines closed them.
         let is_kept = recorder.pushed > 0 || !matches!(end, Err(ExitReason::Failure(_)));
         let finished = recorder.finish(is_kept, &stop);
         if !is_kept && !self.is_to_stdout() {
-            // Without the hub or sensor, the run leaves no file.
+            // A run without a hub or sensor leaves no file.
             files::discard(&file);
         }
         verb_result(end).and(verb_result(finished))
     }
 
-    /// Creates the first file, or takes stdout in its place. Returns the disk thread that writes the samples of `queue`
-    /// to it.
+    /// Creates the first file, or uses stdout. Returns the disk thread that writes the samples of `queue` there.
     fn create_file(&self, locations: &[Domain], queue: &Arc<Queue>) -> Result<DiskWriter, Failure> {
         let wall_ns = clock::wall_ns();
         let default = files::default_name(wall_ns);
@@ -185,10 +185,10 @@ impl RecordArgs {
         })
     }
 
-    /// Returns the files of a run that starts at `wall_ns`, the first of which is called `path`.
+    /// Returns the files of a run that starts at `wall_ns`. The first one is called `path`.
     fn files(&self, path: &Path, wall_ns: u64) -> Result<Files, Failure> {
         let target = Target::open(path)?;
-        // A split run adds numbers to the name.
+        // With --split, the names have numbers, so `path` itself is not written.
         let is_split = self.split.is_some();
         if !is_split {
             target.check(self.force)?;
@@ -197,7 +197,7 @@ impl RecordArgs {
         Ok(Files::new(path, is_split, self.force, keep, &wall_ns.to_string()))
     }
 
-    /// Returns stdout as a file.
+    /// Returns stdout as a file, if a recording may be written there.
     fn stdout(&self) -> Result<File, Failure> {
         if self.split.is_some() {
             return Err(Failure::new(Kind::Usage, "stdout cannot be split", "leave --split out"));
@@ -211,12 +211,12 @@ impl RecordArgs {
     }
 }
 
-/// Returns the topics that `texts` name, and those of all sensors: without names, the default or `everything`. With `ros2`, they
-/// are scans, and the status of their sensors, which has their poses.
+/// Returns the topics in `texts`, as topics of named sensors and topics of all sensors. Without `texts`, these are the
+/// default topics, or all if `everything`. With `ros2`, they are scans, and statuses for the poses of the sensors.
 ///
 /// # Errors
 ///
-/// [`Kind::Usage`] if there is no such topic, no hub publishes it, or ROS has no message for it.
+/// [`Kind::Usage`] if a topic does not exist, no hub publishes it, or ROS has no message for it.
 fn selection(
     texts: &[String],
     everything: bool,
@@ -260,7 +260,7 @@ fn no_message(what: &str) -> Failure {
     Failure::new(Kind::Usage, message, hint)
 }
 
-/// Returns the description of the run in the recording.
+/// Returns the description of the run that the recording contains.
 fn description(locations: &[Domain], wall_ns: u64) -> BTreeMap<String, String> {
     let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let domain = locations.first().map(Domain::name).unwrap_or_default();
@@ -274,21 +274,21 @@ fn description(locations: &[Domain], wall_ns: u64) -> BTreeMap<String, String> {
     fields.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
 }
 
-/// Receiving side of a run: passes samples to the queue, and reports what the disk thread does.
+/// Receiving side of a run. It adds samples to the queue, and reports the events of the disk thread.
 struct Recorder<'a> {
     queue: Arc<Queue>,
     writer_thread: JoinHandle<io::Result<()>>,
     progress: Arc<WriterProgress>,
-    /// Topics of the recording, by their numbers in the queue.
+    /// Topics of the recording, by their track numbers in the queue.
     tracks: Vec<TopicName>,
-    /// Samples that were passed to the disk thread.
+    /// Number of samples that were added to the queue.
     pushed: u64,
-    /// Samples that the queue had no room for.
+    /// Number of samples for which the queue had no room.
     dropped: u64,
     gap: Option<Gap>,
     tick_at: Instant,
     report: Report<'a>,
-    /// Set at the end, when the run may wait for readers of its lines.
+    /// Set at the end of the run, when it may wait for the readers of its lines.
     is_over: &'a AtomicBool,
 }
 
@@ -319,7 +319,7 @@ impl<'a> Recorder<'a> {
         })
     }
 
-    /// Passes samples on until the run ends.
+    /// Adds samples to the queue until the run ends.
     fn run(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         while let Some(event) = following.next(None)? {
             match event {
@@ -339,7 +339,7 @@ impl<'a> Recorder<'a> {
         Ok(())
     }
 
-    /// Passes `sample` to the disk thread. After a gap, it first waits until there is room for many samples.
+    /// Adds `sample` to the queue. During a gap, it drops samples until half of the queue is free.
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), ExitReason> {
         let Some(header) = sample.header() else { return Ok(()) };
         if self.gap.is_some() {
@@ -356,7 +356,7 @@ impl<'a> Recorder<'a> {
         Ok(())
     }
 
-    /// Leaves out a sample for which there is no room, and all that follow until there is room for many.
+    /// Drops a sample for which the queue has no room. This starts a gap, which lasts until half of the queue is free.
     fn drop_sample(&mut self, name: &TopicName) -> Result<(), ExitReason> {
         self.dropped += 1;
         let is_first = self.gap.is_none();
@@ -369,7 +369,7 @@ impl<'a> Recorder<'a> {
         if is_first { self.report.gap_begins() } else { Ok(()) }
     }
 
-    /// Ends the gap, and notes it in the file.
+    /// Ends the gap, and adds it to the file.
     fn end_gap(&mut self) -> Result<(), ExitReason> {
         let Some(mut gap) = self.gap.take() else { return Ok(()) };
         gap.to_ns = clock::wall_ns();
@@ -378,7 +378,7 @@ impl<'a> Recorder<'a> {
         reported
     }
 
-    /// Reports progress and news of the disk thread.
+    /// Reports progress and events of the disk thread.
     fn report_progress(&mut self) -> Result<(), ExitReason> {
         let stats = self.progress.take_stats();
         for event in stats.events.iter() {
@@ -390,14 +390,14 @@ impl<'a> Recorder<'a> {
         self.report.progress(&stats, self.dropped)
     }
 
-    /// Reports what was received of a topic, at the end of the run.
+    /// Reports the counters of a topic at the end of the run.
     fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), ExitReason> {
         self.is_over.store(true, Ordering::Relaxed);
         self.report.topic(name, stats)
     }
 
-    /// Waits until everything is written, and reports the result if the recording `stays`. A second request to stop ends the
-    /// wait.
+    /// Waits until everything is written, and reports the result if the recording `is_kept`. A second request to stop
+    /// ends the wait.
     fn finish(mut self, is_kept: bool, stop: &AtomicBool) -> Result<(), ExitReason> {
         self.is_over.store(true, Ordering::Relaxed);
         stop.store(false, Ordering::Relaxed);
@@ -428,16 +428,16 @@ impl<'a> Recorder<'a> {
     }
 }
 
-/// Distinguishes a second request to stop from the signals that belong to the first one. A shell that loses its terminal
-/// sends another SIGHUP than the terminal, and both may arrive after SIGINT. They come within a second, but a busy machine
-/// may not run this process for that long. Therefore polls are counted, and not time.
+/// Distinguishes a second request to stop from further signals of the first one. A shell that loses its terminal sends
+/// another SIGHUP than the terminal, and both may arrive after SIGINT. They arrive within a second, but a busy machine
+/// may not run this process for that time. Therefore polls are counted instead of time.
 #[derive(Default)]
 struct SecondStop {
     polls: u32,
 }
 
 impl SecondStop {
-    /// Polls that take the signals of one request.
+    /// Number of polls during which signals belong to the first request.
     const POLLS_PER_REQUEST: u32 = 20;
 
     /// Counts a poll. Returns whether a signal since the last poll is a second request to stop.
@@ -447,7 +447,7 @@ impl SecondStop {
     }
 }
 
-/// Returns the kind of failure for the error of a write. It is temporary if the disk or a quota is full.
+/// Returns the kind of failure for a write error. It is temporary if the disk or a quota is full.
 fn kind(error: &io::Error) -> Kind {
     match error.kind() {
         ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => {
@@ -457,7 +457,7 @@ fn kind(error: &io::Error) -> Kind {
     }
 }
 
-/// Returns the failure to make a file at `path`.
+/// Returns the failure for a file that cannot be created at `path`.
 fn no_file(path: &Path, is_split: bool, error: &io::Error) -> Failure {
     let hint = match error.kind() {
         ErrorKind::AlreadyExists if is_split => {
@@ -483,7 +483,7 @@ fn no_stderr(error: io::Error) -> Failure {
     Failure::new(Kind::Failed, format!("no stderr: {error}"), "")
 }
 
-/// Returns the failure that the reader of stdout went away. It has an incomplete recording.
+/// Returns the failure for a reader that has closed stdout. The reader has an incomplete recording.
 fn reader_closed(samples: u64) -> Failure {
     let what = format!("the reader of the recording is gone: it has at most {samples} samples");
     let hint = "see why the program or the connection behind the pipe ended; `scanhub convert` writes a copy with an index";
@@ -497,7 +497,7 @@ mod tests {
     #[test]
     fn second_stop_request_differs_from_repeated_signals() {
         let mut second = SecondStop::default();
-        // A signal at every poll, however long each of them takes.
+        // A signal at every poll belongs to the first request, however long the polls take.
         assert!((0..SecondStop::POLLS_PER_REQUEST).all(|_| !second.poll(true)));
         assert!(!second.poll(false));
         assert!(second.poll(true));

@@ -1,9 +1,9 @@
-//! Adds the new name of a flag to the error for its old name.
+//! Hint at the new name of a flag in the error for its old name.
 
 use clap::error::{ContextKind, ContextValue};
 use scanhub_schema::renamed;
 
-/// Returns `error`, with the new name as its tip if it is the error for a flag whose name has changed.
+/// Returns `error`. If it is about a flag that was renamed, a tip with the new name is added.
 pub fn with_new_name(mut error: clap::Error) -> clap::Error {
     let new = match error.get(ContextKind::InvalidArg) {
         Some(ContextValue::String(flag)) => renamed(flag),

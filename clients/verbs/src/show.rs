@@ -1,7 +1,7 @@
-//! Shows the payload of each topic as a line of JSON and as a line for people, whether it was received through shared
-//! memory or from a network.
+//! JSON lines and text lines for the payloads of all topics, received through shared memory or from a network.
 //!
-//! It follows from the table of topics: modules `json` and `text` have a function with the name of each topic.
+//! The code is generated from the table of topics: modules `json` and `text` have a function for each topic, with the
+//! topic's name.
 
 use std::io;
 
@@ -14,9 +14,9 @@ use serde::Serialize;
 use crate::output::{ExitReason, Output};
 use crate::{json, text};
 
-/// Takes the keys of one line.
+/// Destination of the keys of one line.
 pub trait Keys {
-    /// Writes them.
+    /// Writes the keys.
     fn take(self, keys: impl Serialize) -> Result<(), ExitReason>;
 }
 
@@ -26,24 +26,25 @@ impl Keys for &mut Output<'_> {
     }
 }
 
-/// The payload of a topic.
+/// A payload that can be printed.
 pub trait Show {
-    /// The line of JSON, given to `to`.
+    /// Passes the JSON line to `to`.
     fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), ExitReason>;
 
-    /// What stands behind the topic's name on a line for people.
+    /// Writes the text after the topic's name.
     fn text(&self, header: &Header, line: &mut Vec<u8>) -> io::Result<()>;
 }
 
-/// Implements [`Show`] for the payloads of all topics, with the functions of `json` and `text` that have the topic's name.
+/// Implements [`Show`] for the payloads of all topics. It uses the functions of `json` and `text` that have the topic's
+/// name.
 macro_rules! shown {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         $(shown! { $payload, $name })*
     };
-    // Implemented below.
+    // Zones are implemented below, because they become an update first.
     (Zones, $name:ident) => {};
     (Event, $name:ident) => { shown! { @impl Event, event(header) } };
-    // Classes without the numbers and stamps of the sample.
+    // Classes without the sequence numbers and stamps of the sample.
     (Background, $name:ident) => { shown! { @impl Background, $name() } };
     (Status, $name:ident) => { shown! { @impl Status, $name() } };
     ($payload:tt, $name:ident) => {
@@ -65,7 +66,7 @@ macro_rules! shown {
 
 scanhub_schema::for_each_topic!(shown);
 
-/// Shows the zones as they were received. The caller has checked their age.
+/// Prints the zones as received. The caller must have checked their age.
 impl Show for Zones {
     fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), ExitReason> {
         to.take(json::zones(sensor, &zones_update(self, header)))
@@ -80,7 +81,7 @@ fn zones_update(zones: &Zones, header: &Header) -> ZonesUpdate {
     ZonesUpdate { zones: *zones, header: Some(*header), missed: 0, stale: false, as_published: *zones }
 }
 
-/// What was received.
+/// A received sample that can be printed.
 trait ShowSample {
     fn json(&self, sensor: &str, to: impl Keys) -> Result<(), ExitReason>;
     fn text(&self, line: &mut Vec<u8>) -> io::Result<()>;
@@ -118,7 +119,7 @@ impl ShowSample for RobotUpdate {
 
 macro_rules! samples {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        /// The line of JSON of a sample of `sensor`.
+        /// Passes the JSON line of a sample of `sensor` to `to`.
         pub fn json(sample: &Sample, sensor: &str, to: impl Keys) -> Result<(), ExitReason> {
             match sample {
                 $(Sample::$topic(sample) => sample.json(sensor, to),)*
@@ -126,7 +127,7 @@ macro_rules! samples {
             }
         }
 
-        /// What stands behind the topic's name on a line for people.
+        /// Writes the text of a sample after the topic's name.
         pub fn text(sample: &Sample, line: &mut Vec<u8>) -> io::Result<()> {
             match sample {
                 $(Sample::$topic(sample) => sample.text(line),)*

@@ -1,4 +1,5 @@
-//! The classes of `--json` as text for people: one line per sample, the most important values first. Not a contract.
+//! The classes of `--json` as text for users: one line per sample, the most important values first. The text is not a
+//! contract.
 
 use std::f64::consts::TAU;
 use std::fmt;
@@ -18,7 +19,7 @@ use crate::names::TopicName;
 use crate::receive_stats::ReceiveStats;
 use crate::show;
 
-/// Bytes as lower hex, without spaces.
+/// Formats bytes as lowercase hex digits without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);
 
 impl fmt::Display for Hex<'_> {
@@ -27,13 +28,13 @@ impl fmt::Display for Hex<'_> {
     }
 }
 
-/// One sample.
+/// Writes a line for a sample.
 pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> io::Result<()> {
     write!(line, "{name} ")?;
     show::text(sample, line)
 }
 
-/// One notice, for stderr; news of the hub are the same for all streams.
+/// Writes a line for a notice, which goes to stderr. A notice about the hub is the same for all topics.
 pub(crate) fn notice(line: &mut Vec<u8>, names: &[Rc<TopicName>], notice: &Notice) -> io::Result<()> {
     match notice {
         Notice::NoHub(Failure { message, hint, .. }) => {
@@ -52,13 +53,13 @@ pub(crate) fn notice(line: &mut Vec<u8>, names: &[Rc<TopicName>], notice: &Notic
     }
 }
 
-/// The end of a run.
+/// Writes the summary of a topic at the end of a run.
 pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, stats: &ReceiveStats) -> io::Result<()> {
     write!(line, "{name}: {} received, {} missed in {:.1} s", stats.received, stats.missed, stats.seconds())?;
     if let Some(hz) = stats.hz() {
         write!(line, ", {hz:.2} Hz")?;
     }
-    // That nothing was is not worth a word.
+    // Print losses only if there are any.
     if let Some(lost) = stats.loss.lost_on_line.filter(|&lost| lost > 0) {
         write!(line, ", {lost} lost on the line")?;
     }
@@ -83,7 +84,7 @@ fn numbers(line: &mut Vec<u8>, header: &Header) -> io::Result<()> {
     if header.flags & Flags::STAMP_ESTIMATED != 0 { write!(line, " stamp_estimated") } else { Ok(()) }
 }
 
-/// What follows the name of a sample of topic `telegram`.
+/// Writes the text after the name of a sample of topic `telegram`.
 pub(crate) fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io::Result<()> {
     const MAX_BYTES_SHOWN: usize = 16;
     numbers(line, header)?;
@@ -101,11 +102,11 @@ pub(crate) fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io:
     if bytes.len() > MAX_BYTES_SHOWN { write!(line, "...") } else { Ok(()) }
 }
 
-/// What follows the name of a sample of topic `scan`.
+/// Writes the text after the name of a sample of topic `scan`.
 pub(crate) fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
     numbers(line, header)?;
     let beams = scan.beams();
-    // Those of the grid: exact ones of the first beams may be a turn more or less.
+    // Use the angles of the grid, because exact angles of the first beams may differ by a full revolution.
     let (first, last) = (scan.first_angle, scan.first_angle + scan.step * beams.saturating_sub(1) as f64);
     if (last - first).abs() + scan.step.abs() > TAU - 1e-6 {
         write!(line, " {beams} beams all around")?;
@@ -116,7 +117,7 @@ pub(crate) fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Resu
     write!(line, " {} valid", valid.clone().count())?;
     match valid.min() {
         Some((mm, i)) => {
-            // The shorter way around from ahead.
+            // Print the angle between -180 and 180 degrees.
             let angle = scan.angle(i);
             let turns = (angle / TAU).round();
             write!(line, " nearest {mm} mm at {} deg", in_degrees(angle - TAU * turns))
@@ -125,7 +126,7 @@ pub(crate) fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Resu
     }
 }
 
-/// What follows the name of a sample of topic `status`.
+/// Writes the text after the name of a sample of topic `status`.
 pub(crate) fn status(line: &mut Vec<u8>, status: &Status) -> io::Result<()> {
     let state = status.state().map_or("unknown", |state| state.name());
     write!(line, "{state} {} Bd ", status.baud)?;
@@ -149,7 +150,7 @@ pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::R
         return write!(line, " {why}: set link.NAME.marks.level");
     }
     if !marks.is_available() {
-        // A sample does not tell whether the mode of a recording is known; `info` does.
+        // A sample does not show whether the mode of a recording is known; `info` does.
         return if header.flags & Flags::REPLAYED != 0 {
             write!(
                 line,
@@ -242,7 +243,7 @@ pub(crate) fn zones(line: &mut Vec<u8>, update: &ZonesUpdate) -> io::Result<()> 
     if zones.invalid_beams > 0 { write!(line, ", {} invalid", zones.invalid_beams) } else { Ok(()) }
 }
 
-/// The fold over all sensors.
+/// Writes the combined verdict of all sensors.
 pub(crate) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
     write!(line, "{}", robot.verdict().name())?;
     match robot.nearest() {
@@ -255,7 +256,7 @@ pub(crate) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
     Ok(())
 }
 
-/// In place of what is nearest, where no beam met anything.
+/// Returns the text in place of the nearest range if no beam has one.
 fn without_nearest(verdict: Verdict) -> &'static str {
     if verdict == Verdict::Unknown { "nearest not known" } else { "nothing near" }
 }
@@ -340,7 +341,7 @@ pub(crate) fn cloud(line: &mut Vec<u8>, header: &Header, cloud: &Cloud) -> io::R
     sweep_text(line, cloud.has(Cloud::COMPLETE), cloud.has(Cloud::UNRELIABLE))
 }
 
-/// Writes number and stamp of a sweep, and its obstacles.
+/// Writes sequence number and stamp of a sweep, and its obstacles.
 ///
 /// # Errors
 ///

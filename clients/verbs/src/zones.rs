@@ -1,5 +1,5 @@
-//! `scanhub zones SENSOR mask`: learns what a sensor sees of its own robot, and prints a configuration with which the
-//! hub ignores it. `body` decides what belongs to the robot. Printing changes nothing by itself.
+//! `scanhub zones SENSOR mask`: learns which readings of a sensor are its own robot, and prints a configuration with
+//! which the hub ignores them. Module `body_mask` computes them. The configuration of the hub is not changed.
 
 mod body_mask;
 
@@ -48,15 +48,15 @@ enum ZonesCommand {
 }
 
 impl ZonesArgs {
-    /// Observes the sensor for a while, then writes its mask to stdout as TOML for the hub, and warnings about it to
-    /// stderr. A terminal there shows the progress.
+    /// Observes the sensor for a while, and then writes its mask to stdout as TOML for the hub, with warnings on
+    /// stderr. If stderr is a terminal, it shows the progress.
     ///
     /// # Errors
     ///
     /// - [`Kind::Configuration`] if a value is not valid.
-    /// - [`Kind::NoHub`] and [`Kind::NoTopic`] as [`EchoArgs::run`](crate::echo::EchoArgs::run).
+    /// - [`Kind::NoHub`] and [`Kind::NoTopic`] as for [`EchoArgs::run`](crate::echo::EchoArgs::run).
     /// - [`Kind::Timeout`] if too few scans arrived.
-    /// - [`Kind::Failed`] if the hub went away, or the sensor's settings changed meanwhile.
+    /// - [`Kind::Failed`] if the hub exited, or the sensor's settings changed during the observation.
     /// - [`Kind::Interrupted`] if a signal stops the run.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
@@ -110,26 +110,26 @@ impl ZonesArgs {
     }
 }
 
-/// What comes in while one looks.
+/// State of an observation.
 struct Observation<'a> {
     run_for: Duration,
     since: Instant,
     pose: Option<Pose>,
     within_mm: Option<f64>,
-    /// Samples of zones with circles.
+    /// Number of zones samples with at least one zone.
     verdicts: u32,
-    /// Those of them in which the largest circle is violated.
+    /// Number of those samples in which the largest zone is violated.
     violated: u32,
     body: Option<Body>,
     notes: &'a mut File,
-    /// Whether the line of progress is shown; `None` if `notes` is not a terminal, which never has the line.
+    /// Whether the progress line is shown; always `None` if `notes` is not a terminal.
     is_shown: Option<bool>,
     /// Number of seconds whose progress was shown.
     shown_seconds: u64,
 }
 
 impl Observation<'_> {
-    /// What was seen, if it is enough to tell a body from noise.
+    /// Returns the body and the radius in mm, if the observation is sufficient to distinguish a body from noise.
     fn result(&self, sensor: &str) -> Result<(&Body, f64), Failure> {
         let few = |message: String, hint: String| Err(Failure::new(Kind::Timeout, message, hint));
         let see = format!("`scanhub info {sensor}` shows its state");
@@ -150,7 +150,7 @@ impl Observation<'_> {
         }
     }
 
-    /// The largest circle is violated all the while.
+    /// Returns whether the largest zone was violated during nearly the whole observation.
     fn is_violated(&self) -> bool {
         self.verdicts > 0 && f64::from(self.violated) >= MIN_VIOLATED_SHARE * f64::from(self.verdicts)
     }
@@ -181,7 +181,7 @@ impl Observation<'_> {
                 self.verdicts += 1;
                 self.violated += u32::from(largest.violated != 0);
             }
-            // A telegram that may be broken is no evidence.
+            // Ignore suspect telegrams, because they may be damaged.
             Sample::Scan(scan) if scan.header().quality() == Quality::Clean => {
                 let slice = self.slice();
                 if let (Some(pose), Some(within_mm)) = (self.pose, self.within_mm) {
@@ -221,7 +221,7 @@ impl Observation<'_> {
         }
     }
 
-    /// Removes the line of progress.
+    /// Removes the progress line.
     fn clear(&mut self) {
         if self.is_shown == Some(true) {
             let _ = write!(self.notes, "\r\x1b[K");
@@ -230,25 +230,25 @@ impl Observation<'_> {
     }
 }
 
-/// What was found, to be told.
+/// Result of an observation, for output.
 struct MaskReport<'a> {
     sensor: &'a str,
     run_for: Duration,
     within_mm: f64,
     scans: u32,
     mask: Mask,
-    /// The hub finds something in the largest circle all the while.
+    /// Whether the hub reported an object in the largest zone nearly all the time.
     is_violated: bool,
 }
 
 impl MaskReport<'_> {
-    /// What a person should check before using the mask.
+    /// Returns the points that the user should check before using the mask.
     fn warnings(&self) -> Vec<String> {
         let within = meters(self.within_mm as u32);
         let mut warnings = Vec::new();
         if self.mask.sectors.is_empty() {
             let so = if self.is_violated {
-                // The hub adds zones.margin to its circles, and keeps it to itself.
+                // The hub adds zones.margin to its circles, but does not publish it.
                 "but the largest circle is violated all the time. If by the robot, look farther: --within RADIUS, \
                  at least the circle's and zones.margin"
             } else {
@@ -277,7 +277,7 @@ impl MaskReport<'_> {
         self.mask.sectors.iter().map(|sector| sector.beams).sum()
     }
 
-    /// The section of the link that masks the body.
+    /// Returns the configuration section of the link that masks the body.
     fn toml(&self) -> String {
         let MaskReport { sensor, run_for, scans, mask, .. } = self;
         let mut text = format!(
@@ -299,7 +299,7 @@ impl MaskReport<'_> {
         text + "]\n"
     }
 
-    /// Class `mask`.
+    /// Returns the line of class `mask`.
     fn object(&self) -> impl Serialize {
         #[derive(Serialize)]
         struct MaskJson<'a> {
@@ -313,7 +313,7 @@ impl MaskReport<'_> {
             body_mask: Vec<Part>,
             moving: Vec<Part>,
         }
-        /// As in the configuration: degrees and metres.
+        /// Sector in the units of the configuration: degrees and meters.
         #[derive(Serialize)]
         struct Part {
             from_deg: f64,
@@ -339,7 +339,7 @@ impl MaskReport<'_> {
     }
 }
 
-/// As TOML has it: 1000 is 1.0.
+/// Formats a range in meters as a TOML number: 1000 mm is 1.0.
 fn meters(mm: u32) -> String {
     format!("{:?}", f64::from(mm) / 1000.0)
 }
@@ -348,11 +348,11 @@ fn degrees(mdeg: i32) -> String {
     format!("{:?}", f64::from(mdeg) / 1000.0)
 }
 
-/// Fewer tell little of noise: five in each slice.
+/// Minimum number of scans, five per slice. With fewer, the body cannot be distinguished from noise.
 const MIN_SCANS: u32 = 50;
-/// Of the zones' samples, so that one scan without a reading changes nothing.
+/// Minimum share of zones samples with a violated zone, so that single scans without a reading do not matter.
 const MIN_VIOLATED_SHARE: f64 = 0.9;
-/// As large as a circle of the zones may be.
+/// Maximum radius of a zone in meters.
 const MAX_DISTANCE_M: f64 = 65.0;
-/// A robot hides at most the third part of its sensor's view; more will be the room around it.
+/// Divisor of the number of beams: if the mask hides more than a third of the view, it probably includes the room.
 const HIDDEN_VIEW_DIVISOR: usize = 3;

@@ -1,5 +1,5 @@
-//! The classes of results that the hub and its clients compute from scans: marks, lines, motion, zones, foreground, people,
-//! tilt and obstacles. A contract, like its parent module.
+//! Classes of results that the hub and its clients compute from scans: marks, lines, motion, zones, foreground, people,
+//! tilt and obstacles. They are a contract like those of the parent module.
 
 use scanhub_client::{Robot, ZonesUpdate};
 use scanhub_schema::{
@@ -10,7 +10,7 @@ use serde::{Serialize, Serializer};
 
 use super::{FlagNames, SampleKeys};
 
-/// Class `marks`.
+/// Returns the line of class `marks`.
 pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -32,7 +32,7 @@ pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> i
     }
 }
 
-/// Class `lines`.
+/// Returns the line of class `lines`.
 pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -61,7 +61,7 @@ pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> i
     }
 }
 
-/// Class `motion`; what is not known is null.
+/// Returns the line of class `motion`. Unknown values are null.
 pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -104,7 +104,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
     }
 }
 
-/// Class `early`.
+/// Returns the line of class `early`.
 pub(crate) fn early<'a>(sensor: &'a str, header: &Header, early: &Early) -> impl Serialize + use<'a> {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -132,7 +132,7 @@ pub(crate) fn early<'a>(sensor: &'a str, header: &Header, early: &Early) -> impl
     }
 }
 
-/// Class `zones`; a silence has neither numbers nor stamps.
+/// Returns the line of class `zones`. A line about a silence has neither sequence numbers nor stamps.
 pub(crate) fn zones<'a>(sensor: &'a str, update: &'a ZonesUpdate) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -170,7 +170,8 @@ pub(crate) fn zones<'a>(sensor: &'a str, update: &'a ZonesUpdate) -> impl Serial
     }
 }
 
-/// Class `zones` of the robot: the fold over its sensors after `heard`, the last sample of one of them.
+/// Returns the line of class `zones` of the robot: the combined verdict after `update`, the last zones of one of its
+/// sensors.
 pub(crate) fn robot<'a>(robot: &'a Robot, update: &ZonesUpdate) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -200,7 +201,7 @@ pub(crate) fn robot<'a>(robot: &'a Robot, update: &ZonesUpdate) -> impl Serializ
     }
 }
 
-/// Class `foreground`.
+/// Returns the line of class `foreground`.
 pub(crate) fn foreground<'a>(
     sensor: &'a str,
     header: &Header,
@@ -302,7 +303,7 @@ fn corner_list<S: Serializer>(corners: &[Corner], serializer: S) -> Result<S::Ok
     }))
 }
 
-/// As many digits as there is sense in: six behind the point.
+/// Rounds to six decimals; more would be noise.
 fn millionths(value: impl Into<f64>) -> f64 {
     (1e6 * value.into()).round() / 1e6
 }
@@ -359,7 +360,7 @@ fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok,
     serializer.collect_seq(foreground.readings().map(|(beam, _)| beam))
 }
 
-/// Class `tracks`.
+/// Returns the line of class `tracks`.
 pub fn tracks<'a>(sensor: &'a str, header: &Header, tracks: &'a Tracks) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -373,7 +374,7 @@ pub fn tracks<'a>(sensor: &'a str, header: &Header, tracks: &'a Tracks) -> impl 
     MarksJson { stamp: SampleKeys::new("tracks", sensor, header), tracks, flags: FlagNames::of(header) }
 }
 
-/// Class `event`.
+/// Returns the line of class `event`.
 pub fn event<'a>(sensor: &'a str, header: &Header, event: &'a Event) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -434,12 +435,12 @@ fn track_list<S: Serializer>(tracks: &Tracks, serializer: S) -> Result<S::Ok, S:
     }))
 }
 
-/// A millimetre is as much as there is sense in.
+/// Rounds to a millimeter; more would be noise.
 fn thousandths(value: f32) -> f64 {
     (1e3 * f64::from(value)).round() / 1e3
 }
 
-/// Class `tilt`.
+/// Returns the line of class `tilt`.
 pub(crate) fn tilt<'a>(sensor: &'a str, header: &Header, tilt: &Tilt) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -458,7 +459,7 @@ pub(crate) fn tilt<'a>(sensor: &'a str, header: &Header, tilt: &Tilt) -> impl Se
     }
 }
 
-/// Class `cloud`.
+/// Returns the line of class `cloud`.
 pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -494,7 +495,7 @@ pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> i
     }
 }
 
-/// Class `obstacles`.
+/// Returns the line of class `obstacles`.
 pub fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {
@@ -636,7 +637,7 @@ mod tests {
             |beam, point_class| CloudPoint { at: [1.0, -2.5, 0.1234], beam, point_class, reserved: 0 };
         let flags = Cloud::FIRST | Cloud::COMPLETE;
         let head = CloudHead { sweep: 3, generation: 1, flags, ..CloudHead::default() };
-        // A class that is not known says nothing.
+        // An unknown point class is printed as 0.
         let line = letters(cloud("house", &header(), &Cloud::of(head, &[point(90, 2), point(91, 9)])));
         let rest = r#""sweep":3,"generation":1,"first":true,"last":false,"complete":true,"unreliable":false,"points":[[1.0,-2.5,0.123],[1.0,-2.5,0.123]],"beams":[90,91],"classes":[2,0]}"#;
         assert_eq!(line, format!(r#"{{"class":"cloud",{HEAD}{rest}"#));

@@ -1,4 +1,4 @@
-//! Splits the age of a sample into spans, as far as its stamps allow, and keeps a histogram of each span.
+//! Spans of the age of a sample, as far as its stamps allow, with a histogram of each span.
 
 use hdrhistogram::Histogram;
 use scanhub_schema::{Flags, Header};
@@ -6,29 +6,29 @@ use serde::Serialize;
 
 use crate::follow::Arrival;
 
-/// Part of the time between the first byte of a telegram and the arrival of its sample here.
+/// Part of the time between the first byte of a telegram and the arrival of its sample in this process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Span {
-    /// From the first byte of the telegram to its last: the time on the line.
+    /// From the first byte of the telegram to its last byte: the time on the line.
     Line,
-    /// From the first byte on another machine to the arrival on this one, by the wall clocks of both.
+    /// From the first byte on another machine to the arrival on this machine, by the wall clocks of both.
     Network,
-    /// From the last byte until the hub sent it.
+    /// From the last byte until the hub sent the sample.
     Hub,
-    /// From the time at which the hub sent it until it was received here.
+    /// From the time at which the hub sent the sample until this process received it.
     Wake,
-    /// The age on arrival: from the last byte, or the arrival on this machine, until it was received here.
+    /// Age on arrival: from the last byte, or the arrival on this machine, until this process received the sample.
     Age,
-    /// From the first byte until it was received here.
+    /// From the first byte until this process received the sample.
     Total,
 }
 
 impl Span {
-    /// In the order of their times.
+    /// All spans in the order of their times.
     pub(super) const ALL: [Span; 6] =
         [Span::Line, Span::Network, Span::Hub, Span::Wake, Span::Age, Span::Total];
 
-    /// Name in all output.
+    /// Returns the name that all output uses.
     pub(super) fn name(self) -> &'static str {
         match self {
             Span::Line => "line",
@@ -43,16 +43,17 @@ impl Span {
 
 /// Spans of all samples of one topic.
 pub(super) struct Spans {
-    /// Since when samples are received as they are sent.
+    /// Time on CLOCK_MONOTONIC in ns since which samples are received as they are sent.
     since_ns: u64,
-    /// All samples.
+    /// Number of all samples.
     pub(super) received: u64,
-    /// Samples that were sent before this process waited for them: those that a topic keeps for late subscribers, and the
-    /// first ones of a new hub.
+    /// Number of samples that were sent before this process waited for them: those in the history, and the first ones
+    /// of a new hub.
     pub(super) before: u64,
-    /// Samples with stamps ahead of the clock of this machine, for example by the wall clock of another one.
+    /// Number of samples whose stamp is ahead of this machine's clock, for example because another machine's wall clock
+    /// is.
     pub(super) in_future: u64,
-    /// Bits of [`Flags`] that any sample had.
+    /// Bits of [`Flags`] that at least one sample had.
     pub(super) flags: u8,
     ages: [Ages; Span::ALL.len()],
 }
@@ -63,7 +64,7 @@ impl Spans {
         Spans { since_ns: u64::MAX, received: 0, before: 0, in_future: 0, flags: 0, ages }
     }
 
-    /// Does not measure samples that were sent before `now_ns` of CLOCK_MONOTONIC.
+    /// Excludes samples that were sent before `now_ns` on CLOCK_MONOTONIC from the measurement.
     pub(super) fn begin(&mut self, now_ns: u64) {
         self.since_ns = now_ns;
     }
@@ -72,7 +73,7 @@ impl Spans {
         &self.ages[span as usize]
     }
 
-    /// Takes the times of a sample that arrived at `seen`.
+    /// Records the spans of a sample that was received at `arrival`.
     pub(super) fn take(&mut self, header: &Header, arrival: Arrival) {
         self.received += 1;
         self.flags |= header.flags;
@@ -86,7 +87,7 @@ impl Spans {
         };
         self.record(Span::Age, age_ns);
         if let Some(hub_ns) = header.hub_time_ns() {
-            // The header contains it rounded up.
+            // The header has a value that is rounded up.
             let hub_ns = hub_ns.min(age_ns);
             self.record(Span::Hub, hub_ns);
             self.record(Span::Wake, age_ns - hub_ns);
@@ -113,11 +114,11 @@ impl Spans {
     }
 }
 
-/// A listener that receives nothing publishes a sample of its own, stamped by both clocks of this machine one after the other.
-/// A network takes longer than this.
+/// Maximum difference in ns between the stamps of a sample that a listener publishes itself when it receives nothing.
+/// It reads both clocks of this machine one after the other. Transmission over a network takes longer.
 const OWN_SAMPLE_NS: u64 = 10_000;
 
-/// Returns whether both stamps come from a telegram. They are equal in a sample that was published without one.
+/// Returns whether both stamps come from a telegram. They are equal in a sample that was published without a telegram.
 fn is_from_telegram(header: &Header) -> bool {
     header.flags & Flags::STAMP_ESTIMATED == 0 && header.stamp_first_ns < header.stamp_last_ns
 }
@@ -129,7 +130,7 @@ pub(super) struct Ages {
     max_ns: u64,
 }
 
-/// Quantiles of times. Minimum and maximum are exact, the others are at most a thousandth too great.
+/// Quantiles of times. Minimum and maximum are exact, and the others are at most 0.1 % too high.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub(super) struct Quantiles {
     pub(super) count: u64,
@@ -141,7 +142,7 @@ pub(super) struct Quantiles {
     pub(super) max_ns: u64,
 }
 
-/// Number of times in `from_ns..to_ns`.
+/// Number of times from `from_ns` up to but not including `to_ns`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct HistogramBin {
     pub(super) from_ns: u64,
@@ -179,7 +180,7 @@ impl Ages {
         })
     }
 
-    /// Returns the bars from the minimum to the maximum, with the edges of [`BIN_EDGES`] and 0.
+    /// Returns the bins from the minimum to the maximum, whose edges are 0 and those of [`BIN_EDGES`].
     pub(super) fn bins(&self) -> Vec<HistogramBin> {
         let mut bins: Vec<HistogramBin> = Vec::new();
         let mut edges = edges();
@@ -202,7 +203,7 @@ impl Ages {
     }
 }
 
-/// Edges between bars in each power of ten, from 1 us on.
+/// Edges between bins in each power of ten, starting at 1 us.
 const BIN_EDGES: [u64; 7] = [1, 2, 3, 4, 5, 6, 8];
 
 fn edges() -> impl Iterator<Item = u64> {
@@ -216,7 +217,7 @@ mod tests {
 
     const US: u64 = 1000;
 
-    /// A telegram that took 15 ms, sent 40 us after its last byte.
+    /// Returns the header of a telegram that took 15 ms and was sent 40 us after its last byte.
     fn header(last_ns: u64) -> Header {
         let (first, wall_ns) = (last_ns - 15_000 * US, 1_700_000_000_000_000_000 + last_ns);
         let mut header =
@@ -225,7 +226,7 @@ mod tests {
         header
     }
 
-    /// So long after `header`'s last byte.
+    /// Returns the arrival `age_ns` after the last byte of `header`.
     fn arrival_after(header: &Header, age_ns: u64) -> Arrival {
         Arrival { monotonic_ns: header.stamp_last_ns + age_ns, wall_ns: 0 }
     }
@@ -236,7 +237,7 @@ mod tests {
         spans
     }
 
-    /// Greatest time and count of each known span, in us.
+    /// Returns name, maximum in us and count of each known span.
     fn known_spans(spans: &Spans) -> Vec<(&'static str, u64, u64)> {
         let max_and_count = |span: Span| {
             let quantiles = spans.ages(span).quantiles()?;
@@ -314,11 +315,11 @@ mod tests {
         spans.take(&remote(8_999_000 * US), arrival_time);
         let parts = known_spans(&spans);
         assert_eq!(parts, [("network", 1_000, 1), ("age", 50, 1), ("total", 1_050, 1)]);
-        // Its wall clock is ahead: the stretch here is known all the same.
+        // Its wall clock is ahead, but the time on this machine is known.
         spans.take(&remote(9_001_000 * US), arrival_time);
         assert_eq!((spans.in_future, known_spans(&spans)[1]), (1, ("age", 50, 2)));
         assert_eq!((known_spans(&spans)[0].2, known_spans(&spans)[2].2), (1, 1));
-        // Said here, when nothing came.
+        // Samples that a listener publishes itself when it receives nothing.
         for wall_ns in [9_000_000 * US - 300, 9_000_000 * US + 300] {
             spans.take(&remote(wall_ns), arrival_time);
         }

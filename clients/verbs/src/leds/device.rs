@@ -1,5 +1,5 @@
-//! An LED of the machine, which Linux offers as a directory of files (Documentation/leds/leds-class.rst). It is written only
-//! when its state changes, and used again when it comes back. Time is an argument.
+//! An LED of the machine, which Linux provides as a directory of files (Documentation/leds/leds-class.rst). It is
+//! written only when its state changes, and used again after it was unavailable. Time is an argument.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -9,34 +9,35 @@ use std::time::{Duration, Instant};
 
 use scanhub_schema::{Failure, Kind};
 
-/// Interval at which an LED that cannot be switched is tried again.
+/// Interval between attempts to switch an LED that has failed.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
 /// An LED.
 pub(super) struct Device {
     directory: PathBuf,
-    /// `None` if its state is unknown.
+    /// Whether the LED is on; `None` if that is unknown.
     is_on: Option<bool>,
-    /// Time of the next try, if it could not be switched.
+    /// Time of the next attempt after a failure.
     retry_at: Option<Instant>,
 }
 
-/// Change of an LED.
+/// Change of an LED's availability.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum DeviceEvent {
-    /// It cannot be switched any more.
+    /// The LED can no longer be switched.
     Failed(Failure),
-    /// It can be switched again.
+    /// The LED can be switched again.
     Recovered,
 }
 
 impl Device {
-    /// Opens the LED `name` below `root`, and switches it off. Also returns the trigger that controlled it and that this ended.
+    /// Opens the LED `name` in `root`, and switches it off. Also returns the trigger that controlled the LED until now,
+    /// if there was one.
     ///
     /// # Errors
     ///
-    /// - [`Kind::Configuration`] if there is no such LED; the hint lists those that exist.
-    /// - [`Kind::Failed`] if it may not be switched; the hint names its owner.
+    /// - [`Kind::Configuration`] if there is no such LED; the hint lists the existing ones.
+    /// - [`Kind::Failed`] if this user may not switch it; the hint names its owner.
     pub(super) fn open(root: &Path, name: &str) -> Result<(Device, Option<String>), Failure> {
         if !root.is_dir() {
             let message = format!("{} is no directory", root.display());
@@ -58,12 +59,12 @@ impl Device {
         Ok((device, trigger))
     }
 
-    /// Switches it unless it shows `on` already. Returns news if that starts or stops to fail.
+    /// Switches the LED if it does not show `on` already. Returns an event if it starts failing or has recovered.
     pub(super) fn show(&mut self, on: bool, now: Instant) -> Option<DeviceEvent> {
         if self.is_on == Some(on) || self.retry_at.is_some_and(|at| now < at) {
             return None;
         }
-        // An LED that was unplugged may have the state after power-on.
+        // An LED that was unplugged may have its state after power-on.
         let taken = if self.retry_at.is_some() { self.take() } else { Ok(()) };
         match taken.and_then(|()| self.switch(on)) {
             Ok(()) => self.retry_at.take().map(|_| DeviceEvent::Recovered),
@@ -75,10 +76,10 @@ impl Device {
         }
     }
 
-    /// Ends a trigger, which would otherwise keep control of the LED, and switches it off.
+    /// Ends the trigger, which would otherwise continue to control the LED, and switches the LED off.
     fn take(&mut self) -> io::Result<()> {
         if self.trigger().is_some() {
-            // This may be forbidden although the LED may be switched. Switching it off ends a trigger, too.
+            // This may be forbidden even if switching is allowed. Switching the LED off also ends a trigger.
             let _ = write(&self.directory.join(TRIGGER), b"none\n");
         }
         self.switch(false)
@@ -96,7 +97,7 @@ impl Device {
         text.trim().parse().map_err(|_| io::Error::other(format!("its max_brightness is {:?}", text.trim())))
     }
 
-    /// Returns the active trigger: the word in brackets, unless that is `none`.
+    /// Returns the active trigger, which is the word in brackets, unless it is `none`.
     fn trigger(&self) -> Option<String> {
         let text = fs::read_to_string(self.directory.join(TRIGGER)).ok()?;
         let (_, rest) = text.split_once('[')?;
@@ -123,7 +124,7 @@ impl Device {
     }
 }
 
-/// Writes to an existing file; never creates one.
+/// Writes to an existing file, and never creates one.
 fn write(path: &Path, content: &[u8]) -> io::Result<()> {
     File::options().write(true).truncate(true).open(path)?.write_all(content)
 }
@@ -146,7 +147,7 @@ mod tests {
     use super::*;
     use tempfile::TempDir;
 
-    /// A directory that replaces the kernel's.
+    /// Directory in place of the kernel's LED directory.
     struct Root(TempDir);
 
     impl Root {
@@ -177,7 +178,7 @@ mod tests {
         let (mut red, trigger) = Device::open(root.0.path(), "red").unwrap();
         assert_eq!((trigger, root.brightness("red").as_str()), (None, "0\n"));
         assert_eq!((red.show(true, now), root.brightness("red").as_str()), (None, "255\n"));
-        // Somebody else's doing is not undone, so nothing was written.
+        // The LED was not written, because it keeps what another program has set.
         fs::write(root.0.path().join("red").join(BRIGHTNESS), "3\n").unwrap();
         assert_eq!((red.show(true, now), root.brightness("red").as_str()), (None, "3\n"));
         assert_eq!((red.show(false, now), root.brightness("red").as_str()), (None, "0\n"));

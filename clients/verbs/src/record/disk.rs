@@ -1,5 +1,5 @@
-//! The disk thread: takes the queue ten times a second, makes a chunk and writes it. If the disk is full, slow or missing, it
-//! reports that and tries again, while new samples wait in the queue.
+//! Disk thread: takes the whole queue ten times a second, builds a chunk and writes it. If the disk is full, slow or
+//! missing, the thread reports that and tries again, while new samples wait in the queue.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -15,7 +15,7 @@ use super::queue::{Batch, Entry, Queue, WRITE_INTERVAL, WriterEvent, WriterProgr
 use super::recording_file::{FileOptions, RecordingFile, RecordingOutput, RepeatedStatus};
 use crate::names::TopicName;
 
-/// State of the disk thread of one run.
+/// State of the disk thread.
 pub(super) struct DiskWriter {
     queue: Arc<Queue>,
     progress: Arc<WriterProgress>,
@@ -25,13 +25,13 @@ pub(super) struct DiskWriter {
     options: FileOptions,
     file: RecordingFile,
     tracks: Vec<TopicName>,
-    /// Last status of each track of that topic, for the start of the next file.
+    /// Last status of each status track, for the start of the next file.
     statuses: Vec<Option<RepeatedStatus>>,
-    /// Entries that are being written. They stay here until the disk has them.
+    /// Entries that are being written. They stay here until the disk has stored them.
     batch: Batch,
-    /// Bytes of the files before.
+    /// Length of the earlier files in bytes.
     bytes: u64,
-    /// Whether a sample was written. Before that, no older file is removed: a run without a hub must not cost one.
+    /// Whether a sample was written. Until then, no older file is removed, so that a run without a hub costs no file.
     has_samples: bool,
     failure: Option<WriteFailure>,
     check_at: Instant,
@@ -45,16 +45,16 @@ struct WriteFailure {
     is_too_large: bool,
 }
 
-/// Place of a recording.
+/// Destination of a recording.
 pub(super) enum Destination {
-    /// Files. The next one is started if the current one is full or fails.
+    /// Files. The next one is started when the current one is full or fails.
     Files(Files),
     /// A stream, such as stdout.
     Stream(File),
 }
 
 impl DiskWriter {
-    /// Starts the first file, or the stream. An error at the start ends the run at once.
+    /// Starts the first file or the stream. An error at the start ends the run.
     pub(super) fn begin(
         queue: Arc<Queue>,
         destination: Destination,
@@ -71,7 +71,7 @@ impl DiskWriter {
         };
         let mut recording_file =
             RecordingFile::begin(output, options, numbered(&description, files.as_ref()))?;
-        // A file that could not be started must not block the next try.
+        // Remove the incomplete file, so that it does not block the next attempt.
         recording_file.write().inspect_err(|_| recording_file.path().into_iter().for_each(discard))?;
         let progress = WriterProgress::default();
         progress.stats().bytes = recording_file.written;
@@ -99,17 +99,17 @@ impl DiskWriter {
         self.progress.clone()
     }
 
-    /// Returns how many files of earlier runs are removed as soon as a sample is written.
+    /// Returns the number of files of earlier runs that will be removed once a sample is written.
     pub(super) fn surplus_older(&self) -> usize {
         self.files.as_ref().map_or(0, Files::surplus_older)
     }
 
-    /// Returns the name of the current file.
+    /// Returns the path of the current file.
     pub(super) fn path(&self) -> PathBuf {
         self.file.path().map_or_else(|| "stdout".into(), PathBuf::from)
     }
 
-    /// Writes until the queue has ended and everything is written. The error is the reason why the end is missing.
+    /// Writes until the queue has ended and is completely written. The error is the reason why the file has no end.
     pub(super) fn run(mut self) -> io::Result<()> {
         let mut due = Instant::now();
         loop {
@@ -138,7 +138,7 @@ impl DiskWriter {
         }
     }
 
-    /// Writes first what could not be written before, and then what the queue received since.
+    /// Writes the data that could not be written before, and then the new entries of the queue.
     fn step(&mut self, now: Instant, is_over: bool) -> io::Result<()> {
         if self.failure.is_some() && self.is_lost() {
             self.renew()?;
@@ -175,10 +175,11 @@ impl DiskWriter {
         Ok(())
     }
 
-    /// Returns whether the next file is due. A file without samples stays open, because the next one could replace a kept file.
+    /// Returns whether the next file is due. A file without samples is never full, because the next file could replace
+    /// a kept one.
     fn is_full(&self, now: Instant) -> bool {
         let is_split = match self.split {
-            // The file ends before it is too long, unless its index takes half of it.
+            // End the file before it is too long, unless its index takes half of it.
             Some(Split::Bytes(max_len)) => {
                 self.file.started.is_some()
                     && self.file.written >= max_len / 2
@@ -192,7 +193,7 @@ impl DiskWriter {
         is_split || self.file.index >= self.max_index_len
     }
 
-    /// Writes the chunk of the batch, counts its samples, and empties the batch.
+    /// Writes the pending chunk, counts the samples of its batch, and empties the batch.
     fn write(&mut self) -> io::Result<()> {
         self.file.write()?;
         self.store_statuses();
@@ -209,13 +210,13 @@ impl DiskWriter {
         Ok(())
     }
 
-    /// Returns whether the current file cannot be continued, even if the disk recovers.
+    /// Returns whether the current file cannot be continued, even after the disk recovers.
     fn is_lost(&self) -> bool {
         let is_too_large = self.failure.as_ref().is_some_and(|failure| failure.is_too_large);
         self.files.is_some() && (self.file.check().is_err() || (is_too_large && self.file.written > 0))
     }
 
-    /// Starts the next file, with the batch that is not written yet.
+    /// Starts the next file, and adds the batch that is not written yet.
     fn renew(&mut self) -> io::Result<()> {
         let Some(files) = &mut self.files else { return Ok(()) };
         let (path, file) = files.next()?;
@@ -226,21 +227,21 @@ impl DiskWriter {
         recording_file.add(&self.tracks, &self.batch)?;
         self.subtract_removed();
         self.bytes += self.file.written;
-        // Replacing the part closes the old file, which unlocks it. Only then can it be removed.
+        // Replacing the file closes the old one, which releases its lock. It can be removed only then.
         self.file = recording_file;
         self.prune();
         self.progress.stats().events.push(WriterEvent::File(path));
         Ok(())
     }
 
-    /// Removes files beyond those that are kept.
+    /// Removes the oldest files if there are more than `--keep` allows.
     fn prune(&mut self) {
         if let Some(files) = self.files.as_mut().filter(|_| self.has_samples) {
             files.prune();
         }
     }
 
-    /// Subtracts the samples of a file that was removed or cut.
+    /// Subtracts the samples of a file that was removed or truncated.
     fn subtract_removed(&mut self) {
         let Some(path) = self.file.path().filter(|_| self.file.is_removed()).map(PathBuf::from) else {
             return;
@@ -252,7 +253,7 @@ impl DiskWriter {
         stats.events.push(WriterEvent::Removed(path, samples));
     }
 
-    /// Keeps the tracks of the batch.
+    /// Adds the new tracks of the batch.
     fn add_tracks(&mut self) {
         for entry in &self.batch.entries {
             if let Entry::Track(track) = entry {
@@ -262,7 +263,7 @@ impl DiskWriter {
         }
     }
 
-    /// Keeps the last statuses of the batch, for the next file.
+    /// Stores the last statuses of the batch, for the next file.
     fn store_statuses(&mut self) {
         let now = Instant::now();
         for (track, header, payload) in self.batch.samples() {
@@ -281,7 +282,7 @@ impl DiskWriter {
         if self.failure.is_none() {
             self.progress.stats().events.push(WriterEvent::WriteFailed(self.path(), error.to_string()));
         }
-        // If another file may help, the next try is at once.
+        // If another file may help, try again at once.
         let is_first = self.failure.is_none();
         let since = self.failure.as_ref().map_or(now, |failure| failure.since);
         self.failure = Some(WriteFailure { since, retry_at: now, is_too_large });
@@ -301,18 +302,18 @@ impl DiskWriter {
     }
 }
 
-/// Returns the description of the run, with the number of the file in the run.
+/// Returns the description of the run, with the number of the file in this run.
 fn numbered(description: &BTreeMap<String, String>, files: Option<&Files>) -> BTreeMap<String, String> {
     let mut description = description.clone();
     description.insert("part".to_owned(), files.map_or(1, Files::count).to_string());
     description
 }
 
-/// Maximum memory for the index of a file, in bytes. Finishing the file takes twice as much again.
+/// Maximum memory for the index of a file, in bytes. Finishing the file takes twice as much in addition.
 const MAX_INDEX_LEN: usize = 128 << 20;
-/// Interval at which a disk that fails is tried again.
+/// Interval between attempts after the disk has failed.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
-/// Interval at which the current file is checked for removal.
+/// Interval between checks whether the current file was removed.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
@@ -326,7 +327,7 @@ mod tests {
     use super::super::recording_file::Form;
     use super::*;
 
-    /// Starts a recording of the status of these sensors, in its own directory.
+    /// Starts a recording of the statuses of these sensors, in a new directory.
     fn disk(split: Option<Split>, sensors: &[&str]) -> (TempDir, DiskWriter) {
         let directory = TempDir::new().unwrap();
         let files = Files::new(&directory.path().join("walk.mcap"), split.is_some(), false, None, "");

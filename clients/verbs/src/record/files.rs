@@ -1,7 +1,7 @@
-//! The files of a run: their names, when the next one starts, and which of them are kept.
+//! Files of a run: their names, the limits at which the next one starts, and the removal of old ones.
 //!
-//! With `--force`, files of earlier runs count as kept files too. Each file is checked again just before it is removed, so
-//! that neither a file that another recorder writes nor a file of another kind is ever lost.
+//! With `--force`, files of earlier runs count as kept files too. Each file is checked again just before it is removed.
+//! A file that another recorder writes, or that is not a recording, is therefore never removed.
 
 use std::fs::{self, File, TryLockError};
 use std::io::{self, ErrorKind, Read};
@@ -15,17 +15,17 @@ use scanhub_schema::file::MAGIC;
 
 use crate::duration;
 
-/// Limit of a file, after which the recording continues in the next one.
+/// Limit of a file, at which the recording continues in the next one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Split {
-    /// At this length in bytes.
+    /// Length in bytes.
     Bytes(u64),
-    /// After this time.
+    /// Duration.
     Time(Duration),
 }
 
 impl Split {
-    /// Parses a duration like `1h`, or a size like `512MiB` or `2GB`. The error is for the user.
+    /// Parses a duration such as `1h`, or a size such as `512MiB` or `2GB`. The error is a message for the user.
     pub(super) fn parse(text: &str) -> Result<Split, String> {
         let unit = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
         let (number, unit) = text.split_at(unit);
@@ -59,33 +59,34 @@ const UNITS: [(&str, u64); 8] = [
     ("GiB", 1 << 30),
     ("TiB", 1 << 40),
 ];
-/// Half of it describes the topics.
+/// Minimum size of a file in bytes. The descriptions of the topics may take half of it.
 const MIN_SPLIT_BYTES: u64 = 128 << 10;
 const MAX_SPLIT_BYTES: u64 = 1 << 50;
 const MIN_SPLIT_TIME: Duration = Duration::from_secs(1);
 
-/// The files that a run has made so far.
+/// Names of the files of a run, with those that it has created.
 pub(super) struct Files {
     path: PathBuf,
     is_split: bool,
     overwrites: bool,
     keep: Option<usize>,
-    /// Number in the last name.
+    /// Number in the name of the last file.
     number: u32,
     /// Number of files of this run.
     count: u32,
-    /// Text near the beginning of each file of this run, and of no other file.
+    /// Text near the start of each file of this run, and of no other file.
     run: String,
-    /// Files of this run, the current one last.
+    /// Paths of the files of this run, the current one last.
     created: Vec<PathBuf>,
-    /// Files of earlier runs that count as kept files, the lowest number first.
+    /// Paths of the files of earlier runs that count as kept files, the lowest number first.
     older: Vec<PathBuf>,
 }
 
 impl Files {
-    /// Creates the files of a run: one that is called `path`, or with numbers after its stem if the run `is_split`. An existing
-    /// file is an error, unless the run `overwrites` it; a split run then continues after the existing numbers. The last
-    /// `keep` files stay. All files of the run contain `run` within their first [`HEAD`] bytes.
+    /// Describes the files of a run, and creates none of them. There is one file `path`, or with `is_split`, several
+    /// with numbers after its stem. An existing file is an error, unless `overwrites` is set; a split run then
+    /// continues after the existing numbers. The last `keep` files are kept. All files of the run must contain `run`
+    /// within their first [`HEAD_LEN`] bytes.
     pub(super) fn new(
         path: &Path,
         is_split: bool,
@@ -97,7 +98,7 @@ impl Files {
         Files { path, is_split, overwrites, keep, number: 0, count: 0, run, created, older }
     }
 
-    /// Makes the first file.
+    /// Creates the first file, and returns its path.
     ///
     /// # Errors
     ///
@@ -117,7 +118,7 @@ impl Files {
         self.make(last + 1, self.overwrites && !self.is_split)
     }
 
-    /// Makes the next file. Skips a name that another run has taken.
+    /// Creates the next file, and returns its path. Names that another run has taken are skipped.
     pub(super) fn next(&mut self) -> io::Result<(PathBuf, File)> {
         let mut number = self.number + 1;
         loop {
@@ -128,16 +129,16 @@ impl Files {
         }
     }
 
-    /// Returns how many files of earlier runs the next [`prune`](Self::prune) removes.
+    /// Returns the number of files of earlier runs that the next [`prune`](Self::prune) removes.
     pub(super) fn surplus_older(&self) -> usize {
         self.surplus().min(self.older.len())
     }
 
-    /// Removes the oldest files, those of earlier runs first, until no more than `keep` are left. A file that cannot be
+    /// Removes the oldest files, those of earlier runs first, until at most `keep` remain. A file that cannot be
     /// removed no longer counts.
     pub(super) fn prune(&mut self) {
         for _ in 0..self.surplus() {
-            // Something else may have the name by now.
+            // Another file may have this name by now.
             let (path, removable) = if self.older.is_empty() {
                 let path = self.created.remove(0);
                 let own = lock_of_run(&path, &self.run);
@@ -154,7 +155,7 @@ impl Files {
         }
     }
 
-    /// Returns by how many files there are more than are kept. The current one is always kept.
+    /// Returns by how many the files exceed the limit. The current file is always kept.
     fn surplus(&self) -> usize {
         let keep = self.keep.map_or(usize::MAX, |keep| keep.max(1));
         (self.older.len() + self.created.len()).saturating_sub(keep)
@@ -181,14 +182,14 @@ impl Files {
         self.path.with_file_name(format!("{stem}-{number:04}{ending}"))
     }
 
-    /// Returns the text before and after the number in a name.
+    /// Returns the parts of a name before and after the number.
     fn name_parts(&self) -> (String, String) {
         let stem = self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let ending = self.path.extension().map(|ending| format!(".{}", ending.to_string_lossy()));
         (stem, ending.unwrap_or_default())
     }
 
-    /// Returns the numbers of the names in the directory that belong to these files, in ascending order.
+    /// Returns the numbers of the existing files with a name of this run, in ascending order.
     fn existing(&self) -> Vec<u32> {
         let (stem, ending) = self.name_parts();
         let directory = self.path.parent().filter(|directory| !directory.as_os_str().is_empty());
@@ -196,7 +197,7 @@ impl Files {
         let names = entries.flatten().map(|entry| entry.file_name());
         let number = |name: &str| {
             let digits = name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&ending)?;
-            // Longer numbers are dates.
+            // A longer number is a date.
             let number = digits.parse().ok().filter(|number| *number < 1_000_000)?;
             (format!("{number:04}") == digits).then_some(number)
         };
@@ -206,25 +207,27 @@ impl Files {
     }
 }
 
-/// Returns the file at `path` if it is a recording that no recorder writes; none takes it until it is closed. `None` if the
-/// file system has no locks, because then a recorder cannot be detected.
+/// Opens and locks the file at `path` if it is a recording that no recorder writes. No recorder can lock it until it is
+/// closed. Returns `None` if the file system has no locks, because recorders then cannot be detected.
 fn lock_finished(path: &Path) -> Option<File> {
     let (file, head, is_taken) = head(path).ok()?;
     (head.starts_with(MAGIC) && is_taken == Some(false)).then_some(file)
 }
 
-/// Returns the file at `path` if `run` has written it, and no other recorder writes it; none takes it until it is closed.
+/// Opens and locks the file at `path` if `run` has created it and no other recorder writes it. No recorder can lock it
+/// until it is closed.
 fn lock_of_run(path: &Path, run: &str) -> Option<File> {
     let (file, head, is_taken) = head(path).ok()?;
     (String::from_utf8_lossy(&head).contains(run) && is_taken != Some(true)).then_some(file)
 }
 
-/// Returns the regular file at `path` with its first [`HEAD`] bytes, and whether another process has locked it, if the file
-/// system has locks. If none has, this process has it until it closes the file.
+/// Opens the regular file at `path`. Returns it with its first [`HEAD_LEN`] bytes, and whether another process has
+/// locked it, or `None` if the file system has no locks. If no other process has, this process holds the lock until it
+/// closes the file.
 ///
 /// # Errors
 ///
-/// The file cannot be read, or is not a regular file. A link to one is refused too.
+/// The file cannot be read, or is not a regular file. A link to a regular file is also an error.
 fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
     // Without NONBLOCK, opening a pipe would wait for its writer.
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
@@ -232,19 +235,19 @@ fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
     if !file.metadata()?.is_file() {
         return Err(ErrorKind::InvalidInput.into());
     }
-    // Another recorder could write the file between a look and the lock.
+    // Lock before reading, because another recorder could otherwise start to write in between.
     let is_taken = is_taken(&file);
     let mut head = Vec::new();
     (&file).take(HEAD_LEN).read_to_end(&mut head)?;
     Ok((file, head, is_taken))
 }
 
-/// Opens the file at `path`, which no other run writes, and empties it.
+/// Opens and locks the file at `path`, and empties it. Fails if another run writes it.
 fn open(path: &Path, overwrites: bool) -> io::Result<File> {
     let target = Target::open(path).map_err(|failure| io::Error::other(failure.message))?;
     let mut file = target.create(overwrites)?;
     take_lock(&file)?;
-    // Another run may remove it as an old file between the open and the lock.
+    // Another run may remove the file as an old one between the open and the lock.
     for _ in 0..MAX_ATTEMPTS {
         if is_at(&file, path) {
             break;
@@ -256,21 +259,23 @@ fn open(path: &Path, overwrites: bool) -> io::Result<File> {
     Ok(file)
 }
 
-/// Returns whether `file` is the one that `path` names.
+/// Returns whether `file` is the file that `path` names.
 fn is_at(file: &File, path: &Path) -> bool {
     let id = |metadata: fs::Metadata| (metadata.dev(), metadata.ino());
     let named = path.symlink_metadata().map(id);
     file.metadata().map(id).is_ok_and(|own| named.is_ok_and(|named| named == own))
 }
 
-/// Opens of a file that other runs remove at the same time. Some file systems never report the same inode twice.
+/// Maximum number of attempts to open a file that other runs remove at the same time. Some file systems never report
+/// the same inode twice.
 const MAX_ATTEMPTS: usize = 3;
 
-/// Locks `file` for this process until it is closed, because two writers would overwrite each other.
+/// Locks `file` until it is closed, because two writers would overwrite each other. Succeeds without a lock if the file
+/// system has none.
 ///
 /// # Errors
 ///
-/// [`ErrorKind::ResourceBusy`] if another process has it. Succeeds if the file system has no locks.
+/// [`ErrorKind::ResourceBusy`] if another process holds the lock.
 fn take_lock(file: &File) -> io::Result<()> {
     match file.try_lock() {
         Err(TryLockError::WouldBlock) => {
@@ -281,9 +286,9 @@ fn take_lock(file: &File) -> io::Result<()> {
     }
 }
 
-/// Returns whether a process has taken `file`, or `None` if the file system has no locks.
+/// Returns whether a process has locked `file`, or `None` if the file system has no locks.
 fn is_taken(file: &File) -> Option<bool> {
-    // A shared lock needs no write permission. It is released when `file` is closed.
+    // A shared lock needs no permission to write. It is released when `file` is closed.
     match file.try_lock_shared() {
         Ok(()) => Some(false),
         Err(TryLockError::WouldBlock) => Some(true),
@@ -291,7 +296,7 @@ fn is_taken(file: &File) -> Option<bool> {
     }
 }
 
-/// Returns the process that has locked `file`, if the kernel reports it.
+/// Returns the ID of the process that has locked `file`, if the kernel reports it.
 fn holder(file: &File) -> Option<u32> {
     let metadata = file.metadata().ok()?;
     let id = format!("{:02x}:{:02x}:{}", major(metadata.dev()), minor(metadata.dev()), metadata.ino());
@@ -305,12 +310,12 @@ fn holder(file: &File) -> Option<u32> {
 const PROCESS_WORD: usize = 4;
 const FILE_WORD: usize = 5;
 
-/// Bytes that contain the description of the run, which is the first record of a recording.
+/// Number of bytes at the start of a recording that contain the description of the run, which is its first record.
 const HEAD_LEN: u64 = 4096;
-/// Errors if another run has the name.
+/// Kinds of errors that mean that another run has taken a name.
 const NAME_TAKEN_ERRORS: [ErrorKind; 2] = [ErrorKind::AlreadyExists, ErrorKind::ResourceBusy];
 
-/// Removes the file that was made at `path`, unless it is a device or a link.
+/// Removes the file that was created at `path`, unless it is a device or a link.
 pub(super) fn discard(path: &Path) {
     if fs::symlink_metadata(path).is_ok_and(|metadata| metadata.is_file()) {
         let _ = fs::remove_file(path);
@@ -323,7 +328,7 @@ pub(super) fn default_name(wall_ns: u64) -> PathBuf {
     format!("scanhub-{year:04}{month:02}{day:02}-{hour:02}{minute:02}{second:02}.mcap").into()
 }
 
-/// Formats `wall_ns` by ISO 8601, to the second.
+/// Formats `wall_ns` as in ISO 8601, to the second.
 pub(super) fn iso(wall_ns: u64) -> String {
     let [year, month, day, hour, minute, second] = utc(wall_ns);
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
@@ -382,7 +387,7 @@ mod tests {
         assert_eq!(default_name(1_700_000_000_000_000_000), Path::new("scanhub-20231114-221320.mcap"));
     }
 
-    /// The beginning of a file that `run` wrote.
+    /// Returns the start of a file that `run` created.
     fn recording(run: &str) -> Vec<u8> {
         [MAGIC, run.as_bytes()].concat()
     }
@@ -400,7 +405,7 @@ mod tests {
         for number in [2, 3, 9, 10, 11] {
             fs::write(at(&format!("walk-{number:04}.mcap")), recording("run 1")).unwrap();
         }
-        // None of these is a recording of an earlier run that has ended.
+        // None of these is a finished recording of an earlier run.
         fs::write(at("target.mcap"), recording("run 1")).unwrap();
         std::os::unix::fs::symlink(at("target.mcap"), at("walk-0001.mcap")).unwrap();
         fs::write(at("walk-0004.mcap"), "my notes").unwrap();
@@ -493,14 +498,14 @@ mod tests {
         assert_eq!((files.count(), files.surplus_older()), (3, 0));
         files.prune();
         assert!(!at("walk-0001.mcap").exists() && at("walk-0003.mcap").exists());
-        // A file that another run has made under a name of this run.
+        // Another run has created a file under a name of this run.
         fs::write(at("walk-0003.mcap"), recording("run 2")).unwrap();
         assert_eq!(files.next().unwrap().0, at("walk-0005.mcap"));
         files.prune();
         assert_eq!(fs::read(at("walk-0003.mcap")).unwrap(), recording("run 2"));
         let failure = Files::new(&at("walk-0002.mcap"), false, false, None, "").first().unwrap_err();
         assert_eq!(failure.kind(), ErrorKind::AlreadyExists);
-        // Those of an earlier run are not mixed with those of the next one.
+        // These names do not belong to the files of this run.
         for other in
             ["walk-20261122.mcap", "walk-00009.mcap", "walk-7.mcap", "walk-0009.bag", "walks-0009.mcap"]
         {

@@ -1,7 +1,7 @@
 //! Exchange between the receiving thread and the disk thread: samples in one direction, progress in the other.
 //!
-//! The queue is bounded, so a stalled disk costs samples and not memory. The disk thread takes the whole queue at once, so the
-//! receiving thread never waits.
+//! The queue is bounded, so a stalled disk costs samples, but no additional memory. The disk thread takes the whole
+//! queue at once, so the receiving thread never waits.
 
 use std::path::PathBuf;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -11,7 +11,7 @@ use scanhub_schema::Header;
 
 use crate::names::TopicName;
 
-/// Samples that were received and are in no file yet.
+/// Samples that were received but not written yet.
 pub(super) struct Queue {
     waiting: Mutex<QueueState>,
     ended: Condvar,
@@ -22,30 +22,30 @@ struct QueueState {
     is_over: bool,
 }
 
-/// Entries in their order. Its memory is reused.
+/// Entries in the order of their arrival. Its memory is reused.
 pub(super) struct Batch {
     pub(super) entries: Vec<Entry>,
-    /// Payloads of the samples in the same order, packed as for a network.
+    /// Payloads of the samples in the same order, packed as for transmission over a network.
     pub(super) bytes: Vec<u8>,
 }
 
-/// Entry of the queue.
+/// An entry of the queue.
 pub(super) enum Entry {
-    /// Starts a track: a topic of the recording. Tracks are numbered from 0.
+    /// A new track, which is a topic of the recording. Tracks are numbered from 0.
     Track(TopicName),
-    /// Sample of a track. Its payload is the next `len` bytes.
+    /// A sample of a track. Its payload is the next `len` bytes.
     Sample { track: usize, header: Header, len: usize },
-    /// Samples were left out here.
+    /// A gap at this position.
     Gap(Gap),
 }
 
-/// Time in which samples were left out, because the queue was full.
+/// Period in which samples were dropped because the queue was full.
 #[derive(Clone, Debug)]
 pub(super) struct Gap {
-    /// Start and end by the wall clock, in ns since 1970.
+    /// Start and end as wall clock times in ns since 1970.
     pub(super) from_ns: u64,
     pub(super) to_ns: u64,
-    /// Number of samples by topic.
+    /// Number of dropped samples by topic.
     pub(super) dropped: Vec<(TopicName, u64)>,
 }
 
@@ -57,12 +57,13 @@ impl Queue {
         }
     }
 
-    /// Adds an entry that always has room, because such entries are rare.
+    /// Adds an entry even if the queue is full. Such entries are rare.
     pub(super) fn note(&self, entry: Entry) {
         self.lock().batch.entries.push(entry);
     }
 
-    /// Adds a sample of `track`, whose payload of at most `longest` bytes `pack` writes. Returns false if there is no room.
+    /// Adds a sample of `track`. `pack` writes its payload of at most `longest` bytes. Returns false if the queue has
+    /// no room.
     pub(super) fn push(
         &self,
         track: usize,
@@ -88,13 +89,13 @@ impl Queue {
         self.lock().batch.entries.is_empty()
     }
 
-    /// Returns whether at least half of the room is free.
+    /// Returns whether the queue is less than half full.
     pub(super) fn is_roomy(&self) -> bool {
         let Batch { entries, bytes } = &self.lock().batch;
         entries.len() < MAX_ENTRIES / 2 && bytes.len() < MAX_BYTES / 2
     }
 
-    /// Ends the queue: nothing is added from now on.
+    /// Ends the queue. No entry is added after that.
     pub(super) fn end(&self) {
         self.lock().is_over = true;
         self.ended.notify_all();
@@ -148,14 +149,14 @@ impl Batch {
 #[derive(Default)]
 pub(super) struct WriterProgress(Mutex<RecordStats>);
 
-/// Progress and news.
+/// Progress and events of the disk thread.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct RecordStats {
-    /// Bytes in all files that still exist.
+    /// Length of all files that still exist, in bytes.
     pub(super) bytes: u64,
-    /// Samples in all files that still exist.
+    /// Number of samples in all files that still exist.
     pub(super) samples: u64,
-    /// Events since the receiving thread last read them.
+    /// Events since the last [`take_stats`](WriterProgress::take_stats).
     pub(super) events: Vec<WriterEvent>,
 }
 
@@ -168,30 +169,31 @@ pub(super) enum WriterEvent {
     WriteFailed(PathBuf, String),
     /// The file can be written again, after this time.
     WriteResumed(PathBuf, Duration),
-    /// This number of samples was lost, because the file was removed or cut.
+    /// The file was removed or truncated, which lost this number of samples.
     Removed(PathBuf, u64),
-    /// The reader of stdout went away.
+    /// The reader of stdout has closed it.
     ReaderClosed,
 }
 
 impl WriterProgress {
-    /// Returns the progress, and takes the news.
+    /// Returns the progress, and removes the events.
     pub(super) fn take_stats(&self) -> RecordStats {
         let mut stats = self.stats();
         let events = std::mem::take(&mut stats.events);
         RecordStats { events, ..stats.clone() }
     }
 
-    /// Locks the progress for the disk thread.
+    /// Locks the progress, for the disk thread.
     pub(super) fn stats(&self) -> MutexGuard<'_, RecordStats> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Bytes of payloads: 20 seconds of all topics of two sensors at their fastest.
+/// Maximum length of the payloads in bytes. It is enough for 20 seconds of all topics of two sensors at their highest
+/// rate.
 const MAX_BYTES: usize = 8 << 20;
 const MAX_ENTRIES: usize = 1 << 15;
-/// Interval at which the queue is written and a chunk is closed. A kill costs no more than this.
+/// Interval at which the queue is written and a chunk is closed. A kill loses at most the samples of this time.
 pub(super) const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! One file of a recording. Each chunk is made in memory and then written. If the disk refuses it, it is written again, so the
+//! A file of a recording. Each chunk is built in memory and then written. After an error it is written again, so the
 //! file always has a whole number of chunks.
 
 use std::collections::BTreeMap;
@@ -17,33 +17,33 @@ use scanhub_schema::{Header, Scan, Status, Topic};
 use super::queue::{Batch, Entry, Gap};
 use crate::names::TopicName;
 
-/// A file that is being written.
+/// A file or stream that is being written.
 pub(super) struct RecordingFile {
     writer: Option<Writer<PendingBytes>>,
     pending: PendingBytes,
     output: RecordingOutput,
-    /// Bytes of `made` that a stream has taken already. They cannot be taken back.
+    /// Number of pending bytes that a stream has accepted. They cannot be withdrawn.
     taken: usize,
-    /// Bytes that are in the file.
+    /// Number of written bytes.
     pub(super) written: u64,
-    /// Samples that are in the file, without those that are repeated.
+    /// Number of samples in the file, except for repeated statuses.
     pub(super) samples: u64,
-    /// Arrival of its first sample, apart from those that are repeated.
+    /// Arrival of the first sample that is not a repeated status.
     pub(super) started: Option<Instant>,
-    /// Approximate memory of its index, in bytes.
+    /// Approximate memory of the index in bytes.
     pub(super) index: usize,
-    /// Approximate length of its index in the file, in bytes.
+    /// Approximate length of the index at the end of the file, in bytes.
     end_len: u64,
     /// Length of the last write, in bytes.
     last: u64,
-    /// Whether a sync failed, so that data may be missing on the disk.
+    /// Whether a sync has failed, so that data may be missing on the disk.
     pub(super) is_doubtful: bool,
-    /// Boot numbers of the hubs that the file describes.
+    /// `boot` IDs of the hubs that the file describes.
     boots: Vec<u64>,
     /// Topics and tracks in the file.
     topics: Vec<Topic>,
     known_tracks: Vec<usize>,
-    /// Only in a recording for ROS 2.
+    /// Writer of ROS 2 messages, in a recording for ROS 2.
     bag: Option<BagWriter>,
     scan: Box<Scan>,
 }
@@ -55,19 +55,19 @@ pub(super) struct RepeatedStatus {
     pub(super) payload: Vec<u8>,
 }
 
-/// Form of a file.
+/// Format of a file.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct FileOptions {
     pub(super) form: Form,
     pub(super) compression: Compression,
 }
 
-/// Form of the messages.
+/// Format of the messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Form {
     /// Samples as the hub publishes them.
     Hub,
-    /// Only messages of ROS 2.
+    /// ROS 2 messages only.
     Ros2,
 }
 
@@ -82,13 +82,13 @@ impl Form {
 
 /// Destination of the bytes.
 pub(super) enum RecordingOutput {
-    /// A file and its name.
+    /// File with its path.
     File(File, PathBuf),
     /// Stdout, for example a pipe.
     Stream(File),
 }
 
-/// Bytes that are made and not written yet.
+/// Bytes that are not written yet.
 #[derive(Clone, Default)]
 struct PendingBytes(Arc<Mutex<Vec<u8>>>);
 
@@ -104,7 +104,7 @@ impl Write for PendingBytes {
 }
 
 impl RecordingFile {
-    /// Makes the start of a file, with `description` on the run. Nothing is written yet.
+    /// Builds the start of a file, with the `description` of the run, and writes nothing yet.
     pub(super) fn begin(
         output: RecordingOutput,
         options: FileOptions,
@@ -137,8 +137,8 @@ impl RecordingFile {
         })
     }
 
-    /// Repeats the last statuses, by track, so that the file can be played without those before. Leaves out sensors that are
-    /// silent while others send.
+    /// Repeats the last status of each track, so that the file can be played without the earlier files. Statuses of
+    /// sensors that have been silent while others sent are dropped.
     pub(super) fn repeat(
         &mut self,
         tracks: &[TopicName],
@@ -156,7 +156,7 @@ impl RecordingFile {
         Ok(())
     }
 
-    /// Makes a chunk of `batch`, whose tracks are among `tracks`.
+    /// Builds a chunk from `batch`, whose track numbers refer to `tracks`.
     pub(super) fn add(&mut self, tracks: &[TopicName], batch: &Batch) -> io::Result<()> {
         let samples = batch.count() as usize;
         if samples > 0 {
@@ -180,7 +180,7 @@ impl RecordingFile {
         self.writer()?.close_chunk()
     }
 
-    /// Makes the index, which ends the file.
+    /// Builds the index, which ends the file.
     pub(super) fn finish(&mut self) -> io::Result<()> {
         match self.writer.take() {
             Some(writer) => writer.finish().map(drop),
@@ -192,7 +192,8 @@ impl RecordingFile {
         self.writer.is_none()
     }
 
-    /// Writes what was made. After an error, the file ends with the last whole chunk, and the next call tries again.
+    /// Writes the pending bytes. After an error, the file ends with the last whole chunk, and the next call tries
+    /// again.
     pub(super) fn write(&mut self) -> io::Result<()> {
         let mut pending = self.pending.0.lock().unwrap_or_else(PoisonError::into_inner);
         match &mut self.output {
@@ -221,8 +222,8 @@ impl RecordingFile {
         Ok(())
     }
 
-    /// Returns the approximate length of the file after one more chunk and its end, in bytes. The chunk is assumed to be half as
-    /// long again as the last one.
+    /// Returns the approximate length of the file after one more chunk and its end, in bytes. The estimate for the
+    /// chunk is 1.5 times the length of the last one.
     pub(super) fn next_len(&self) -> u64 {
         self.written + self.last * 3 / 2 + self.end_len
     }
@@ -232,15 +233,15 @@ impl RecordingFile {
         match &self.output {
             RecordingOutput::Stream(_) => Ok(()),
             RecordingOutput::File(file, _) => match file.sync_data() {
-                // Not every device stores data.
+                // Some devices do not support a sync.
                 Err(error) if error.kind() == ErrorKind::InvalidInput => Ok(()),
-                // Linux reports the error only once: the next sync would succeed.
+                // Linux reports the error only once, so the next sync would succeed.
                 synced => synced.inspect_err(|_| self.is_doubtful = true),
             },
         }
     }
 
-    /// Returns the name of the file, or `None` for a stream.
+    /// Returns the path of the file, or `None` for a stream.
     pub(super) fn path(&self) -> Option<&Path> {
         match &self.output {
             RecordingOutput::File(_, path) => Some(path),
@@ -248,11 +249,11 @@ impl RecordingFile {
         }
     }
 
-    /// Checks that the whole file still has its name.
+    /// Checks that the file still has its name and its full length.
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::NotFound`] if another file has the name, or the file was cut.
+    /// [`ErrorKind::NotFound`] if another file has the name, or the file was truncated.
     pub(super) fn check(&self) -> io::Result<()> {
         let RecordingOutput::File(file, path) = &self.output else { return Ok(()) };
         let (here, there) = (file.metadata()?, fs::metadata(path)?);
@@ -265,7 +266,7 @@ impl RecordingFile {
         Ok(())
     }
 
-    /// Returns whether the file was removed or cut. A file that was moved still has its samples.
+    /// Returns whether the file was removed or truncated. A file that was moved still has its samples.
     pub(super) fn is_removed(&self) -> bool {
         let RecordingOutput::File(file, _) = &self.output else { return false };
         file.metadata().is_ok_and(|here| here.is_file() && (here.nlink() == 0 || here.len() < self.written))
@@ -324,19 +325,20 @@ fn nothing_after_index() -> io::Error {
     io::Error::other("nothing follows the index")
 }
 
-/// A status is valid for this time while others arrive. Each sensor sends one a second.
+/// Maximum age of a repeated status, compared with the newest one. Each sensor sends a status once a second.
 const STATUS_LIFETIME: Duration = Duration::from_secs(60);
-/// Bytes in the index in memory: for a chunk, and for each channel in it.
+/// Length of the index in memory, in bytes: for a chunk, and for each channel in a chunk.
 const CHUNK_INDEX_LEN: usize = 200;
 const CHANNEL_INDEX_LEN: usize = 24;
-/// Bytes in the index in the file: for a chunk, each channel in it, a track, and a topic, whose type the index describes again.
+/// Length of the index in the file, in bytes: for a chunk, each channel in a chunk, a track, and a topic. The index
+/// describes the topic's type again.
 const CHUNK_END_LEN: u64 = 70;
 const CHANNEL_END_LEN: u64 = 10;
 const TRACK_END_LEN: u64 = 100;
 const TOPIC_END_LEN: u64 = 100 + scanhub_schema::file::LAYOUT.len() as u64;
-/// Name of the metadata record that precedes the first sample of a hub.
+/// Name of the metadata record before the first sample of a hub's run.
 const HUB_RECORD_NAME: &str = "scanhub.life";
-/// Name of the metadata record of samples that were left out.
+/// Name of the metadata record about dropped samples.
 const GAP_RECORD_NAME: &str = "scanhub.gap";
 
 #[cfg(test)]
@@ -355,7 +357,7 @@ mod tests {
         part.pending.write_all(&[7; 300_000]).unwrap();
         let made = part.pending.0.lock().unwrap().clone();
         let mut read = Vec::new();
-        // A pipe takes less than that, and then for a while nothing.
+        // A pipe takes fewer bytes, and then none until they are read.
         while let Err(error) = part.write() {
             assert_eq!((error.kind(), part.written), (ErrorKind::WouldBlock, 0));
             let mut some = [0; 50_000];

@@ -1,4 +1,4 @@
-//! The reports of a recorder: lines of JSON, or text with one progress line that is redrawn.
+//! Reports of a recorder: JSON lines, or text with one progress line that is redrawn.
 
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
@@ -15,19 +15,19 @@ use crate::output::{ExitReason, Output, columns, fitting};
 use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 
-/// Form of the reports.
+/// Format of the reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ReportForm {
     /// Lines of text at the start, at the end, and for events.
     Lines,
-    /// JSON objects, also once a second.
+    /// JSON lines for the same, and once a second.
     Json,
-    /// A line of progress that is redrawn.
+    /// Lines of text, and a progress line that is redrawn.
     Terminal,
 }
 
 impl ReportForm {
-    /// Returns the form of reports for this output.
+    /// Returns the format for this output.
     pub(super) fn of(is_json: bool, is_terminal: bool) -> ReportForm {
         match (is_json, is_terminal) {
             (true, _) => ReportForm::Json,
@@ -37,30 +37,30 @@ impl ReportForm {
     }
 }
 
-/// Reports of a run, and the counts in them.
+/// Reports of a run, with their counters.
 pub(super) struct Report<'a> {
     form: ReportForm,
     out: Output<'a>,
     notes: Output<'a>,
-    /// The terminal of the progress line, for its width.
+    /// Terminal of the progress line, from which its width is read.
     terminal: Option<OwnedFd>,
     started: Instant,
     next: Instant,
     files: Vec<PathBuf>,
-    /// Bytes in the last report of progress.
+    /// Number of bytes in the last report of progress.
     bytes: u64,
-    /// Samples that were sent and not received.
+    /// Number of samples that were published but not received.
     missed: u64,
-    /// Samples whose file was removed or cut.
+    /// Number of samples in files that were removed or truncated.
     removed: u64,
     is_write_failing: bool,
 }
 
-/// Interval between two reports of progress.
+/// Interval between reports of progress.
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 impl<'a> Report<'a> {
-    /// Creates the reports of a run. They go to `out`, which may be `terminal`, and notices to `notes` if `out` is not
+    /// Creates the reports of a run. They go to `out`, which may be `terminal`. Notices go to `notes` unless `out` is
     /// JSON.
     pub(super) fn new(
         form: ReportForm,
@@ -84,7 +84,8 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Writes the first line: the file at `path`, and how many files of earlier runs are removed once it has samples.
+    /// Writes the first line: the file at `path`, and the number of files of earlier runs that are removed once it has
+    /// samples.
     pub(super) fn begin(&mut self, path: &Path, older: usize) -> Result<(), ExitReason> {
         self.files.push(path.to_owned());
         if self.form == ReportForm::Json {
@@ -101,7 +102,7 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// Reports news of the hub, and missed samples.
+    /// Reports events of the hub, and missed samples.
     pub(super) fn hub(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), ExitReason> {
         if let Notice::Missed(missed) = notice {
             self.missed += missed;
@@ -112,7 +113,7 @@ impl<'a> Report<'a> {
         self.note(|line| text::notice(line, names, &notice))
     }
 
-    /// Reports news of the disk thread.
+    /// Reports an event of the disk thread.
     pub(super) fn disk(&mut self, event: &WriterEvent) -> Result<(), ExitReason> {
         self.is_write_failing = match event {
             WriterEvent::WriteFailed(..) => true,
@@ -169,7 +170,7 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// Reports that samples are left out from now on.
+    /// Reports the start of a gap, in which samples are dropped.
     pub(super) fn gap_begins(&mut self) -> Result<(), ExitReason> {
         if self.form == ReportForm::Json {
             let (dropped, seconds) = (0, 0.0);
@@ -178,7 +179,7 @@ impl<'a> Report<'a> {
         self.note(|line| write!(line, "memory for samples is full: samples are left out of the recording"))
     }
 
-    /// Reports what a gap left out.
+    /// Reports the end of a gap, with the number of dropped samples.
     pub(super) fn gap_ends(&mut self, gap: &Gap) -> Result<(), ExitReason> {
         let dropped = gap.dropped.iter().map(|(_, count)| count).sum();
         let seconds = gap.to_ns.saturating_sub(gap.from_ns) as f64 / 1e9;
@@ -207,7 +208,7 @@ impl<'a> Report<'a> {
                 self.out.json(&progress)
             }
             ReportForm::Terminal => {
-                // A line that wraps could not be redrawn, so the terminal cuts a line that is still too long.
+                // A wrapped line could not be redrawn, so let the terminal cut a line that is still too long.
                 let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
                 let status = fitting(self.status(written, dropped), columns);
                 let line = [CLEAR_LINE, b"\x1b[?7l", status.as_bytes(), b"\x1b[?7h"].concat();
@@ -217,7 +218,7 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Reports what was received of a topic.
+    /// Reports the counters of a topic.
     pub(super) fn topic(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), ExitReason> {
         if self.form == ReportForm::Json {
             return self.out.json(&json::summary(name, stats));
@@ -226,7 +227,7 @@ impl<'a> Report<'a> {
         self.out.line(|line| text::summary(line, name, stats))
     }
 
-    /// Reports the finished recording.
+    /// Reports the completed recording.
     pub(super) fn end(&mut self, written: &RecordStats, dropped: u64) -> Result<(), ExitReason> {
         let RecordStats { bytes, samples, .. } = *written;
         if self.form == ReportForm::Json {
@@ -273,7 +274,7 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Returns the progress in parts with their ranks. Lost samples have the highest rank.
+    /// Returns the parts of the progress line with their ranks. The part about lost samples has the highest rank.
     fn status(&self, written: &RecordStats, dropped: u64) -> Vec<(u8, String)> {
         let seconds = self.started.elapsed().as_secs();
         let rate = written.bytes.saturating_sub(self.bytes) / REPORT_INTERVAL.as_secs();
@@ -302,7 +303,7 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Formats a size in bytes for users.
+/// Formats a size in bytes for users, such as `1.5 MiB`.
 fn size(bytes: u64) -> String {
     let units = [("GiB", 30), ("MiB", 20), ("KiB", 10)];
     match units.into_iter().find(|(_, bits)| bytes >> bits > 0) {
@@ -311,7 +312,7 @@ fn size(bytes: u64) -> String {
     }
 }
 
-/// Line of class `recording`.
+/// JSON line of class `recording`.
 #[derive(Serialize)]
 struct ProgressJson {
     class: &'static str,
@@ -321,12 +322,12 @@ struct ProgressJson {
     missed: u64,
     dropped: u64,
     seconds: f64,
-    /// Only in the first line.
+    /// Number of files of earlier runs that will be removed; only in the first line.
     #[serde(skip_serializing_if = "Option::is_none")]
     older_removed: Option<usize>,
 }
 
-/// Line of class `recorded`, the last one.
+/// JSON line of class `recorded`, the last one.
 #[derive(Serialize)]
 struct RecordedJson {
     class: &'static str,
@@ -339,7 +340,7 @@ struct RecordedJson {
     seconds: f64,
 }
 
-/// Line of class `notice` on the disk.
+/// JSON line of class `notice` about the disk.
 #[derive(Serialize)]
 struct DiskJson<'a> {
     class: &'static str,
@@ -353,7 +354,7 @@ struct DiskJson<'a> {
     samples: Option<u64>,
 }
 
-/// Line of class `notice` on samples that were left out.
+/// JSON line of class `notice` about dropped samples.
 #[derive(Serialize)]
 struct DroppedJson {
     class: &'static str,

@@ -1,8 +1,8 @@
-//! Computes which readings of a sensor are the robot's own body, as sectors with a range. The body is whatever stays
-//! within a circle around the robot's center during the whole observation.
+//! Computes which readings of a sensor are the robot's own body, as sectors with a range. The body consists of the
+//! objects that stay within a circle around the robot's center during the whole observation.
 //!
-//! The observation is divided into slices of time. An object that a beam meets in all slices at about the same range is
-//! body. An object that it meets in only some slices is not.
+//! The observation is divided into time slices. An object is body if a beam meets it in all slices at about the same
+//! range. It is not body if a beam meets it in only some slices.
 
 use scanhub_schema::{Pose, Scan, in_degrees, in_sector_mdeg};
 
@@ -10,38 +10,39 @@ use scanhub_schema::{Pose, Scan, in_degrees, in_sector_mdeg};
 pub(crate) const SLICE_COUNT: usize = 10;
 /// Maximum number of sectors that a hub accepts.
 const MAX_SECTORS: usize = 64;
-/// Maximum range of a sector that a hub accepts.
+/// Maximum range of a sector that a hub accepts, in mm.
 const MAX_RANGE_MM: u32 = 65_000;
-/// Margin behind the farthest reading of the body, in which readings still count as body. It is five standard
-/// deviations of 7 mm, the maximum in recordings of standing sensors, and the 15 mm by which two devices differ.
+/// Margin beyond the farthest reading of the body in mm, in which readings still count as body. It is five standard
+/// deviations of 7 mm, the maximum in recordings of stationary sensors, plus the 15 mm by which two devices differ.
 const MARGIN_MM: u32 = 50;
-/// Margin for a beam that the body hides completely, so that a large margin hides nothing else. One reading in a
-/// hundred is off by 60 mm, which would cause a stop every few seconds. The margin is four standard deviations of that.
+/// Margin in mm for a beam that the body hides completely. It can be large, because such a beam has nothing else to
+/// hide. One reading in a hundred is off by 60 mm, which would cause a stop every few seconds. The margin is four
+/// standard deviations of that.
 const HIDDEN_MARGIN_MM: u32 = 250;
-/// Share of body readings from which on the body hides the beam completely.
+/// Minimum share of body readings in a beam that the body hides completely.
 const FULL_SHARE: f64 = 0.9;
 
 /// Share of a slice's scans in which a beam must meet an object, so that a single wrong reading has no effect.
 const MIN_HIT_SHARE: f64 = 0.05;
-/// Divisor of the number of slices that may differ from the others, because a person may pass near the body.
+/// Divisor of the number of slices that may differ from the others, because a person may walk past the body.
 const PASSING_DIVISOR: usize = 5;
-/// Maximum difference between the nearest readings of a body in different slices, from noise and a trembling robot. A
-/// person moves more.
+/// Maximum difference between the nearest readings of a body in different slices, in mm. It is caused by noise and
+/// vibration of the robot. A person moves more.
 const MAX_STEADY_DIFFERENCE_MM: u32 = 100;
-/// Distance from an edge of the body, in degrees, in which a beam may measure any range between the body and the object
-/// behind it: half a spot of 12 mm at 0.4 m.
+/// Distance from an edge of the body, in degrees, within which a beam may measure any range between the body and the
+/// object behind it. It is half a light spot of 12 mm at 0.4 m.
 const EDGE_DEG: f64 = 1.0;
-/// Maximum difference between the ranges of neighboring beams in a sector. A sector hides at most this much more than
-/// needed.
+/// Maximum difference between the ranges of neighboring beams in a sector, in mm. A sector hides at most this much more
+/// than necessary.
 const MAX_SECTOR_DIFFERENCE_MM: u32 = 50;
 /// Maximum number of beams without motion between two beams with motion in the same sector.
 const MAX_GAP_BEAMS: usize = 3;
 
-/// Observation of a sensor.
+/// Observation of a sensor, from which the mask is computed.
 pub(crate) struct Body {
     pose: Pose,
     within_mm: f64,
-    /// Shape of the first scan, which all other scans must have.
+    /// Shape of the first scan. All other scans must have the same.
     shape: Option<Shape>,
     /// Number of scans in each slice.
     scans: [u32; SLICE_COUNT],
@@ -52,10 +53,10 @@ pub(crate) struct Body {
 type Shape = (u16, f64, f64, u32);
 
 struct Beam {
-    /// Unit vector in the robot's frame.
+    /// Unit vector of the beam in the robot's frame.
     direction: (f64, f64),
     angle_mdeg: i32,
-    /// Range at which the beam leaves the circle, plus the margin. 0 if it is never inside.
+    /// Range in mm at which the beam leaves the circle, plus the margin; 0 if it is never inside the circle.
     circle_mm: u32,
     /// Number of scans with a reading.
     valid: u32,
@@ -73,7 +74,7 @@ struct Slice {
 /// Result of an observation: the body, and other objects in the circle.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Mask {
-    /// Sectors in which readings nearer than `range_mm` are the body, in the order of the beams. At most [`MAX_SECTORS`].
+    /// Sectors in which readings below `range_mm` are the body, in the order of the beams. At most [`MAX_SECTORS`].
     pub(crate) sectors: Vec<Sector>,
     /// Sectors of objects that moved, appeared or disappeared, with their shortest range.
     pub(crate) moving: Vec<Sector>,
@@ -81,7 +82,7 @@ pub(crate) struct Mask {
     pub(crate) of_beams: usize,
 }
 
-/// Neighboring beams.
+/// A group of neighboring beams.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Sector {
     /// Angle of the first beam in 1/1000 degree.
@@ -90,18 +91,18 @@ pub(crate) struct Sector {
     pub(crate) to_mdeg: i32,
     /// Number of beams.
     pub(crate) beams: usize,
-    /// Range in mm.
+    /// Range of the sector in mm.
     pub(crate) range_mm: u32,
 }
 
 impl Body {
-    /// Creates the observation of a sensor at `pose`. Objects nearer than `within_mm` to the robot's center may be
+    /// Creates the observation of a sensor at `pose`. Only objects within `within_mm` of the robot's center can be
     /// body.
     pub(crate) fn new(pose: Pose, within_mm: f64) -> Body {
         Body { pose, within_mm, shape: None, scans: [0; SLICE_COUNT], beams: Vec::new() }
     }
 
-    /// Adds `scan`, which was made in slice `slice`. Returns false if its shape differs from that of earlier scans.
+    /// Adds `scan`, which belongs to `slice`. Returns false if its shape differs from that of earlier scans.
     pub(crate) fn add(&mut self, slice: usize, scan: &Scan) -> bool {
         let shape = (scan.count, scan.first_angle, scan.step, scan.unit_um);
         if *self.shape.get_or_insert(shape) != shape {
@@ -130,12 +131,12 @@ impl Body {
         true
     }
 
-    /// Returns the number of scans.
+    /// Returns the number of scans in all slices.
     pub(crate) fn scans(&self) -> u32 {
         self.scans.iter().sum()
     }
 
-    /// Returns the number of slices with a scan.
+    /// Returns the number of slices that have a scan.
     pub(crate) fn slice_count(&self) -> usize {
         self.scans.iter().filter(|&&scans| scans > 0).count()
     }
@@ -187,9 +188,9 @@ impl Body {
     }
 }
 
-/// Ranges of a beam in the slices in which it met an object often enough, in ascending order.
+/// Ranges of a beam in the slices in which it met an object often enough, each list in ascending order.
 struct FrequentHits {
-    /// Whether the objects that it met hide everything behind them.
+    /// Whether the body hides everything behind it.
     is_full: bool,
     circle_mm: u32,
     nearest_mm: Vec<u32>,
@@ -223,7 +224,7 @@ impl FrequentHits {
         self.nearest_mm.len()
     }
 
-    /// Returns whether the beam met an object in all of `slices`, at about the same range.
+    /// Returns whether the beam met an object in each of `slices` at about the same range.
     fn is_body(&self, slices: usize) -> bool {
         if self.slices() < slices {
             return false;
@@ -233,23 +234,23 @@ impl FrequentHits {
         near.zip(far).is_some_and(|(near, far)| far.saturating_sub(*near) <= MAX_STEADY_DIFFERENCE_MM)
     }
 
-    /// Returns the range below which readings are the body.
+    /// Returns the range in mm below which readings are the body.
     fn reach_mm(&self, slices: usize) -> u32 {
         let reach = self.farthest_mm.iter().nth_back(slices / PASSING_DIVISOR).copied().unwrap_or_default();
         reach + if self.is_full { HIDDEN_MARGIN_MM } else { MARGIN_MM }
     }
 
-    /// Returns the nearest reading at `range_mm` or farther. 0 if there is none.
+    /// Returns the nearest reading at `range_mm` or beyond; 0 if there is none.
     fn beyond(&self, range_mm: u32) -> u32 {
         self.nearest_mm.iter().copied().find(|&nearest| nearest >= range_mm).unwrap_or_default()
     }
 }
 
-/// Returns the range below which readings of `beam` are the body. 0 if none are.
+/// Returns the range in mm below which readings of `beam` are the body; 0 if none are.
 ///
-/// Within `edge` beams of an edge of the body, every reading in the circle may be body. Spots are wider than beams,
-/// robots tremble, and a range there may lie anywhere between the body and a farther object. The strip that this hides
-/// is too narrow for a leg.
+/// Within `edge` beams of an edge of the body, every reading in the circle may be body. Light spots are wider than
+/// beams, and robots vibrate, so a range there may lie anywhere between the body and a farther object. The strip that
+/// this hides is too narrow for a leg.
 fn range_mm(hits: &[FrequentHits], is_body: &[bool], beam: usize, edge: usize, slices: usize) -> u32 {
     let near = |distance: usize| {
         let (first, last) =
@@ -267,7 +268,7 @@ fn range_mm(hits: &[FrequentHits], is_body: &[bool], beam: usize, edge: usize, s
     }
 }
 
-/// Neighboring beams, with the lowest and the highest of their values.
+/// A group of neighboring beams, with the minimum and the maximum of their values.
 #[derive(Clone, Copy)]
 struct Run {
     first: usize,
@@ -281,7 +282,7 @@ impl Run {
         self.last - self.first + 1
     }
 
-    /// Returns the run from the first to the last beam of both.
+    /// Returns the run from the first beam of both runs to the last one.
     fn union(self, other: Run) -> Run {
         Run {
             first: self.first.min(other.first),
@@ -291,14 +292,14 @@ impl Run {
         }
     }
 
-    /// Returns the area that it hides, in beams times mm.
+    /// Returns the area that the run hides, in beams times mm.
     fn area(&self) -> u64 {
         self.beams() as u64 * u64::from(self.max_mm)
     }
 }
 
-/// Groups beams whose value is not 0 into runs. A run has at most `gap` beams without a value between two others, and
-/// its values differ by at most `alike_mm`.
+/// Groups beams whose value is not 0 into runs. Between two beams of a run, at most `gap` beams have no value. The
+/// values of a run differ by at most `alike_mm`.
 fn runs(values_mm: &[u32], gap: usize, alike_mm: u32) -> Vec<Run> {
     let mut runs: Vec<Run> = Vec::new();
     for (beam, &value) in values_mm.iter().enumerate().filter(|(_, value)| **value > 0) {
@@ -316,7 +317,7 @@ fn runs(values_mm: &[u32], gap: usize, alike_mm: u32) -> Vec<Run> {
     runs
 }
 
-/// Joins neighboring runs until a hub accepts their number. It first joins those that add the smallest hidden area.
+/// Joins neighboring runs until the hub accepts their number. Those that add the smallest hidden area are joined first.
 fn join(mut runs: Vec<Run>) -> Vec<Run> {
     while runs.len() > MAX_SECTORS {
         let more = |at: &usize| {
@@ -339,7 +340,8 @@ mod tests {
     const WALL_MM: u16 = 5000;
     const SCANS: usize = 40;
 
-    /// Returns the mask of a sensor at the robot's center. Its ranges are `range_mm(beam, slice, scan of the slice)`.
+    /// Returns the mask of a sensor at the robot's center. `range_mm` gets the beam, the slice, and the scan within the
+    /// slice.
     fn mask(range_mm: impl Fn(usize, usize, usize) -> Option<u16>) -> Mask {
         learn(Pose::default(), 1000.0, range_mm)
     }
@@ -370,13 +372,13 @@ mod tests {
     }
 
     /// Returns the sectors of a body from beam `first` to `last`, up to `range_mm`, in a circle of one meter. On each
-    /// side, two of its beams and the next one are its edge.
+    /// side, the edge consists of two of its beams and the next one.
     fn body_sectors(first: usize, last: usize, range_mm: u32) -> Vec<Sector> {
         let edge = |from: usize| sector(from, from + 2, 1050);
         vec![edge(first - 1), sector(first + 2, last - 2, range_mm), edge(last - 1)]
     }
 
-    /// Returns noise of a few mm, the same in every run.
+    /// Returns reproducible noise of a few mm.
     fn noise(beam: usize, slice: usize, scan: usize) -> u16 {
         ((beam * 31 + slice * 17 + scan * 7) % 11) as u16
     }
@@ -387,7 +389,7 @@ mod tests {
             60..=67 => Some(400 + noise(beam, slice, scan)),
             _ => Some(WALL_MM),
         };
-        // Behind the post, the mask has the large margin. The beams next to it are hidden up to the circle.
+        // For beams on the post, the mask has the large margin. Next to it, beams are hidden up to the circle.
         assert_eq!(mask(post), Mask { sectors: body_sectors(60, 67, 660), moving: vec![], of_beams: COUNT });
     }
 
@@ -445,7 +447,7 @@ mod tests {
 
     #[test]
     fn cable_with_rare_scattered_readings_is_body() {
-        // Six of forty scans meet the cable, each at another range.
+        // Six of forty scans meet the cable, each at a different range.
         let found = mask(|beam, slice, scan| match beam {
             200..=202 if scan % 7 == slice % 7 => Some(300 + ((slice * 97 + scan * 41) % 400) as u16),
             _ => Some(WALL_MM),
@@ -463,7 +465,7 @@ mod tests {
             })
         };
         assert_eq!(wrong(3), Mask { of_beams: COUNT, ..Mask::default() });
-        // Two readings in a slice are an object, but not a body.
+        // Two readings in a slice count as an object, but not as a body.
         assert_eq!(wrong(30), Mask { moving: vec![sector(7, 7, 100)], of_beams: COUNT, ..Mask::default() });
     }
 

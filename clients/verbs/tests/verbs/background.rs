@@ -1,4 +1,4 @@
-//! `background` against a hub that keeps a model and nothing else.
+//! Tests of `background` with a fake hub that keeps only a model.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, chown};
@@ -15,7 +15,7 @@ use scanhub_shm::ControlServer;
 use scanhub_shm::{Domain, HubLock};
 use scanhub_verbs::background::{BackgroundArgs, ModelRequest, saved_model};
 
-/// A hub that answers for the background of `front`.
+/// A hub that answers only control requests for the background of `front`.
 struct FakeControlServer {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -120,7 +120,7 @@ fn run_order(
     (end, out.text())
 }
 
-/// To save a model where nothing is yet.
+/// Returns a request to save the model to a new file.
 fn save_order(file: &Path) -> ModelRequest {
     ModelRequest::Save { file: file.to_owned(), force: false }
 }
@@ -158,7 +158,7 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
             .split_at(160)
             .0
     );
-    // What is shown is what a file is.
+    // The shown model is equal to a saved file.
     let (_, piped) = run_order(&test_domain, "front", save_order(Path::new("-")), false);
     assert_eq!(piped, out);
     assert!(saved_model("-".as_ref(), "front", false, &mut out.as_bytes()).is_ok());
@@ -188,7 +188,7 @@ fn unsuitable_or_unreadable_models_are_refused() {
     assert!(foreign.hint.contains("--any-sensor"));
     assert!(saved_model(&file, "rear", true, &mut &b""[..]).is_ok());
 
-    // The hub says what it has; here it is another resolution.
+    // The hub rejects a model of another resolution, and reports its own.
     let other = test_domain.base.join("other.json");
     fs::write(&other, serde_json::to_vec(&as_json("front", &model())).unwrap()).unwrap();
     let refused = run_order(&test_domain, "front", load_order(&other), false).0.unwrap_err();
@@ -231,7 +231,7 @@ fn nothing_is_saved_by_halves() {
     assert_eq!(fs::read(&file).unwrap(), b"old");
     save(file.clone()).0.unwrap();
     assert!(saved_model(&file, "front", false, &mut &b""[..]).is_ok());
-    // Owner and permissions stay.
+    // Owner and permissions of a replaced file stay the same.
     let _ = chown(&file, Some(12_345), Some(12_345));
     fs::set_permissions(&file, fs::Permissions::from_mode(0o640)).unwrap();
     let rights = || fs::metadata(&file).map(|found| (found.mode(), found.uid(), found.gid())).unwrap();

@@ -1,4 +1,4 @@
-//! `echo` to the letter: lines, notices, bounds and ends.
+//! Tests of the exact output of `echo`: lines, notices, limits and ends.
 
 use std::fs::File;
 use std::io;
@@ -49,7 +49,7 @@ fn count(count: u64) -> RunLimits {
     RunLimits { count: Some(count), ..RunLimits::default() }
 }
 
-/// Without the last line, which carries times.
+/// Returns all lines but the last, which has times.
 fn all_but_last_line(text: &str) -> Vec<&str> {
     let mut lines: Vec<_> = text.lines().collect();
     lines.pop();
@@ -84,7 +84,7 @@ fn telegrams_and_status_as_json() {
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(&test_domain, &["front/telegram", "front/status"], Format::Json, count(2));
     hub.front_sensor().telegram.await_subscribers(1);
-    // What was asked for, and the state of the line beside it.
+    // One subscriber for the requested topic, and one for the state of the line.
     hub.front_sensor().status.await_subscribers(2);
     hub.front_sensor().publish_telegram(&REPLY);
     verb.out.await_lines("telegram", 1);
@@ -127,7 +127,7 @@ fn scans_as_columns_and_as_bytes() {
     assert!(notes.starts_with("front/scan: 2 received, 0 missed"), "{notes}");
     crate::fake::wait_until("bytes", || raw.finished());
     let bytes = raw.out.bytes();
-    // The head up to the unit, unit, count, the greatest range and the code above it; the ranges behind the head.
+    // Head of the payload: unit, count, maximum range and the code above it. The ranges follow the head.
     let field = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]);
     assert_eq!((bytes.len(), [28, 32, 34, 36, 64].map(field)), (70, [10_000, 2, 0x1FF6, 0x1FFF, 1000]));
 }
@@ -247,7 +247,7 @@ fn all_sensors_and_all_topics() {
     ] {
         assert_eq!(out.matches(begin).count(), 1, "{out}");
     }
-    // One of the front's, all of the rear's, each once.
+    // One topic of the front sensor and all of the rear sensor, each once.
     assert_eq!(out.matches(r#"{"class":"summary""#).count(), 1 + 10, "{out}");
 }
 
@@ -335,7 +335,7 @@ fn summary_reports_line_loss_during_the_run() {
     assert!(!out.contains(r#""class":"status""#), "{out}");
 }
 
-/// A hub lends four statuses at most, and that number may have waited.
+/// A subscriber can borrow at most four statuses, and that number may be waiting.
 #[test]
 fn statuses_that_waited_do_not_hide_later_ones() {
     let test_domain = TestDomain::new();
@@ -343,7 +343,7 @@ fn statuses_that_waited_do_not_hide_later_ones() {
     let names = [TopicName { sensor: "front".to_owned(), topic: Topic::Scan }];
     let (places, bounds, stop) = (test_domain.locations(), RunLimits::default(), AtomicBool::new(false));
     let mut following = TopicRun::new(&names, &[], &places, &bounds, &stop).with_lines();
-    // Takes events until the status with this count arrives, or for 0 until the topic has a subscriber.
+    // Handles events until the status with this count arrives, or with 0 until the topic has a subscriber.
     let mut follow = |hub: &mut FakeHub, errors: u64| loop {
         match following.next(None).unwrap().expect("the run has no end") {
             Event::Line(_, status) if status.counters[Counter::LineErrors] == errors => break,

@@ -1,4 +1,4 @@
-//! `latency`: what counts as an age, what ends in exit 5, and that every way of waiting measures the same things.
+//! Tests of `latency`: which ages are measured, when it exits with 5, and that all wait methods measure the same.
 
 use std::time::Duration;
 
@@ -22,7 +22,7 @@ fn start(test_domain: &TestDomain, is_json: bool, arguments: &str) -> RunningVer
     })
 }
 
-/// Three zones, stamped when they are sent, to a consumer that listens.
+/// Runs `latency` while a fake hub publishes zones, stamped when they are sent. Returns end, output and notes.
 fn run_with_three_zones(
     test_domain: &TestDomain,
     is_json: bool,
@@ -31,7 +31,7 @@ fn run_with_three_zones(
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(test_domain, is_json, arguments);
     hub.front_sensor().zones.await_subscribers(1);
-    // It has to be past its subscription, which is told by nothing but what it receives.
+    // Only the samples that it receives show that it has completed the subscription, so repeat them.
     while !verb.finished() {
         hub.front_sensor().publish_zones(Verdict::Clear, 700);
         std::thread::sleep(Duration::from_millis(5));
@@ -39,7 +39,7 @@ fn run_with_three_zones(
     verb.join()
 }
 
-/// The line of what came of `topic`.
+/// Returns the last line of class `latency` about `topic`.
 fn latency_line<'a>(out: &'a str, topic: &str) -> &'a str {
     let named = format!(r#""class":"latency","sensor":"front","topic":"{topic}""#);
     out.lines().rfind(|line| line.contains(&named)).unwrap_or_else(|| panic!("no {topic}: {out}"))
@@ -94,7 +94,7 @@ fn samples_from_before_the_start_have_no_age() {
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(&test_domain, true, "front/scan front/scan -n 5 --max-p99 60s");
     hub.front_sensor().scan.await_subscribers(1);
-    // Stamps of the first seconds after the machine's start.
+    // The fake hub's stamps are from the first seconds after the machine's start.
     while !verb.finished() {
         hub.front_sensor().publish_scan(&[100]);
         std::thread::sleep(Duration::from_millis(5));
@@ -136,7 +136,7 @@ fn a_line_each_second_and_a_hub_that_is_replaced() {
     };
     tell(1, 1);
     verb.out.await_lines(r#""kind":"hub_gone""#, 1);
-    // Told while the new one is here.
+    // Lines are also written while the second hub runs.
     let lines = verb.out.text().matches(r#""class":"latency""#).count();
     tell(2, lines + 1);
     verb.out.await_lines(r#""kind":"hub_back""#, 1);

@@ -1,5 +1,4 @@
-//! The verbs against a hub that a test makes: one binary with a module for each thing that is held, so that what they all
-//! link is linked once.
+//! Tests of the verbs with a fake hub. They are modules of one binary, so that their dependencies are linked only once.
 
 #[path = "../../../../tests/testkit/child.rs"]
 mod child;
@@ -21,12 +20,12 @@ use scanhub_verbs::context::{Context, DomainOptions};
 
 use fake::TestDomain;
 
-/// Returns the domain of `place` as a user would name it.
+/// Returns the options with which a user would name the domain of `test_domain`.
 fn domain_options(test_domain: &TestDomain) -> DomainOptions {
     DomainOptions { name: test_domain.domain.name().to_owned(), root: Some(test_domain.base.clone()) }
 }
 
-/// Returns what a verb gets that writes to `out` and `notes` until `stop` is set.
+/// Returns the context of a verb that writes to `out` and `notes` until `stop` is set.
 fn context(domain: DomainOptions, json: bool, out: File, notes: File, stop: Arc<AtomicBool>) -> Context {
     Context::new(json, domain, (out, notes), Box::new(stop))
 }

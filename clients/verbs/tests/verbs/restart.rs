@@ -1,4 +1,4 @@
-//! A hub that is killed and comes back, as those see it who follow it.
+//! Tests of a hub that is killed and restarted, as seen by its subscribers.
 
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -11,10 +11,10 @@ use scanhub_schema::Scan;
 use scanhub_shm::{Domain, hub_pid};
 use scanhub_verbs::RunLimits;
 
-/// One turn of an LMS's mirror (75 Hz); it measures the half degrees one turn later.
+/// Duration of one mirror revolution of an LMS (75 Hz). It measures the half degrees one revolution later.
 const REVOLUTION_NS: u64 = 13_320_000;
 
-/// The hub of these tests when it has to be a process of its own: run by them, ignored otherwise.
+/// Hub of these tests as a separate process. They start it, and it is ignored otherwise.
 #[test]
 #[ignore = "a helper process of the tests here"]
 fn hub_process() {
@@ -27,7 +27,7 @@ fn hub_process() {
     }
 }
 
-/// A process that goes with the test.
+/// A hub process that ends with the test.
 struct HubProcess(Child);
 
 impl HubProcess {
@@ -61,7 +61,7 @@ fn echo_continues_after_a_killed_hub() {
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()));
     assert_eq!((out.matches("hub_gone").count(), out.matches("hub_back").count()), (1, 1));
-    // The consumer was there all the time: it got the new hub's samples from the first on.
+    // The subscriber existed before the new hub, so it receives the new hub's samples from the first one on.
     let first = out.lines().find(|line| line.contains(r#""boot":"0000000000000002""#)).unwrap();
     assert!(first.contains(r#""topic_seq":0,"#), "{first}");
     assert!(out.lines().last().unwrap().contains(r#""missed":0"#), "{out}");
@@ -134,7 +134,7 @@ fn a_client_that_comes_between_two_hubs() {
         Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).timeout(timeout).open().unwrap();
     assert!(scans.next().unwrap().is_none() && !scans.hub_is_running());
     let hub = HubProcess::start(&test_domain, 2);
-    // It looks for a hub all the time, so it may come while the hub starts.
+    // The subscriber polls for a hub all the time, so it may receive a scan while the hub still starts.
     let mut is_heard = false;
     let mut receive = || {
         is_heard |= scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted);

@@ -1,4 +1,4 @@
-//! Zones that go silent, as those see it who act on them.
+//! Tests of zones that become stale, as seen by subscribers.
 
 use std::time::{Duration, Instant};
 
@@ -10,17 +10,18 @@ use scanhub_schema::Verdict;
 use scanhub_verbs::RunLimits;
 use scanhub_verbs::hz::HzArgs;
 
-/// Slow scans, so that a busy machine is no silence: two of them and 40 ms are.
+/// Period of slow scans in us, so that a delay of a busy machine does not count as a silence. Zones become stale after
+/// two periods and 40 ms.
 const PERIOD_US: u32 = 300_000;
 
-/// A hub of such scans.
+/// Creates a hub whose sensors have slow scans.
 fn slow_hub(test_domain: &TestDomain, sensors: &[&str], boot: u64) -> FakeHub {
     let mut hub = FakeHub::new(&test_domain.domain, sensors, boot);
     hub.sensors.iter_mut().for_each(|sensor| sensor.period_us = PERIOD_US);
     hub
 }
 
-/// Publishes zones until a consumer that came late has heard them, too.
+/// Publishes zones until a late joiner has received them.
 fn publish_until_received(sensor: &mut FakeSensor, verdict: Verdict, mut is_received: impl FnMut() -> bool) {
     wait_until("a sample", || {
         sensor.publish_zones(verdict, 1234);
@@ -83,7 +84,7 @@ fn newest_verdict_counts_and_stale_one_is_unknown() {
     }
     let received = zones.next().unwrap();
     assert_eq!((received.zones.nearest_mm, received.missed, received.stale), (100, 2, false));
-    // A second after the machine started.
+    // The stamp is one second after the machine's start, so these zones are stale.
     hub.front_sensor().publish_zones_at(Verdict::Clear, 9000, 1_000_000_000);
     let received = zones.next().unwrap();
     assert_eq!(
@@ -180,7 +181,7 @@ fn echo_of_the_robot() {
     let bounds = RunLimits { count: Some(3), ..RunLimits::default() };
     let verb = start(&test_domain, &["robot/zones"], Format::Json, bounds);
     hub.sensors.iter().for_each(|sensor| sensor.zones.await_subscribers(1));
-    // There is nothing to say of all of them until each was heard.
+    // There is no combined verdict until each sensor has sent one.
     hub.sensors[1].publish_zones(Verdict::Stop, 500);
     hub.sensors[0].publish_zones(Verdict::Slow, 700);
     verb.out.await_lines(r#""verdict":"stop","nearest_mm":500,"nearest_sensor":"front""#, 1);
