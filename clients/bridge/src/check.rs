@@ -121,7 +121,8 @@ fn unreachable(reasons: &[String]) -> Finding {
     Finding::failed(message, remedy)
 }
 
-/// Replies of the hubs by ID. A reply is the lead of our clock over the hub's in nanoseconds, or the error in its datagram.
+/// Replies of the hubs by ID. A reply is the lead of our clock over the hub's in nanoseconds, or the error in its
+/// datagram.
 type HubReplies = BTreeMap<u64, Result<i64, DatagramError>>;
 
 /// Queries all sensors for their announcements, and returns the findings about their hubs.

@@ -22,7 +22,8 @@ impl Diagnosis {
     }
 }
 
-/// Default cause if the connecting side reports no other: no program answers there, or it does not use Zenoh's protocol.
+/// Default cause if the connecting side reports no other: no program answers there, or it does not use Zenoh's
+/// protocol.
 pub(crate) const UNREACHED: Diagnosis = Diagnosis {
     finding: "no router is reached",
     remedy: "start a router there (`scanhub bridge --listen ..` or zenohd), and check the firewall",

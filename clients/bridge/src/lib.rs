@@ -176,8 +176,8 @@ fn spawn<T: Send + 'static>(
     thread::Builder::new().name(name.into()).spawn(work).map_err(|error| no_thread(&error))
 }
 
-/// Reports the statistics of sent samples, and the refused connections. Once topics are published, the refused connections are
-/// reported with them.
+/// Reports the statistics of sent samples, and the number of refused connections. If the bridge publishes, the receiver
+/// reports the refused connections once the session is open.
 fn report_counts(
     options: &BridgeOptions,
     connection: &Connection,

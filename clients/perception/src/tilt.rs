@@ -1,10 +1,11 @@
-//! Computes three dimensions with a planar scanner that a mount tilts: points, background and obstacles, sweep by sweep.
+//! Three-dimensional points, background and obstacles from a planar scanner that a mount tilts, sweep by sweep.
 //!
-//! A [`Mount`] describes the axis. [`TiltScanner`] takes scans and [`Angle`]s and returns [`Sweep`]s. Each beam gets the
-//! mount's angle at its own time. A beam without a reliable angle makes no point; [`Counts`] has the number of such beams by
-//! reason.
+//! A [`Mount`] describes the axis. [`TiltScanner`] takes scans and [`Angle`]s and returns [`Sweep`]s. Each beam gets
+//! the mount's angle at its own time. A beam without a reliable angle produces no point; [`Counts`] has the number of
+//! such beams by reason.
 //!
-//! There is neither clock nor I/O here. Time is that of the stamps, so a recording gives the same points at any speed.
+//! The module uses neither a clock nor I/O. Time is that of the stamps, so a recording gives the same points at any
+//! speed.
 
 mod angles;
 mod background;
@@ -24,21 +25,21 @@ use self::delay::{Delay, MAX_DELAY_S};
 pub use self::mount::{Floor, Mount, MountCheck, Wall};
 use self::sweep::{Ray, SweepAnalyzer};
 
-/// The examples of the page.
+/// Runs the examples of the page as tests.
 #[cfg(doctest)]
 #[doc = include_str!("../../../docs/tilt.md")]
 struct Page;
 
-/// Maximum number of scans that wait for angles. One more makes the scanner take the oldest at once.
+/// Maximum number of scans that wait for angles. With one more, the oldest is processed at once.
 const MAX_WAITING_SCANS: usize = 64;
-/// Maximum number of beams of a sweep. It then ends without a reversal.
+/// Maximum number of beams of a sweep. A sweep with more ends without a reversal.
 const MAX_RAYS: usize = 262_144;
-/// Difference from the last stamp at which a clock is taken to have been set back.
+/// Minimum step backward from the last stamp that counts as a clock that was set back, in ns.
 const CLOCK_JUMP_NS: u64 = 1_000_000_000;
-/// Counters since the start.
+/// Counters since the creation of the scanner.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
-    /// Sweeps that were returned.
+    /// Returned sweeps.
     pub sweeps: u64,
     /// Returned sweeps that are not complete.
     pub incomplete: u64,
@@ -46,20 +47,20 @@ pub struct Counts {
     pub unreliable: u64,
     /// Resets of the background, because scans changed or sweeps contradicted it for too long.
     pub background_resets: u64,
-    /// Scans that were taken.
+    /// Processed scans.
     pub scans: u64,
     /// Scans that were dropped because later ones had arrived.
     pub out_of_order: u64,
-    /// Points that were made.
+    /// Created points.
     pub points: u64,
-    /// Beams with a reading that made no point, by [`DropReason`].
+    /// Beams with a reading but without a point, by [`DropReason`].
     #[serde(serialize_with = "by_reason")]
     pub points_dropped: [u64; DropReason::COUNT],
-    /// Angles that were taken.
+    /// Accepted angles.
     pub angles: u64,
     /// Angles that were dropped because later ones had arrived.
     pub angles_out_of_order: u64,
-    /// Angles that were dropped because their stamps are later than all scans.
+    /// Angles that were dropped because their stamps are later than those of all scans.
     pub angles_in_future: u64,
     /// Angles that were dropped because they are not numbers.
     pub angles_invalid: u64,
@@ -94,7 +95,7 @@ pub struct TiltScanner {
     spare_scans: Vec<Box<Scan>>,
     /// Stamp of the last scan.
     scan_ns: Option<u64>,
-    /// Stamp of the last beam that was taken.
+    /// Stamp of the last processed beam.
     taken_ns: u64,
     ends: VecDeque<SweepEnd>,
     rays: Vec<Ray>,
@@ -104,13 +105,13 @@ pub struct TiltScanner {
     /// Number of beams, first angle and step of the scans.
     shape: (usize, f64, f64),
     from_ns: u64,
-    /// Whether the sweep started at a reversal, and no beam is missing so far.
+    /// Whether the sweep started at a reversal and has all beams so far.
     is_whole: bool,
     counts: Counts,
 }
 
 impl TiltScanner {
-    /// Creates a scanner without scans and angles.
+    /// Creates a tilted scanner without scans and angles.
     pub fn new(mount: Mount, settings: Settings) -> TiltScanner {
         TiltScanner {
             settings,
@@ -137,20 +138,20 @@ impl TiltScanner {
         Counts { background_resets: self.analyzer.background_resets, ..self.counts }
     }
 
-    /// Returns the estimated delay of the stamps of the mount in ns, by which all angles are corrected. It follows
-    /// from the difference of up and down sweeps.
+    /// Returns the estimated delay of the mount's stamps in ns, by which all angles are corrected. It is computed from
+    /// the difference between up and down sweeps.
     pub fn late_ns(&self) -> i64 {
         self.angles.late_ns()
     }
 
-    /// Returns the reason why beams that are measured now make no points. `None` if they do.
+    /// Returns the reason why beams that are measured now produce no points; `None` if they produce points.
     pub fn problem(&self) -> Option<DropReason> {
         let late_ns = self.scan_ns.unwrap_or(0).saturating_sub(self.settings.delay_ns);
         let is_silent = self.angles.last_ns().is_none_or(|last_ns| last_ns < late_ns);
         if is_silent { Some(DropReason::Silent) } else { self.angles.problem() }
     }
 
-    /// Takes the next angle, and passes each complete sweep to `show`.
+    /// Handles the next angle, and passes each complete sweep to `show`.
     pub fn take_angle(&mut self, angle: Angle, mut show: impl FnMut(&Sweep<'_>)) {
         let before_ns = self.angles.last_ns();
         match self.angles.take(angle, self.scan_ns, &self.settings, &mut self.counts) {
@@ -187,7 +188,7 @@ impl TiltScanner {
         self.advance(&mut show);
     }
 
-    /// Takes the next scan with its header's first stamp, and passes each complete sweep to `show`.
+    /// Handles the next scan, whose header has the first stamp `stamp_ns`, and passes each complete sweep to `show`.
     pub fn take_scan(&mut self, stamp_ns: u64, scan: &Scan, mut show: impl FnMut(&Sweep<'_>)) {
         if let Some(last_ns) = self.scan_ns.filter(|&last_ns| stamp_ns <= last_ns) {
             if last_ns - stamp_ns < CLOCK_JUMP_NS {
@@ -220,13 +221,13 @@ impl TiltScanner {
         (self.taken_ns, self.is_whole) = (0, false);
     }
 
-    /// Restarts with a new background if the shape of the scans changes.
+    /// Restarts with a new background if the shape of the scans has changed.
     fn fit(&mut self, scan: &Scan) {
         let shape = (scan.beams(), scan.first_angle, scan.step);
         if shape != self.shape {
             self.analyzer.begin(shape.0, self.shape.0 == 0);
             self.delay.reset();
-            // Beams of the old shape have other directions.
+            // Drop beams of the old shape, because they have other directions.
             self.rays.clear();
             self.spare_scans.extend(self.waiting.drain(..).map(|one| one.scan));
             self.is_whole = false;
@@ -234,7 +235,7 @@ impl TiltScanner {
         }
     }
 
-    /// Ends the sweep at `stamp_ns`, from which on the angle is unknown.
+    /// Ends the sweep at `stamp_ns`, because the angle is unknown after that.
     fn interrupt_sweep(&mut self, stamp_ns: u64) {
         if self.ends.back().is_none_or(|end| end.is_reversal || end.stamp_ns < stamp_ns) {
             self.ends.push_back(SweepEnd { stamp_ns, is_reversal: false });
@@ -258,7 +259,7 @@ impl TiltScanner {
         self.finish(show);
     }
 
-    /// Gives the beams of a scan their angles.
+    /// Determines the mount's angle for each beam of a scan.
     fn assign_angles(&mut self, one: &PendingScan) {
         let unit_m = f64::from(one.scan.unit_um) * 1e-6;
         for (beam, &value) in one.scan.ranges().iter().enumerate() {
@@ -286,12 +287,12 @@ impl TiltScanner {
         if self.rays.len() > MAX_RAYS {
             self.interrupt_sweep(self.taken_ns);
         } else if self.angles.last_ns().is_some_and(|last_ns| last_ns < one.until_ns) {
-            // It has waited for angles that did not arrive.
+            // The scan has waited for angles that did not arrive.
             self.interrupt_sweep(self.angles.last_ns().unwrap_or(0));
         }
     }
 
-    /// Ends the complete sweeps.
+    /// Passes all complete sweeps to `show`.
     fn finish(&mut self, show: &mut impl FnMut(&Sweep<'_>)) {
         while let Some(end) = self.ends.front().copied().filter(|end| end.stamp_ns <= self.taken_ns) {
             self.ends.pop_front();
@@ -305,9 +306,9 @@ impl TiltScanner {
         }
     }
 
-    /// Adds `more_ns` to the delay of the angles' stamps, and gives the beams of this sweep and the next one their corrected
-    /// angles. Returns whether each of the two still has all beams: the angles of the first ones may be forgotten, and those of
-    /// the last ones may not have arrived.
+    /// Adds `more_ns` to the delay of the angles' stamps, and corrects the angles of the beams of this sweep and the
+    /// next one. Returns for both whether they still have all beams. The first beams may need angles that are no longer
+    /// stored, and the last ones angles that have not arrived.
     fn correct(&mut self, more_ns: i64) -> [bool; 2] {
         self.angles.correct(more_ns);
         let TiltScanner { angles, rays, next_rays: later, ends, counts, .. } = self;
@@ -329,7 +330,7 @@ impl TiltScanner {
         is_whole
     }
 
-    /// Passes the sweep until `end` to `show`. Returns whether the next sweep has all beams so far.
+    /// Passes the sweep that ends at `end` to `show`. Returns whether the next sweep has all beams so far.
     fn show(&mut self, end: SweepEnd, show: &mut impl FnMut(&Sweep<'_>)) -> bool {
         let mut is_next_whole = true;
         let mut sweep = Sweep {
@@ -362,33 +363,33 @@ impl TiltScanner {
 /// End point of a beam.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Point {
-    /// Position in the robot's frame, in meters: ahead, to the left, above the floor.
+    /// Position in the robot's frame in meters: forward, to the left, above the floor.
     pub at: [f32; 3],
-    /// Time of the measurement.
+    /// Time of the measurement in ns.
     pub stamp_ns: u64,
     /// Index of the beam in its scan.
     pub beam: u16,
-    /// Class, compared with the background before this sweep.
+    /// Class of the point, compared with the background before this sweep.
     pub class: PointClass,
 }
 
-/// The points between two reversals of the mount.
+/// A sweep: the points between two reversals of the mount.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sweep<'a> {
     /// Number of the sweep, from 0.
     pub number: u32,
-    /// Time of its start.
+    /// Time of the start in ns.
     pub from_ns: u64,
-    /// Time of its end.
+    /// Time of the end in ns.
     pub until_ns: u64,
-    /// Whether it lasts from one reversal to the next, and every beam had a reliable angle.
+    /// Whether the sweep lasts from one reversal to the next, and every beam had a reliable angle.
     pub is_complete: bool,
-    /// Whether its angles contradict the background, so that they are unreliable. All points then have class unknown,
+    /// Whether the angles contradict the background, and are therefore unreliable. All points then have class unknown,
     /// and there are no obstacles.
     pub is_unreliable: bool,
-    /// Generation of the background that the points were compared with. Each reset increases it by 1.
+    /// Generation of the background with which the points were compared. Each reset increases it by 1.
     pub generation: u32,
-    /// Delay of the angles' stamps by which its angles are corrected, in ns.
+    /// Delay of the angles' stamps that was corrected, in ns.
     pub late_ns: i64,
     /// Points in the order of their scans.
     pub points: &'a [Point],
@@ -405,31 +406,32 @@ pub struct Settings {
     pub delay_ns: u64,
     /// Maximum time between two angles that can be interpolated, in ns.
     pub gap_ns: u64,
-    /// Maximum speed of a mount in rad/s. A faster change is a jump of its encoder.
+    /// Maximum speed of a mount in rad/s. A faster change counts as a jump of its encoder.
     pub max_speed_rad_s: f64,
     /// Maximum difference between the speed that two angles show and the rates in their samples, in rad/s.
     pub rate_rad_s: f64,
     /// Time without a jump after which angles are reliable again, in ns.
     pub settle_ns: u64,
-    /// Minimum change of the angle in the other direction that makes a reversal, in radians.
+    /// Minimum change of the angle in the other direction that counts as a reversal, in radians.
     pub reversal_rad: f64,
-    /// The mount stands if its angle changes by less than a tenth of [`turn_rad`](Self::reversal_rad) in this time, in
-    /// ns.
+    /// Time in ns after which the mount counts as standing, if its angle changes by less than a tenth of
+    /// [`reversal_rad`](Self::reversal_rad).
     pub standing_ns: u64,
     /// Width of a cell of the background, in radians of the mount's angle.
     pub bin_rad: f64,
     /// Minimum distance of foreground from the background, in meters.
     pub threshold_m: f64,
-    /// Sweeps in which a surface must be seen before it is background.
+    /// Number of sweeps that must meet a surface before it becomes background.
     pub sweeps: u16,
-    /// Maximum share of the known background that may be elsewhere in a sweep. More contradicts its angles.
+    /// Maximum share of the known background that may differ in a sweep. With more, the sweep contradicts the
+    /// background.
     pub max_displaced_share: f64,
-    /// Maximum error of the angles in a part of a sweep that the floor shows, in radians. More contradicts the
-    /// angles.
+    /// Maximum error of the angles in a part of a sweep, in radians, as the floor shows it. With more, the sweep
+    /// contradicts the background.
     pub max_error_rad: f64,
     /// Minimum number of points of an obstacle.
     pub points: usize,
-    /// Width of the cubes that connect the points of an obstacle, in meters.
+    /// Edge length of the cubes that connect the points of an obstacle, in meters.
     pub cube_m: f64,
     /// Box in which every object is an obstacle, even if it is background: minimum and maximum x, y and z in the
     /// robot's frame.

@@ -1,11 +1,12 @@
-//! Tracks people across the sensors and rooms of a site, from the foregrounds of several sensors to people with an identity.
+//! Tracking of people across the sensors and rooms of a site, from the foregrounds of several sensors to people with an
+//! ID.
 //!
 //! A [`Site`] describes sensors, rooms and doors. [`PeopleTracker`] takes scans with their foregrounds and returns
-//! [`Snapshot`]s: the tracks at one time, and the events before it. It takes the scans of all sensors in the order of their
-//! stamps, with a bounded wait for the latest, and estimates the offsets between the clocks that stamped them.
+//! [`Snapshot`]s: the tracks at one time, and the events before it. It processes the scans of all sensors in the order
+//! of their stamps, with a bounded wait for the latest, and estimates the offsets between the clocks of the hubs.
 //!
-//! There is neither clock nor I/O here. Time is that of the samples (`wall_ns`), so a recording gives the same tracks at any
-//! speed.
+//! The module uses neither a clock nor I/O. Time is that of the samples (`wall_ns`), so a recording gives the same
+//! tracks at any speed.
 
 mod assignment;
 pub mod geometry;
@@ -27,34 +28,35 @@ pub use self::site::Site;
 pub use self::tracker::SNAPSHOT_INTERVAL_NS;
 use self::tracker::{MAX_PEOPLE, Tracker};
 
-/// Maximum number of waiting scans of a sensor. One more makes the tracker take the oldest at once.
+/// Maximum number of waiting scans of a sensor. With one more, the oldest is processed at once.
 const MAX_WAITING_SCANS: usize = 64;
-/// Difference from all other stamps at which a clock is taken to have jumped.
+/// Minimum difference from all other stamps that counts as a jump of the clock, in ns.
 const CLOCK_JUMP_NS: u64 = 2_000_000_000;
-/// After this number of such stamps in a row, they are the time.
+/// Number of such stamps in a row after which they are accepted as the new time.
 const MAX_JUMPS: u32 = 50;
 /// Share of an offset that one correction removes.
 const CORRECTION_GAIN: f64 = 0.05;
-/// Minimum weight of the observations before an offset is corrected, in (m/s)2.
+/// Minimum weight of the observations for a correction of an offset, in (m/s)2.
 const MIN_WEIGHT: f64 = 40.0;
-/// Maximum offset between the clocks of two hubs.
+/// Maximum offset between the clocks of two hubs, in ns.
 const MAX_OFFSET_NS: f64 = 250e6;
 
-/// Counters since the start.
+/// Counters since the creation of the tracker.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
-    /// Scans that were taken.
+    /// Processed scans.
     pub scans: u64,
     /// Scans that were dropped because they arrived after the delay.
     pub late: u64,
-    /// Scans that were dropped because their stamp is seconds away from all others.
+    /// Scans that were dropped because their stamps differ by seconds from all others.
     pub jumped: u64,
-    /// Scans that were dropped because their foreground has other beams, or because their sensor is not in the site.
+    /// Scans that were dropped because their foreground has another number of beams, or because their sensor is not in
+    /// the site.
     pub invalid: u64,
 }
 
 struct WaitingScan {
-    /// As stamped. It is corrected when the scan is taken.
+    /// Original stamp. It is corrected when the scan is processed.
     wall_ns: u64,
     scan: Box<Scan>,
     foreground: Box<Foreground>,
@@ -66,26 +68,25 @@ pub struct PeopleTracker {
     delay_ns: u64,
     /// Scans of each sensor in the order of their stamps.
     queues: Vec<VecDeque<WaitingScan>>,
-    /// Hub of each sensor, as the index of the hub's first sensor.
+    /// Hub of each sensor, given as the index of the hub's first sensor.
     hub_of: Vec<usize>,
-    /// Offset of each hub's clock from the clock of the first hub, in ns. The index is that of the hub's first
-    /// sensor.
+    /// Offset of each hub's clock from the clock of the first hub, in ns, at the index of the hub's first sensor.
     offsets: Vec<f64>,
-    /// Latest stamp.
+    /// Latest stamp of all received scans.
     latest_ns: u64,
-    /// Stamp of the last scan that was taken.
+    /// Stamp of the last processed scan.
     taken_ns: u64,
     next_snapshot_ns: u64,
     jumps: u32,
     counts: Counts,
-    /// Late scans of each sensor.
+    /// Number of late scans of each sensor.
     late: Vec<u64>,
     snapshot: Snapshot,
     spare_scans: Vec<WaitingScan>,
 }
 
 impl PeopleTracker {
-    /// Creates a tracker that waits for late scans for `delay_ns`.
+    /// Creates a tracker that waits up to `delay_ns` for late scans.
     pub fn new(site: Site, delay_ns: u64) -> PeopleTracker {
         let hub_of = site
             .sensors
@@ -125,14 +126,14 @@ impl PeopleTracker {
         &self.late
     }
 
-    /// Returns the estimated offset of the clock that stamps `sensor` from the first sensor's clock, in seconds. It
-    /// follows from people whom both sensors see.
+    /// Returns the estimated offset between the clock that stamps `sensor` and the first sensor's clock, in seconds. It
+    /// is computed from people whom both sensors see.
     pub fn offset_s(&self, sensor: usize) -> f64 {
         self.hub_of.get(sensor).map_or(0.0, |&hub| self.offsets[hub] * 1e-9)
     }
 
-    /// Takes a scan of `sensor`, an index in the site, with its foreground and its stamp of the wall clock. Passes
-    /// each picture that is due to `show`. Scans that arrive within the delay are taken in the order of their stamps.
+    /// Handles a scan of `sensor`, an index in the site, with its foreground and its wall clock stamp. Passes each
+    /// snapshot that is due to `show`. Scans that arrive within the delay are processed in the order of their stamps.
     pub fn take(
         &mut self,
         sensor: usize,
@@ -174,7 +175,7 @@ impl PeopleTracker {
         self.advance(until_ns, &mut show);
     }
 
-    /// Takes all waiting scans, at the end of a recording.
+    /// Processes all waiting scans, at the end of a recording.
     pub fn finish(&mut self, mut show: impl FnMut(&Snapshot)) {
         self.advance(u64::MAX, &mut show);
     }
@@ -195,7 +196,7 @@ impl PeopleTracker {
             if at_ns > until_ns && !is_full {
                 break;
             }
-            // A corrected clock may step back.
+            // The corrected clock may step backward.
             let at_ns = at_ns.max(self.taken_ns + 1);
             if self.next_snapshot_ns == 0 {
                 self.next_snapshot_ns = (at_ns / SNAPSHOT_INTERVAL_NS + 1) * SNAPSHOT_INTERVAL_NS;
@@ -209,7 +210,7 @@ impl PeopleTracker {
                 self.compare_clocks();
             }
         }
-        // No scan that may still arrive changes these.
+        // Scans that may still arrive cannot change these snapshots.
         if until_ns < u64::MAX && self.next_snapshot_ns > 0 && self.next_snapshot_ns <= until_ns {
             self.snapshots_until(until_ns + 1, show);
             self.taken_ns = self.taken_ns.max(self.next_snapshot_ns - SNAPSHOT_INTERVAL_NS);
@@ -228,7 +229,8 @@ impl PeopleTracker {
         }
     }
 
-    /// Counts a stamp that is far from the time so far. Returns whether the clock has been set: then all stamps are.
+    /// Counts a stamp that differs much from the current time. Returns whether enough have done so in a row, which
+    /// means that the clock was set.
     fn is_new_time(&mut self, at_ns: u64) -> bool {
         self.jumps += 1;
         let is_new = self.jumps > MAX_JUMPS;
@@ -242,8 +244,8 @@ impl PeopleTracker {
         is_new
     }
 
-    /// Estimates the offsets of the clocks: a sensor whose clock is late sees a walking person ahead of the expected
-    /// position, and one whose clock is early sees them behind it.
+    /// Estimates the offsets of the clocks. A sensor whose clock lags sees a walking person ahead of the expected
+    /// position, and one whose clock leads sees them behind it.
     fn compare_clocks(&mut self) {
         for (sensor, &hub) in self.hub_of.iter().enumerate() {
             if hub == 0 || hub != sensor {
@@ -270,25 +272,26 @@ impl PeopleTracker {
     }
 }
 
-/// Factor for the offset that shows. The filter follows each sensor in part, so only a part of the offset shows.
+/// Factor from the visible offset to the real one. The filter follows each sensor partly, so only a part of the offset
+/// is visible.
 const OFFSET_FEEDBACK: f64 = 3.0;
 
-/// A person at one time.
+/// Track of a person at one time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Track {
-    /// ID of the track. It is never used again.
+    /// ID of the track, which is never reused.
     pub id: u64,
     /// State of the track.
     pub state: TrackState,
-    /// Middle between the legs, in meters in the map.
+    /// Middle between the legs, in the map, in meters.
     pub position: Point,
     /// Velocity in m/s.
     pub velocity: Point,
-    /// Covariance of the position in m2: xx, xy, yy.
+    /// Covariance of the position in m2: xx, xy and yy.
     pub covariance: [f64; 3],
     /// Index of the room in the site.
     pub room: Option<usize>,
-    /// Sensors that see the person, as bits by their index in the site.
+    /// Sensors that see the person: bit i stands for the sensor with index i in the site.
     pub sensors: u32,
     /// Seconds since the person was first seen.
     pub age_s: f64,
@@ -303,7 +306,7 @@ pub enum Kind {
     Appeared,
     /// The person is no longer tracked.
     Left,
-    /// The person went through a door from room to room. `None` is outside.
+    /// The person went through a door from one room to another. `None` stands for outside.
     Door {
         /// Index of the door in the site.
         door: usize,
@@ -321,13 +324,13 @@ pub struct Event {
     pub wall_ns: u64,
     /// ID of the person's track.
     pub id: u64,
-    /// Index of the room that the person is in after the event.
+    /// Index of the room after the event.
     pub room: Option<usize>,
     /// Kind of the event.
     pub kind: Kind,
 }
 
-/// A sensor that is not at its position in the site, compared with another one that sees the same people. The tracker
+/// A sensor that is not at its position in the site, detected by another sensor that sees the same people. The tracker
 /// corrects its position from then on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MisplacedSensor {
@@ -335,25 +338,25 @@ pub struct MisplacedSensor {
     pub sensor: usize,
     /// Index of the other sensor.
     pub other: usize,
-    /// Offset of the people that it sees from those that the other one sees, in meters in the map.
+    /// Offset of the people that this sensor sees from those that the other one sees, in the map, in meters.
     pub offset: Point,
 }
 
-/// All people at one time, and the events since the last picture.
+/// All tracks at one time, and the events since the previous snapshot.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Snapshot {
-    /// Time of all positions, in ns since 1970.
+    /// Time of all positions in ns since 1970.
     pub wall_ns: u64,
     /// Tracks by ID.
     pub tracks: Vec<Track>,
-    /// Events in their order.
+    /// Events in order of time.
     pub events: Vec<Event>,
-    /// Sensors that were found misplaced since the last picture.
+    /// Sensors that were found misplaced since the previous snapshot.
     pub misplaced: Vec<MisplacedSensor>,
 }
 
 impl Snapshot {
-    /// Returns the picture as it is published, with the names in `site`.
+    /// Returns the payload for publication, with the names in `site`.
     pub fn payload(&self, site: &Site) -> Tracks {
         let mut tracks = Tracks::default();
         site.sensors.iter().for_each(|sensor| tracks.push_sensor(sensor.payload()));
@@ -392,7 +395,7 @@ impl Track {
 }
 
 impl Event {
-    /// Returns the event as it is published, with the names in `site`.
+    /// Returns the payload for publication, with the names in `site`.
     pub fn payload(&self, site: &Site) -> scanhub_schema::Event {
         let room = self.room.and_then(|room| site.rooms.get(room)).map(|room| room.name.as_str());
         let of = |kind| scanhub_schema::Event::new(kind, self.id, room);
@@ -437,7 +440,7 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
         people.tracker.capacity() + queues + people.spare_scans.capacity() + picture
     }
 
-    /// A scan of a sensor that sees a wall 3 m around it, and two legs around a beam 2 m before it.
+    /// Returns a scan of a sensor with a wall 3 m around it, and two legs at a range of 2 m around one beam.
     fn scan(legs: Option<usize>) -> Box<Scan> {
         let head = ScanHead {
             first_angle: -std::f64::consts::FRAC_PI_2,
@@ -473,12 +476,12 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
         };
         (0..300).for_each(|_| turn(&mut people, None));
         let mut visit = |people: &mut PeopleTracker, number: usize| {
-            // 40 of 75 scans show a person who walks by. Their track is deleted before the next person comes.
+            // In 40 of 75 scans, a person walks past. Their track is deleted before the next person arrives.
             for i in 0..SCANS {
                 turn(people, (i < 40).then_some(60 + number % 100 + 3 * i));
             }
         };
-        // Every path once.
+        // Walk each path once.
         (0..100).for_each(|number| visit(&mut people, number));
         let begin = capacity(&people);
         (100..300).for_each(|number| visit(&mut people, number));

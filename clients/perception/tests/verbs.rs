@@ -1,4 +1,4 @@
-//! `track` reports late scans while it runs.
+//! Test that `track` reports late scans while it runs.
 
 #[path = "../../client/tests/fake/mod.rs"]
 mod fake;
@@ -30,8 +30,8 @@ polygon = [[0, 0], [5, 0], [5, 4], [0, 4]]
 const MS: u64 = 1_000_000;
 const RANGES: [u16; 4] = [300; 4];
 
-/// Runs `track`, sends scans of `rear` that are half a second late until a line with `text` reports one, and ends it. Returns
-/// the lines, and the notes.
+/// Runs `track`, and sends scans of `rear` that are half a second late until a line with `text` reports one. Returns
+/// the lines and the notes.
 fn run_with_late_scans(json: bool, text: &str) -> (String, String) {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 7);
@@ -50,7 +50,8 @@ fn run_with_late_scans(json: bool, text: &str) -> (String, String) {
     for seq in [1_000 * MS, 1_200 * MS, 1_400 * MS] {
         hub.sensors[0].publish_scan_with_foreground(seq, &RANGES);
     }
-    // A scan is late only if the tracker has received a later one of `front` before it, so several may be needed.
+    // A scan is late only if the tracker has received a later one of `front` before it, so several attempts may be
+    // needed.
     let mut seq = 700 * MS;
     wait_until("a late scan is reported", || {
         seq += 1;
@@ -63,7 +64,7 @@ fn run_with_late_scans(json: bool, text: &str) -> (String, String) {
     (out, notes)
 }
 
-/// The number after `key` in a line.
+/// Returns the number after `key` in a line.
 fn number(line: &str, key: &str) -> u64 {
     let (_, rest) = line.split_once(key).expect("the key");
     rest.chars().take_while(char::is_ascii_digit).collect::<String>().parse().expect("a number")

@@ -1,5 +1,5 @@
-//! A simulated hall with a scanner on a mount, played from start to end: scans and angles in the order of their arrival, and
-//! what is true of each point. Does not compute scores.
+//! A simulated hall with a scanner on a mount, played from start to end: scans and angles in the order of their
+//! arrival, with the truth about each point. `judge.rs` scores the results.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -12,24 +12,24 @@ use scanhub_sim::room::BeamTarget;
 use scanhub_sim::room::Room;
 use scanhub_sim::world::World;
 
-/// A scan of 361 beams takes two turns of the mirror, and so long to arrive.
+/// Duration of a scan of 361 beams, which is two revolutions of the mirror, and its transmission time, in ns.
 const SCAN_TIME_NS: u64 = 26_640_000;
 const LINE_TIME_NS: u64 = 15_000_000;
 
-/// A hall as a seed makes it.
+/// A hall whose contents depend on a seed.
 pub(crate) struct Hall {
     room: Room,
     motor: Motor,
-    /// The mount as it is known.
+    /// Described mount.
     pub(crate) mount: Mount,
-    /// What stamped each beam, and what it met.
+    /// Target of each beam, by stamp and beam index.
     truth: HashMap<(u64, u16), BeamTarget>,
-    /// The delay of the angles' stamps that the library has found.
+    /// Delay of the angles' stamps that the library has estimated, in ns.
     pub(crate) stamp_delay_ns: i64,
 }
 
 impl Hall {
-    /// `world`, whose first sensor has a mount.
+    /// Creates the hall of `world`, whose first sensor has a mount.
     pub(crate) fn new(world: &World, seed: u64) -> Hall {
         let motor = world.mount(0).expect("a world with a mount").clone();
         let axis_m = motor.height_mm / 1000.0;
@@ -39,7 +39,7 @@ impl Hall {
         Hall { room: Room::new(world, seed), motor, mount, truth: HashMap::new(), stamp_delay_ns: 0 }
     }
 
-    /// Plays the hall until `until_s`, and hands out each sweep with the hall.
+    /// Plays the hall until `until_s`, and passes each sweep with the hall to `show`.
     pub(crate) fn play(
         &mut self,
         settings: Settings,
@@ -64,7 +64,7 @@ impl Hall {
         tilting.counts()
     }
 
-    /// Plays the hall until `until_s` again and again. Returns the time of the library for each scan, in the fastest of them.
+    /// Plays the hall until `until_s` repeatedly. Returns the library's time per scan in the fastest run.
     pub(crate) fn min_time_per_scan(&mut self, settings: Settings, until_s: u64) -> Duration {
         let ends: Vec<u64> =
             (1..until_s * 1_000_000_000 / SCAN_TIME_NS).map(|number| number * SCAN_TIME_NS).collect();
@@ -92,23 +92,24 @@ impl Hall {
         ((self.motor.to_deg - self.motor.from_deg) / self.motor.deg_s * 1e9) as u64
     }
 
-    /// Returns what the beam of `point` met.
+    /// Returns the target of the beam that measured `point`.
     pub(crate) fn target_of(&self, point: &Point) -> Option<BeamTarget> {
         self.truth.get(&(point.stamp_ns, point.beam)).copied()
     }
 
-    /// How far `point` is from where its beam ended by its range, had the angle been known exactly.
+    /// Returns the distance in meters between `point` and the position that it would have if the angle were known
+    /// exactly.
     pub(crate) fn error_m(&self, point: &Point) -> f64 {
         let angle_rad = self.motor.angle_rad(point.stamp_ns);
         let beam_rad = (f64::from(point.beam) / 2.0 - 90.0).to_radians();
         let origin = self.mount.origin(angle_rad);
         let direction = self.mount.direction(angle_rad, beam_rad);
-        // The same range as the point's: the noise of the sensor is in both.
+        // Both use the range of the point, so the noise of the sensor does not matter.
         let (at, range_m) = (point.at.map(f64::from), self.range_m(point));
         (0..3).map(|i| (origin[i] + range_m * direction[i] - at[i]).powi(2)).sum::<f64>().sqrt()
     }
 
-    /// How far `point` is from the sensor.
+    /// Returns the distance between `point` and the sensor in meters.
     pub(crate) fn range_m(&self, point: &Point) -> f64 {
         let origin = self.mount.origin(self.motor.angle_rad(point.stamp_ns));
         let off = |i: usize| f64::from(point.at[i]) - origin[i];
@@ -127,5 +128,5 @@ impl Hall {
     }
 }
 
-/// The truth of a sweep is asked for after it.
+/// Time for which targets are stored in ns, because a sweep is scored after its end.
 const TRUTH_LIFETIME_NS: u64 = 6_000_000_000;

@@ -1,17 +1,18 @@
-//! Halls as worlds of the simulator: each seed has its own furniture, and its own range and speed of the mount. Most tables,
-//! shelves and tops are narrower than the distance between two scans.
+//! Halls as worlds of the simulator. Each seed has its own furniture, and its own range and speed of the mount. Most
+//! tables, shelves and tops are narrower than the distance between two scans.
 
 use std::fmt::Write;
 
 use fastrand::Rng;
 use scanhub_sim::world::World;
 
-/// Returns a hall in which nothing changes.
+/// Returns a hall without changes.
 pub(crate) fn unchanging(seed: u64) -> World {
     world(&furniture(&mut Rng::with_seed(seed)))
 }
 
-/// Returns the same hall with things that appear one after the other from 30 s on, and a person who walks from 45 s on.
+/// Returns the same hall with objects that appear one after the other from 30 s on, and a person who walks from 45 s
+/// on.
 pub(crate) fn changing(seed: u64) -> World {
     let mut text = furniture(&mut Rng::with_seed(seed));
     let mut random = Rng::with_seed(1000 + seed);
@@ -52,7 +53,7 @@ fn furniture(random: &mut Rng) -> String {
         let heights = match number % 4 {
             // A cupboard or a crate.
             0 => format!("height_mm = {}", random.i32(250..2100)),
-            // A table's top, and shelves.
+            // A table top or shelves.
             _ => {
                 let above_mm = random.i32(300..1600);
                 format!("above_mm = {above_mm}\nheight_mm = {}", above_mm + random.i32(20..60))

@@ -1,4 +1,5 @@
-//! What three dimensions are worth: recall, precision and points of world `tilt` over seeds, and what faulty angles do.
+//! Figures of `tilt`: recall, precision and points of world `tilt` over several seeds, and the effects of faulty
+//! angles.
 //!
 //! ```sh
 //! cargo run --release -p scanhub-perception --example figures
@@ -16,13 +17,13 @@ use scanhub_sim::mount::{Fault, FaultKind};
 use scanhub_sim::world::World;
 use score::{ObstacleScore, ObstacleTimes, PointScore, seconds, share};
 
-/// So many halls.
+/// Number of halls.
 const SEED_COUNT: u64 = 10;
 
 fn main() -> Result<(), scanhub_schema::Failure> {
     let world: World = "tilt".parse()?;
     let part = std::env::args().nth(1);
-    // The caller can choose halls that the library was not tuned on.
+    // The user can choose halls for which the library was not tuned.
     let number = |nth: usize| std::env::args().nth(nth).and_then(|text| text.parse().ok());
     let halls = |count: u64| {
         let from = number(2).unwrap_or(0);
@@ -68,7 +69,7 @@ const FAULTS: [(&str, FaultKind); 8] = [
     ("late by 1 s", FaultKind::Delay(1.0)),
 ];
 
-/// Halls in which nothing changes, for 200 sweeps: obstacles that are invented once the background is known.
+/// Measures false obstacles in halls without changes, for 200 sweeps, after the background is known.
 fn measure_unchanging(halls: Range<u64>) {
     let (mut sweeps, mut with, mut obstacles, mut late) = (0, 0, 0, 0);
     for seed in halls.clone() {
@@ -88,7 +89,7 @@ fn measure_unchanging(halls: Range<u64>) {
     println!("  {late} of these in the second hundred");
 }
 
-/// Furnished halls with new things and a person: obstacles.
+/// Measures the obstacles in furnished halls with new objects and a person.
 fn measure_changing(halls: Range<u64>) {
     let settings = Settings::default();
     let mut all = ObstacleScore::default();
@@ -112,7 +113,7 @@ fn measure_changing(halls: Range<u64>) {
     );
 }
 
-/// Stamps of angles that are wrong from the start, in halls in which nothing changes.
+/// Measures the effect of angle stamps that are wrong from the start, in halls without changes.
 fn measure_late_stamps() {
     println!(
         "stamps of angles late by: found; error of points from 20 to 40 s, p50 and p99; obstacles; unreliable sweeps"
@@ -195,7 +196,7 @@ fn measure_people(world: &World) {
 fn measure_fault(world: &World, name: &str, kind: FaultKind) {
     let fault = Fault { kind, from_s: 20.0, until_s: 24.0 };
     let (mut maximum, mut invented) = (0.0_f64, 0);
-    // Nobody has come yet.
+    // Until then, no person has appeared.
     let world = world.clone().with_mount_faults(&[fault]);
     let counts = Hall::new(&world, 1).play(Settings::default(), 29, |hall, sweep| {
         if !sweep.is_unreliable {

@@ -1,4 +1,4 @@
-//! Scores the classes of points and the positions of obstacles. Does not know how a hall is simulated.
+//! Scores of point classes and obstacles, compared with the truth of a simulated hall.
 
 use scanhub_perception::tilt::{Obstacle, PointClass, Settings, Sweep};
 use scanhub_sim::room::BeamTarget;
@@ -7,20 +7,20 @@ use super::hall::Hall;
 
 const ONE_SECOND: u64 = 1_000_000_000;
 
-/// Points of persons and of new things, and what they were taken for.
+/// Points on people and new objects, with the number of those that were found.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct PointScore {
-    /// On persons; of these in the foreground.
+    /// Points on people, and the number of these that are foreground.
     pub(crate) persons: (usize, usize),
-    /// On what was put down and cannot be background yet; of these in the foreground.
+    /// Points on new objects that cannot be background yet, and the number of these that are foreground.
     pub(crate) things: (usize, usize),
-    /// In the foreground, though nothing is there that was not.
+    /// Points that are foreground although nothing is new at their positions.
     pub(crate) wrong: usize,
 }
 
 impl PointScore {
-    /// Adds the points of a sweep. What is put down counts as new until it was met in enough sweeps, and is not counted in
-    /// the two after that, nor is what stands beside it on the same beam.
+    /// Adds the points of a sweep. An object counts as new until enough sweeps have met it. In the two sweeps after
+    /// that, its points are not counted. Points next to it on the same beam are never counted.
     pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
         let new_ns = u64::from(settings.sweeps) * sweep_ns;
         for point in sweep.points {
@@ -40,37 +40,37 @@ impl PointScore {
         }
     }
 
-    /// Share of the points on persons and new things that were found.
+    /// Returns the share of the points on people and new objects that were found.
     pub(crate) fn recall(&self) -> f64 {
         share(self.persons.1 + self.things.1, self.persons.0 + self.things.0)
     }
 
-    /// Share of the points that were found that are on persons and new things.
+    /// Returns the share of the found points that are on people and new objects.
     pub(crate) fn precision(&self) -> f64 {
         let right = self.persons.1 + self.things.1;
         share(right, right + self.wrong)
     }
 }
 
-/// Objects that are new, and obstacles that were found.
+/// Counts of new objects, and of obstacles that were found.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ObstacleScore {
-    /// Clusters of at least [`MIN_POINTS`] points on people and new things; of these found.
+    /// Clusters of at least [`MIN_POINTS`] points on people and new objects, and the number of these that were found.
     pub(crate) new: (usize, usize),
-    /// Obstacles on something new.
+    /// Obstacles on new objects.
     pub(crate) right: usize,
-    /// Obstacles where nothing is new.
+    /// Obstacles at positions at which nothing is new.
     pub(crate) wrong: usize,
 }
 
-/// An object with fewer points need not be found.
+/// Minimum number of points of an object that must be found.
 const MIN_POINTS: usize = 15;
 /// Maximum distance between neighboring points of an object, in meters.
 const NEIGHBOR_DISTANCE_M: f32 = 0.2;
 
 impl ObstacleScore {
-    /// Adds the obstacles of a sweep. [`PointScore::add`] defines which points are new. It leaves out some
-    /// points; obstacles there do not count either.
+    /// Adds the obstacles of a sweep. [`PointScore::add`] defines which points are new, and which are not counted.
+    /// Obstacles at the positions of the latter are not counted either.
     pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
         let new_ns = u64::from(settings.sweeps) * sweep_ns;
         let (mut new, mut open) = (Vec::new(), Vec::new());
@@ -109,13 +109,13 @@ impl ObstacleScore {
         share(self.new.1, self.new.0)
     }
 
-    /// Returns the share of the obstacles that are on something new.
+    /// Returns the share of the obstacles that are on new objects.
     pub(crate) fn precision(&self) -> f64 {
         share(self.right, self.right + self.wrong)
     }
 }
 
-/// Points that are near each other, directly or over others.
+/// Groups points that are near each other, directly or through other points.
 fn clusters(points: &[[f32; 3]]) -> Vec<Vec<[f32; 3]>> {
     let mut open = points.to_vec();
     let mut clusters = Vec::new();
@@ -135,12 +135,13 @@ fn clusters(points: &[[f32; 3]]) -> Vec<Vec<[f32; 3]>> {
     clusters
 }
 
-/// A share of a count that may be 0.
+/// Returns a share. It is NaN if `all` is 0.
 pub(crate) fn share(part: usize, all: usize) -> f64 {
     part as f64 / all as f64
 }
 
-/// When the pole and the box of world `tilt` were among the obstacles: beginning of the sweep, and whether.
+/// Sweeps in which the pole and the box of world `tilt` were among the obstacles: start of each sweep, and whether the
+/// object was found.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ObstacleTimes {
     pole: Vec<(u64, bool)>,
@@ -151,12 +152,12 @@ impl ObstacleTimes {
     /// Adds the obstacles of a sweep.
     pub(crate) fn add(&mut self, sweep: &Sweep<'_>) {
         let found = |at: [f32; 2], wide: f32| sweep.obstacles.iter().any(|one| is_at(one, at, wide));
-        // In the world x is to the right and y ahead.
+        // In the world, x is to the right and y is ahead.
         self.pole.push((sweep.from_ns, found([2.0, -0.3], 0.6)));
         self.boxed.push((sweep.from_ns, found([2.6, 0.9], 0.8)));
     }
 
-    /// Whether the pole was found in the first whole sweep in which it stood.
+    /// Returns whether the pole was found in the first sweep after it appeared.
     pub(crate) fn is_pole_found_first_sweep(&self) -> bool {
         self.pole
             .iter()
@@ -164,31 +165,32 @@ impl ObstacleTimes {
             .is_some_and(|(_, found)| *found)
     }
 
-    /// In how many sweeps the pole was found, until it was background.
+    /// Returns the number of sweeps in which the pole was found, until it was background.
     pub(crate) fn sweeps_of_pole(&self) -> usize {
         self.pole.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(POLE_PLACED_S - 2)).count()
     }
 
-    /// The same of the box.
+    /// Returns the same number for the box.
     pub(crate) fn sweeps_of_box(&self) -> usize {
         self.boxed.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(BOX_PLACED_S - 2)).count()
     }
 }
 
-/// Whether `obstacle` is what stands at `x` and `y` and is so wide at most.
+/// Returns whether the middle of `obstacle` is within half of `max_width_m` of `x` and `y`, and its width is below
+/// `max_width_m`.
 fn is_at(obstacle: &Obstacle, [x, y]: [f32; 2], max_width_m: f32) -> bool {
     (obstacle.middle[0] - x).hypot(obstacle.middle[1] - y) < max_width_m / 2.0
         && obstacle.high[0] - obstacle.low[0] < max_width_m
         && obstacle.high[1] - obstacle.low[1] < max_width_m
 }
 
-/// When world `tilt` puts up its pole and puts down its box.
+/// Times at which the pole and the box of world `tilt` appear, in seconds.
 const POLE_PLACED_S: u64 = 30;
 const BOX_PLACED_S: u64 = 36;
-/// Its mount swings by 50 degrees at 30 degrees a second.
+/// Duration of a sweep of its mount in ns: 50 degrees at 30 degrees per second.
 pub(crate) const SWEEP_TIME_NS: u64 = 1_666_666_667;
 
-/// Seconds in ns.
+/// Converts seconds to ns.
 pub(crate) const fn seconds(s: u64) -> u64 {
     s * ONE_SECOND
 }

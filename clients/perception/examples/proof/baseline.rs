@@ -1,4 +1,5 @@
-//! The simplest that one might do: each segment is a person, and belongs to the nearest one within half a metre.
+//! Baseline: the simplest tracker, in which each segment is a person and belongs to the nearest track within half a
+//! meter.
 
 use scanhub_perception::track::geometry::{Point, distance};
 use scanhub_perception::track::{SNAPSHOT_INTERVAL_NS, Site, Snapshot, Track};

@@ -1,5 +1,5 @@
-//! Why identities are lost: each change of a person's track has one cause, by what became of the old track and where the new one
-//! comes from. Counts alone; scores are the package's.
+//! Reasons for lost IDs. Each change of a person's track gets one cause, from the state of the old track and the origin
+//! of the new one. This module only counts; `motmetrics` computes the scores.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -10,21 +10,21 @@ use scanhub_schema::TrackState;
 use crate::house::CHAIRS;
 use crate::walkers::{CORRIDOR_X, Crossing};
 
-/// Tracks and people match within this distance, as in the score.
+/// Maximum distance between a person and a matching track in meters, as in the score.
 const MATCH_M: f64 = 0.5;
-/// So near to each other two may be taken for one another.
+/// Maximum distance in meters between two people whose tracks may be swapped.
 const NEIGHBOR_M: f64 = 1.2;
 
-/// Follows which track is whose, frame by frame.
+/// Assignment of tracks to people, frame by frame.
 pub(crate) struct Diagnosis {
-    /// Track of each person, and when he had it last.
+    /// Track of each person, with the last time at which they had it.
     tracks: Vec<Option<(u64, f64)>>,
-    /// Who had each track last.
+    /// Last owner of each track.
     owners: HashMap<u64, usize>,
     known_ids: BTreeSet<u64>,
-    /// How often each cause was met.
+    /// Number of changes by cause.
     pub(crate) causes: BTreeMap<&'static str, usize>,
-    /// Squared errors of confirmed tracks and how many, by what may be their cause.
+    /// Sum of the squared errors of confirmed tracks and their number, by possible cause.
     pub(crate) errors: BTreeMap<&'static str, (f64, usize)>,
     is_reported: bool,
 }
@@ -41,7 +41,8 @@ impl Diagnosis {
         }
     }
 
-    /// Takes where people are and the tracks of this instant; `crossings` are all ways through the corridor.
+    /// Compares the true positions of people with the tracks at this time. `crossings` are all passages through the
+    /// corridor.
     pub(crate) fn take(
         &mut self,
         now_s: f64,

@@ -1,5 +1,5 @@
-//! A long time: other people come every ten minutes, one scan a minute comes late, and the tracker neither grows nor gives an
-//! identity twice.
+//! A long run of the tracker. New people arrive every ten minutes, and one scan per minute is late. It shows that the
+//! tracker's memory does not grow, and that no ID is used twice.
 
 use std::time::Instant;
 
@@ -12,18 +12,18 @@ use crate::house::{BEAMS, House, HouseSensor};
 use crate::walkers::Crowd;
 
 const SECONDS_PER_HOUR: u64 = 3600;
-/// Shares of changes of the room, and of rests on a chair.
+/// Shares of rests that end with a change of the room, and of rests on a chair.
 const CHANGE_SHARES: (f64, f64) = (0.25, 0.25);
-/// Scans a second, one sensor after the other.
+/// Scans per second, from the sensors in turn.
 const SCAN_RATE_HZ: u64 = 100;
 const SCAN_DELAY_NS: u64 = 80_000_000;
-/// So long the same people are there, and then others.
+/// Time in seconds after which the people are replaced.
 const VISIT_TIME_S: u64 = 600;
-/// So much later than the others a late scan comes.
+/// Delay of a late scan in ns.
 const LATE_DELAY_NS: u64 = 300_000_000;
 const START_NS: u64 = 1_800_000_000_000_000_000;
 
-/// Follows `people` at a time for so many virtual hours and says each hour what there is.
+/// Tracks `people` people at a time for this number of virtual hours, and prints a line every hour.
 pub(crate) fn run(hours: u64, people: usize) {
     let house = House { is_ideal: false };
     let site = Site::parse("house.toml", &house.site()).expect("the house is right");
@@ -82,7 +82,7 @@ pub(crate) fn run(hours: u64, people: usize) {
     }
 }
 
-/// Identities rise: one that was not in the last picture and is not above all before was used again.
+/// Counts of track IDs. IDs only increase, so a new ID that is not above all earlier ones was reused.
 #[derive(Default)]
 struct TrackIds {
     highest: u64,
@@ -106,7 +106,7 @@ impl TrackIds {
     }
 }
 
-/// The most memory that the program has had, simulation and all.
+/// Returns the peak memory of the program in kB, including the simulation.
 fn peak_kb() -> String {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));

@@ -1,5 +1,5 @@
-//! The house of the proof: two rooms with furniture, a corridor between them that no sensor sees, and a sensor in two corners
-//! of each room. The simulator of the scanners measures it.
+//! House of the proof: two rooms with furniture, a corridor between them that no sensor covers, and a sensor in two
+//! corners of each room. The simulator of the scanners measures it.
 
 use std::f64::consts::PI;
 
@@ -11,7 +11,7 @@ use scanhub_sim::beam::NoiseModel;
 use scanhub_sim::room::Room;
 use scanhub_sim::world::World;
 
-/// Sensors, rooms and inner doors.
+/// Sensors, rooms and inner doors of the site file.
 const ROOMS: &str = r#"
 [[sensor]]
 name = "hall"
@@ -49,7 +49,7 @@ between = ["left", "right"]
 seconds = [2, 15]
 "#;
 
-/// The doors to the street.
+/// Doors that lead outside.
 const OUTER_DOORS: &str = r#"
 [[door]]
 name = "porch"
@@ -68,7 +68,7 @@ const CUPBOARDS: [[f64; 4]; 2] = [[2.6, 3.2, 3.6, 3.6], [13.4, 1.4, 13.8, 2.4]];
 /// Corners of the tables, in the same order. A table has four legs.
 const TABLE_CORNERS: [[f64; 4]; 2] = [[3.4, 0.5, 4.6, 1.2], [14.9, 3.5, 16.1, 4.2]];
 const TABLE_LEG_M: f64 = 0.03;
-/// Chairs: x, y, and the direction in radians that a sitter faces.
+/// Chairs: x, y, and the direction in radians in which a person sits.
 pub(crate) const CHAIRS: [(Point, f64); 6] = [
     ([1.2, 4.4], -PI / 2.0),
     ([4.9, 4.3], -0.75 * PI),
@@ -77,7 +77,7 @@ pub(crate) const CHAIRS: [(Point, f64); 6] = [
     ([15.6, 0.8], 0.75 * PI),
     ([15.5, 3.1], -PI / 2.0),
 ];
-/// Distance of the legs of a chair from its center along both axes, and their radius.
+/// Distance of a chair's legs from its center along both axes, and radius of the legs.
 const CHAIR_HALF_M: f64 = 0.2;
 const CHAIR_LEG_M: f64 = 0.014;
 /// Standard deviation of a range of the ideal sensor, and its share of beams without a range.
@@ -86,10 +86,10 @@ const IDEAL_ERRORS: f64 = 1e-3;
 
 pub(crate) const BEAMS: usize = 361;
 
-/// The plan of the house, with furniture and doors to the street or without.
+/// Plan of the house, with or without furniture and doors that lead outside.
 #[derive(Clone, Copy)]
 pub(crate) struct House {
-    /// Whether the sensors are ideal and the house has nothing but cupboards.
+    /// Whether the sensors are ideal, and the house has only cupboards.
     pub(crate) is_ideal: bool,
 }
 
@@ -99,7 +99,7 @@ impl House {
         if self.is_ideal { ROOMS.to_owned() } else { [ROOMS, OUTER_DOORS].concat() }
     }
 
-    /// Returns the areas that nobody walks through: minimum x and y, maximum x and y.
+    /// Returns the areas that people do not walk through: minimum x and y, maximum x and y.
     pub(crate) fn obstacles(self) -> impl Iterator<Item = &'static [f64; 4]> {
         CUPBOARDS.iter().chain(TABLE_CORNERS.iter().filter(move |_| !self.is_ideal))
     }
@@ -128,7 +128,7 @@ impl House {
             line(&[[0.0, 2.0], [0.0, 3.0]]);
             line(&[[17.0, 2.0], [17.0, 3.0]]);
         } else {
-            // A house across the street, and a fence.
+            // A house on the other side of the street, and a fence.
             line(&[[-4.0, -2.0], [-4.0, 8.0]]);
             line(&[[22.0, -2.0], [22.0, 8.0]]);
         }
@@ -157,7 +157,7 @@ impl HouseSensor {
         HouseSensor(Room::of_port(&house.world(), seed, sensor as u64))
     }
 
-    /// Returns the scan that ends at `end_ns`. `shapes` returns everything that moves, at a time.
+    /// Returns the scan that ends at `end_ns`. `shapes` returns all moving objects at a given time.
     pub(crate) fn scan(&self, shapes: &dyn Fn(Nanos) -> Vec<Shape>, end_ns: Nanos) -> Box<Scan> {
         let words = self.0.scan_with(shapes, Variant::HALF, Unit::Mm, Mode(0), end_ns);
         Scan::of(head(), &words)
@@ -187,7 +187,7 @@ pub(crate) fn head() -> ScanHead {
     ScanHead::lms(BEAMS, -90_000, 500, 1, 13)
 }
 
-/// A standard normal number.
+/// Returns a standard normal random number.
 pub(crate) fn normal(random: &mut fastrand::Rng) -> f64 {
     (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (2.0 * PI * random.f64()).cos()
 }

@@ -1,4 +1,4 @@
-//! What the tracker is worth: simulated people in a simulated house, scored by the package `motmetrics`.
+//! Proof of the tracker: simulated people in a simulated house, scored by the package `motmetrics`.
 //!
 //! ```sh
 //! cargo run --release -p scanhub-perception --example proof -- --seeds 501..511
@@ -106,7 +106,7 @@ fn main() {
     );
 }
 
-/// Shares of changes of the room, and of rests on a chair.
+/// Shares of rests that end with a change of the room, and of rests on a chair.
 const USUAL_SHARES: (f64, f64) = (0.25, 0.12);
 
 fn usage() -> ! {
@@ -162,7 +162,7 @@ fn report(name: &str, outcomes: &[Outcome]) {
     }
 }
 
-/// Says why identities were lost, and which places are how far off.
+/// Prints the causes of lost IDs, and the position errors by class.
 fn print_causes(outcomes: &[Outcome]) {
     let (mut causes, mut errors) = (BTreeMap::new(), BTreeMap::new());
     for diagnosis in outcomes.iter().filter_map(|outcome| outcome.diagnosis.as_ref()) {

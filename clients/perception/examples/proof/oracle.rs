@@ -1,10 +1,10 @@
-//! Who comes out of the corridor, guessed by somebody who sees every door exactly and knows how fast people walk in this
-//! house, and how many stop for how long, but no person's own pace.
+//! Oracle that guesses who comes out of the corridor. It knows the exact time of each passage through a door, and the
+//! distributions of walking speed and stops in this house, but no person's own pace.
 
 use crate::walkers::{CORRIDOR_X, Crossing, Crowd, STOP_SHARE, WALKING_SPEED};
 
-/// Whether the oracle, at the moment of `crossing`, names the right one of all who are inside: the one whose coming out now is
-/// the most likely, given that nobody else has come out before.
+/// Returns whether the oracle identifies the person of `crossing` correctly. It chooses the person inside who is most
+/// likely to come out at that time, given that they have not come out before.
 pub(crate) fn is_guess_right(crowd: &Crowd, crossing: &Crossing) -> bool {
     let inside = crowd
         .crossings
@@ -17,16 +17,16 @@ pub(crate) fn is_guess_right(crowd: &Crowd, crossing: &Crossing) -> bool {
     best.is_some_and(|best| best.walker == crossing.walker)
 }
 
-/// Which identity each walker has at which second, by somebody who sees everything in the rooms and takes whoever comes out of
-/// the corridor for the one whom the oracle names: no tracker that does not see into the corridor, and knows no single
-/// one's pace, is expected to do better.
+/// ID of each walker over time, according to an observer that sees everything in the rooms and uses the oracle for
+/// everyone who comes out of the corridor. A tracker that does not see into the corridor and does not know each
+/// person's pace cannot be expected to do better.
 pub(crate) struct Identities {
-    /// Entries and exits by their time: when, who, whether out.
+    /// Entries and exits in order of time: time in seconds, walker, and whether it is an exit.
     events: Vec<(f64, usize, bool)>,
     next_event: usize,
-    /// Of each walker.
+    /// ID of each walker.
     pub(crate) current_ids: Vec<usize>,
-    /// Who is inside, as far as is known: since when, and as whom.
+    /// Time of entry and ID of everyone who is inside.
     inside: Vec<(f64, usize)>,
 }
 
@@ -47,7 +47,7 @@ impl Identities {
         }
     }
 
-    /// Moves to `now_s`.
+    /// Handles the events up to `now_s`.
     pub(crate) fn advance(&mut self, now_s: f64) {
         while let Some(&(at_s, walker, is_out)) =
             self.events.get(self.next_event).filter(|event| event.0 <= now_s)
@@ -66,7 +66,8 @@ impl Identities {
     }
 }
 
-/// Density of the time inside over what is left of it, by the walkers' own distribution.
+/// Returns the hazard rate of coming out after `after_s` seconds inside: the density divided by the remaining
+/// probability, for the walkers' own distribution.
 fn hazard(after_s: f64) -> f64 {
     let corridor_m = CORRIDOR_X[1] - CORRIDOR_X[0];
     let (mut density, mut remains) = (1e-9, 1e-9);

@@ -1,4 +1,4 @@
-//! One run of the proof: people in the house, its sensors, backgrounds learned by the hub's own processors, and the tracker.
+//! A run of the proof: people in the house, its sensors, backgrounds that the hub's processors learn, and the tracker.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::Instant;
@@ -19,10 +19,10 @@ use crate::walkers::{Crossing, Crowd};
 pub(crate) const EMPTY_TIME_S: f64 = 12.0;
 const SAMPLE_RATE_HZ: f64 = 25.0;
 const NS_PER_S: f64 = 1e9;
-/// A mirror turn of an LMS 2xx, and steps of the simulation that it takes.
+/// Duration of a mirror revolution of an LMS 2xx in ns, and its number of simulation steps.
 const MIRROR_TURN_NS: Nanos = 13_320_000;
 const STEPS_PER_MIRROR_TURN: usize = 3;
-/// Begin of time, as a wall clock says it.
+/// Start of the simulation as a wall clock time in ns.
 const START_NS: u64 = 1_800_000_000_000_000_000;
 
 #[derive(Clone, Copy)]
@@ -37,7 +37,7 @@ pub(crate) struct ProofSetup {
     pub(crate) tracking: TrackerKind,
 }
 
-/// Who tracks.
+/// Tracker to run.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum TrackerKind {
     All,
@@ -47,25 +47,26 @@ pub(crate) enum TrackerKind {
 
 #[derive(Default)]
 pub(crate) struct Outcome {
-    /// Lines for the score.
+    /// Lines for the score of the tracker.
     pub(crate) csv: String,
-    /// The same for perfect places with the identities of the oracle.
+    /// Lines for the score of exact positions with the oracle's IDs.
     pub(crate) oracle_csv: String,
-    /// Squared distances of confirmed tracks from the person, and how many.
+    /// Sum of the squared distances between confirmed tracks and people, and their number.
     pub(crate) squared_errors: (f64, usize),
-    /// Ways through the corridor: seen, kept by the tracker, guessed right by the oracle.
+    /// Passages through the corridor: all, those with the same ID before and after, and those that the oracle guessed
+    /// right.
     pub(crate) crossings: (usize, usize, usize),
-    /// Doors passed, told, and told right: which door, which way, within two seconds.
+    /// Passages of doors: real ones, reported ones, and reports with the right door and direction within two seconds.
     pub(crate) doors: (usize, usize, usize),
-    /// Tracks of each person in the second half, and the share of that time.
+    /// For each person, the number of tracks in the second half, and the share of that time with a track.
     pub(crate) late_ids: Vec<(usize, f64)>,
     pub(crate) tracker_time_s: f64,
     pub(crate) simulated_s: f64,
-    /// Tracks at all, when nobody was there.
+    /// Number of tracks. Without people, each is an error.
     pub(crate) tracks: usize,
     pub(crate) offset_error_s: f64,
     pub(crate) late: u64,
-    /// Why identities were lost.
+    /// Causes of lost IDs.
     pub(crate) diagnosis: Option<Diagnosis>,
 }
 
@@ -102,7 +103,7 @@ pub(crate) fn run(setup: ProofSetup) -> Outcome {
     let mut truths: Vec<Vec<Point>> = Vec::new();
     let mut samples: Vec<Snapshot> = Vec::new();
     let mut sent: Vec<SentScan> = Vec::new();
-    // Shapes of the last mirror turns of a scanner.
+    // Shapes during the last mirror revolutions of a scanner.
     let mut shapes: VecDeque<Vec<Shape>> = VecDeque::new();
     let steps = (setup.seconds * 200.0) as usize;
     for step in 0..steps {
@@ -171,7 +172,7 @@ fn score_run(site: &Site, truths: &[Vec<Point>], samples: &[Snapshot], crowd: &C
     let mut diagnosis = Diagnosis::new(crowd.walkers.len());
     let mut oracle = crate::oracle::Identities::new(crowd);
     let mut next = 0;
-    // Who was where by which track: for each person his track over time.
+    // Tracks of each person over time.
     let mut known: Vec<Vec<(f64, u64)>> = vec![Vec::new(); crowd.walkers.len()];
     let mut ids: HashMap<u64, u64> = HashMap::new();
     for (frame, truth) in truths.iter().enumerate() {

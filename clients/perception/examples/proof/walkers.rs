@@ -1,5 +1,5 @@
-//! People of the proof: they walk from place to place, stand, sit down, stop on the way, give way to each other, change rooms
-//! through the corridor, leave the house and come in. A pure function of the seed.
+//! People of the proof: they walk, stand, sit down, stop on the way, give way to each other, change rooms through the
+//! corridor, and leave and enter the house. Their behavior is a pure function of the seed.
 
 use scanhub_perception::track::geometry::{Point, distance};
 use scanhub_sim::Shape;
@@ -7,50 +7,52 @@ use scanhub_sim::Shape;
 use crate::house::{CHAIRS, House, chair_legs, normal, post, wall};
 
 pub(crate) const LEG_RADIUS_M: f64 = 0.06;
-/// Half the distance of the legs across the way, and how far a foot gets ahead.
+/// Half of the distance between the legs across the walking direction, and maximum distance of a foot ahead.
 const HALF_HIP_WIDTH_M: f64 = 0.11;
 const STRIDE_LEN_M: f64 = 0.25;
 const DOUBLE_STEP_LEN_M: f64 = 1.4;
-/// Mean and deviation of how fast people walk.
+/// Mean and standard deviation of the walking speed in m/s.
 pub(crate) const WALKING_SPEED: (f64, f64) = (1.15, 0.22);
-/// Share of those who stop in the corridor, and for how long at most.
+/// Share of people who stop in the corridor, and maximum duration of the stop in seconds.
 pub(crate) const STOP_SHARE: (f64, f64) = (0.15, 8.0);
 const INSIDE_ROOM: usize = 3;
 pub(crate) const CORRIDOR_X: [f64; 2] = [6.0, 11.0];
 
-/// Nobody steps nearer to another one.
+/// Minimum distance between two people in meters.
 const MIN_DISTANCE_M: f64 = 0.55;
 
-/// A free part of the plan: minimum x and y, maximum x and y.
+/// Free parts of the plan: minimum x and y, maximum x and y.
 const FREE_AREAS: [[f64; 4]; 9] = [
     [0.35, 0.35, 5.65, 4.65],
     [11.35, 0.35, 16.65, 4.65],
     [6.3, 1.8, 10.7, 3.2],
     [5.6, 2.2, 6.4, 2.8],
     [10.6, 2.2, 11.4, 2.8],
-    // The doors to the street, and the street.
+    // Areas of the doors that lead outside, and of the street.
     [-0.4, 2.2, 0.4, 2.8],
     [16.6, 2.2, 17.4, 2.8],
     [-3.4, 0.5, -0.35, 4.5],
     [17.35, 0.5, 20.4, 4.5],
 ];
-/// The doors to the street: x, and the direction of the street.
+/// Doors that lead outside: x, and the direction of the street.
 const OUTER_DOORS: [(f64, f64); 2] = [(0.0, -1.0), (17.0, 1.0)];
-/// Number of the first of them in the site.
+/// Index of the first of these doors in the site.
 const FIRST_OUTER_DOOR: usize = 2;
-/// Share of plans that lead to the street, and time after which somebody else comes in, in seconds.
+/// Share of paths that lead outside, and time after which another person enters, in seconds.
 const LEAVE_SHARE: f64 = 0.06;
 const RETURN_TIME_S: (f64, f64) = (3.0, 12.0);
-/// A door opens for a person who is nearer to it and wants to pass, and takes this time.
+/// Distance in meters at which a door opens for a person who wants to pass, and the duration of the opening in seconds.
 const DOOR_OPEN_DISTANCE_M: f64 = 1.4;
 const DOOR_OPEN_TIME_S: f64 = 0.9;
-/// Distance of the shins of a sitter from the center of the chair: the front edge of the seat is at 0.2 m.
+/// Distance of the shins of a sitting person from the center of the chair in meters. The front edge of the seat is at
+/// 0.2 m.
 const SHIN_DISTANCE_M: f64 = 0.36;
-/// Distance by which a sitter moves the chair along each axis, at most, and its turn in radians.
+/// Maximum distance by which a sitting person moves the chair along each axis in meters, and maximum rotation in
+/// radians.
 const MAX_CHAIR_MOVE: (f64, f64) = (0.05, 0.15);
-/// Minimum distance of a walker from the center of a chair.
+/// Minimum distance of a walker from the center of a chair in meters.
 const MIN_CHAIR_DISTANCE_M: f64 = 0.3;
-/// Duration of sitting, in seconds.
+/// Minimum and maximum duration of sitting in seconds.
 const SIT_TIME_S: (f64, f64) = (10.0, 40.0);
 /// Position of people who have left.
 const OUTSIDE_POSITION: Point = [-1000.0, -1000.0];
@@ -60,22 +62,22 @@ pub(crate) struct Walker {
     velocity: Point,
     heading: Point,
     pub(crate) speed: f64,
-    /// Turns of a double step.
+    /// Phase of the walk in double steps.
     phase: f64,
     path: Vec<(Point, f64)>,
     pause_s: f64,
     room: usize,
-    /// For how long he has wanted to go and could not.
+    /// Time for which the person has been unable to move on, in seconds.
     blocked_s: f64,
-    /// The chair that the person sits on, or walks to.
+    /// Chair on which the person sits, or to which they walk.
     chair: Option<usize>,
-    /// The door to the street that the person wants to pass.
+    /// Outer door that the person wants to pass.
     outer_door: Option<usize>,
-    /// When he went into the corridor, if he is there.
+    /// Time at which the person entered the corridor; `None` outside the corridor.
     pub(crate) entered_s: Option<f64>,
 }
 
-/// Somebody came out of the corridor on the other side.
+/// A passage of a person through the corridor, from one side to the other.
 pub(crate) struct Crossing {
     pub(crate) walker: usize,
     pub(crate) entered_s: f64,
@@ -86,9 +88,9 @@ pub(crate) struct Crowd {
     pub(crate) walkers: Vec<Walker>,
     random: fastrand::Rng,
     pub(crate) crossings: Vec<Crossing>,
-    /// Doors that were passed: when, which, and whether from the room that the site names first.
+    /// Passages of doors: time, door, and whether from the room that the site names first.
     pub(crate) passages: Vec<(f64, usize, bool)>,
-    /// How often one whose rest is over changes rooms; less than 0: whoever is in a room stands there for good.
+    /// Share of rests that end with a change of the room. If it is negative, people stay at their first position.
     room_change_share: f64,
     /// Share of rests on a chair.
     sit_share: f64,
@@ -97,13 +99,13 @@ pub(crate) struct Crowd {
     chairs: Vec<(Point, f64)>,
     /// Opening of the doors to the street, 0 to 1.
     door_openings: [f64; 2],
-    /// Times at which new people enter, and the number of the door.
+    /// Times at which new people enter, with the index of the door.
     arrivals: Vec<(f64, usize)>,
     now_s: f64,
 }
 
 impl Crowd {
-    /// All begin in the corridor or before it, from second `from_s` on one after the other.
+    /// Creates the people, who start in the corridor or in front of it, one after the other from second `from_s` on.
     pub(crate) fn new(
         house: House,
         count: usize,
@@ -153,7 +155,7 @@ impl Crowd {
         crowd
     }
 
-    /// Whether the walker is not yet on his way.
+    /// Returns whether the walker has not started yet.
     pub(crate) fn is_waiting(&self, walker: usize) -> bool {
         let [x, _] = self.walkers[walker].position;
         self.walkers[walker].entered_s.is_none()
@@ -241,7 +243,7 @@ impl Crowd {
                         } else {
                             4.0
                         };
-                    // To the side as well, so that two who meet pass.
+                    // Push sideways too, so that two people who meet can pass.
                     let away = [walker.position[0] - other[0], walker.position[1] - other[1]];
                     desired_velocity = [
                         desired_velocity[0] + push * (away[0] - 0.5 * away[1]),
@@ -275,7 +277,7 @@ impl Crowd {
                     walker.position = to;
                 } else {
                     walker.velocity[axis] = 0.0;
-                    // Around a corner.
+                    // Walk around a corner.
                     let mut aside = walker.position;
                     aside[1 - axis] += dt * 0.5 * if i % 2 == 0 { 1.0 } else { -1.0 };
                     if is_free(aside) && !is_resting && !bumps(aside) {
@@ -305,7 +307,7 @@ impl Crowd {
         }
     }
 
-    /// Somebody comes through the door that this one wants to go through.
+    /// Returns whether another person comes through the door to which this one walks.
     fn must_wait(&self, i: usize, positions: &[Point]) -> bool {
         let walker = &self.walkers[i];
         let Some((goal, _)) = walker.path.last() else { return false };
@@ -385,7 +387,7 @@ impl Crowd {
         }
     }
 
-    /// Sends the person to a free chair of the room, if there is one.
+    /// Sends the person to a free chair in the room. Returns false if there is none.
     fn sit_down(&mut self, i: usize) -> bool {
         let room = self.walkers[i].room;
         let is_free = |&chair: &usize| {
@@ -394,7 +396,7 @@ impl Crowd {
                 && self.walkers.iter().all(|walker| walker.chair != Some(chair))
         };
         let free: Vec<usize> = (0..self.chairs.len()).filter(is_free).collect();
-        // One who has just sat walks first.
+        // A person who has just sat walks first.
         if free.is_empty() || self.walkers[i].chair.is_some() {
             self.walkers[i].chair = None;
             return false;
@@ -410,7 +412,7 @@ impl Crowd {
         true
     }
 
-    /// The person leaves the chair, which moves a little.
+    /// Ends the person's rest on a chair, which is moved a little.
     fn stand_up(&mut self, i: usize) {
         if let Some(chair) = self.walkers[i].chair.take() {
             self.chairs[chair] = move_chair(self.chairs[chair], &mut self.random);
@@ -427,7 +429,7 @@ impl Crowd {
         }
     }
 
-    /// Adds the people who enter from the street by now.
+    /// Adds the people who have entered from the street by now.
     fn admit_arrivals(&mut self, now_s: f64) {
         while let Some(due) = self.arrivals.iter().position(|(at_s, _)| *at_s <= now_s) {
             let (_, door) = self.arrivals.swap_remove(due);
@@ -454,14 +456,14 @@ impl Crowd {
         }
     }
 
-    /// Returns everything that moves: legs, chairs and the leaves of doors.
+    /// Returns all moving objects: legs, chairs and the leaves of doors.
     pub(crate) fn shapes(&self) -> Vec<Shape> {
         let mut legs = Vec::new();
         self.legs(&mut legs);
         let mut shapes: Vec<Shape> = legs.into_iter().map(|leg| post(leg, LEG_RADIUS_M)).collect();
         shapes.extend(self.chairs.iter().flat_map(|&(center, yaw_rad)| chair_legs(center, yaw_rad)));
         if !self.house.is_ideal {
-            // The one swings into the street, the other slides along the wall.
+            // One door swings toward the street, and the other slides along the wall.
             let (sin, cos) = (85.0_f64.to_radians() * self.door_openings[0]).sin_cos();
             shapes.push(wall([0.0, 2.0], [-sin, 2.0 + cos]));
             let y = 2.0 + 0.95 * self.door_openings[1];
@@ -486,7 +488,8 @@ impl Crowd {
     }
 }
 
-/// The ways out of a room: before, in and behind its door, seen from the corridor; and the door's x.
+/// Returns three points on the path out of a room, seen from the corridor: in front of, in and behind its door. Also
+/// returns the door's x.
 fn doors(room: usize) -> ([Point; 3], f64) {
     match room {
         0 => ([[6.6, 2.5], [6.0, 2.5], [5.3, 2.5]], 6.0),
@@ -498,13 +501,13 @@ fn within([a, b, c, d]: &[f64; 4], margin: f64, [x, y]: Point) -> bool {
     x > a - margin && x < c + margin && y > b - margin && y < d + margin
 }
 
-/// Returns whether `place` is at the end of the way out by that door.
+/// Returns whether `position` is at the end of the path out through that door.
 fn is_outside(door: usize, position: Point) -> bool {
     let (x, out) = OUTER_DOORS[door];
     (position[0] - x) * out > 2.0
 }
 
-/// Returns a chair that was moved a little.
+/// Returns a chair whose position has changed a little.
 fn move_chair(([x, y], turn): (Point, f64), random: &mut fastrand::Rng) -> (Point, f64) {
     let mut off = |maximum: f64| maximum * (2.0 * random.f64() - 1.0);
     ([x + off(MAX_CHAIR_MOVE.0), y + off(MAX_CHAIR_MOVE.0)], turn + off(MAX_CHAIR_MOVE.1))

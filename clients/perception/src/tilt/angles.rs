@@ -1,5 +1,5 @@
-//! The mount's angle at any time, interpolated between the angles that its encoder reports; the times at which it is not
-//! reliable; and the reversals of the mount.
+//! The mount's angle at any time, interpolated between the angles that its encoder reports. The module also detects
+//! unreliable angles and the reversals of the mount.
 
 use std::collections::VecDeque;
 
@@ -14,11 +14,11 @@ pub struct Angle {
     pub stamp_ns: u64,
     /// Angle in radians, in the direction that [`Mount`](super::Mount) defines.
     pub angle_rad: f64,
-    /// Rate of change in rad/s. NaN: unknown.
+    /// Rate of change in rad/s; NaN if it is unknown.
     pub rate_rad_s: f64,
 }
 
-/// Reason why a beam makes no point.
+/// Reason why a beam produces no point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(usize)]
@@ -29,7 +29,7 @@ pub enum DropReason {
     Jumped,
     /// The angles contradict their rates.
     Inconsistent,
-    /// The mount stands, or its encoder hangs. Both look the same.
+    /// The mount stands, or its encoder is stuck. Both look the same.
     Standing,
 }
 
@@ -38,7 +38,7 @@ impl DropReason {
     pub const COUNT: usize = 4;
 }
 
-/// The angle at a time.
+/// Result of a query for the angle at a time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum AngleLookup {
     Known(f64),
@@ -69,14 +69,14 @@ struct Entry {
 pub(crate) struct Angles {
     entries: VecDeque<Entry>,
     settled_ns: u64,
-    /// Estimated delay of all stamps.
+    /// Estimated delay of all stamps in ns.
     late_ns: i64,
 }
 
-/// Maximum number of stored angles: ten seconds at 100 Hz.
+/// Maximum number of stored angles, which is ten seconds at 100 Hz.
 const MAX_ANGLES: usize = 1024;
-/// Difference from other stamps at which a clock is taken to have been set back, or from scans at which an angle is
-/// dropped.
+/// Difference in ns from which on a clock counts as set back, compared with other angles, or an angle is dropped,
+/// compared with the scans.
 const CLOCK_JUMP_NS: u64 = 1_000_000_000;
 
 impl Angles {
@@ -84,7 +84,7 @@ impl Angles {
         Angles { entries: VecDeque::with_capacity(MAX_ANGLES), settled_ns: 0, late_ns: 0 }
     }
 
-    /// Takes the next angle. The latest scan is from `scan_ns`.
+    /// Handles the next angle. `scan_ns` is the stamp of the latest scan.
     pub(crate) fn take(
         &mut self,
         angle: Angle,
@@ -133,7 +133,7 @@ impl Angles {
         if angle.stamp_ns <= self.settled_ns {
             return Some(DropReason::Jumped);
         }
-        // At a reversal, the rates differ, and the speed is between them.
+        // At a reversal, the rates of the two angles differ, and the speed is between them.
         let (lowest, highest) =
             (before.rate_rad_s.min(angle.rate_rad_s), before.rate_rad_s.max(angle.rate_rad_s));
         let is_off = speed < lowest - settings.rate_rad_s || speed > highest + settings.rate_rad_s;
@@ -150,7 +150,7 @@ impl Angles {
             .for_each(|entry| entry.drop_reason = Some(DropReason::Standing));
     }
 
-    /// Returns the delay of all stamps.
+    /// Returns the delay of all stamps in ns.
     pub(crate) fn late_ns(&self) -> i64 {
         self.late_ns
     }
@@ -160,7 +160,7 @@ impl Angles {
         self.late_ns += more_ns;
     }
 
-    /// Returns the time at which the mount had the angle with the stamp `stamp_ns`.
+    /// Returns the time at which the mount had the angle with stamp `stamp_ns`.
     pub(crate) fn true_ns(&self, stamp_ns: u64) -> u64 {
         stamp_ns.saturating_add_signed(-self.late_ns)
     }
@@ -170,12 +170,12 @@ impl Angles {
         self.entries.back().map(|entry| self.true_ns(entry.angle.stamp_ns))
     }
 
-    /// Returns the reason why the angles before the last one are unknown.
+    /// Returns the reason why the angle is unknown between the last two reports, if it is.
     pub(crate) fn problem(&self) -> Option<DropReason> {
         self.entries.back().map_or(Some(DropReason::Silent), |entry| entry.drop_reason)
     }
 
-    /// Returns the angle at `time_ns`, interpolated between those before and after.
+    /// Returns the angle at `time_ns`, interpolated between the angles before and after it.
     pub(crate) fn at(&self, time_ns: u64) -> AngleLookup {
         let time_ns = time_ns.saturating_add_signed(self.late_ns);
         let after = self.entries.partition_point(|entry| entry.angle.stamp_ns < time_ns);
@@ -193,7 +193,7 @@ impl Angles {
     }
 }
 
-/// Event that an angle shows.
+/// Event that a new angle shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SwingEvent {
     Nothing,
@@ -213,19 +213,20 @@ struct StampedAngle {
 /// Direction in which the mount moves.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Direction {
-    /// Unknown, with the minimum and maximum angle since then.
+    /// Unknown direction, with the minimum and maximum angle since its start.
     Open { lowest: StampedAngle, highest: StampedAngle },
-    /// To larger angles, with the maximum so far.
+    /// Toward larger angles, with the maximum so far.
     Up(StampedAngle),
-    /// To smaller angles, with the minimum so far.
+    /// Toward smaller angles, with the minimum so far.
     Down(StampedAngle),
 }
 
-/// Detects the reversals of a mount, and whether it stands. Thanks to a hysteresis, play of the gears is neither.
+/// Detects the reversals of a mount, and whether it stands. Because of a hysteresis, play in the gears counts as
+/// neither.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ReversalDetector {
     direction: Option<Direction>,
-    /// Last angle at which it moved.
+    /// Last angle at which the mount moved.
     moved: Option<StampedAngle>,
 }
 
@@ -235,7 +236,7 @@ impl ReversalDetector {
         *self = ReversalDetector::default();
     }
 
-    /// Takes the next angle.
+    /// Handles the next angle, and returns the event that it shows.
     pub(crate) fn take(&mut self, stamp_ns: u64, rad: f64, settings: &Settings) -> SwingEvent {
         use Direction::{Down, Open, Up};
         use SwingEvent::{Nothing, Reversed};
@@ -360,7 +361,7 @@ mod tests {
         events.filter(|event| *event != SwingEvent::Nothing).collect()
     }
 
-    /// To and fro by 20 degrees in a second, with a play of half a degree.
+    /// Returns the angle in degrees at report `i`: 20 degrees up and down in two seconds, with half a degree of play.
     fn triangle(i: u32) -> f64 {
         let phase = f64::from(i % 200) / 100.0;
         20.0 * if phase < 1.0 { phase } else { 2.0 - phase } + if i.is_multiple_of(2) { 0.25 } else { -0.25 }

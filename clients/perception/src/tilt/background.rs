@@ -1,5 +1,6 @@
-//! The background in three dimensions: for each beam in each narrow span of the mount's angle, the surface that it usually
-//! reaches. It is learned as in two dimensions: a surface that is met in enough sweeps in a row replaces the one before.
+//! Background in three dimensions: the surface that each beam usually reaches, in each narrow range of the mount's
+//! angle. It is learned as in two dimensions: a surface that a number of sweeps in a row meet replaces the previous
+//! one.
 
 use scanhub_schema::PointClass;
 
@@ -11,55 +12,56 @@ use super::mount::Mount;
 pub(crate) struct Reading {
     /// Index of the beam.
     pub(crate) beam: u16,
-    /// Height that the beam gains with each meter, -1 to 1.
+    /// Height that the beam gains per meter, -1 to 1.
     pub(crate) rise: f32,
     /// Change of the rise per radian of the mount's angle.
     pub(crate) rise_change: f32,
-    /// Range in meters. Infinite without a return.
+    /// Range in meters; infinite without a return.
     pub(crate) range_m: f32,
 }
 
-/// A surface, represented by one reading.
+/// A surface, described by one reading.
 #[derive(Clone, Copy, Default)]
 struct Surface {
-    /// 0 without a surface.
+    /// Range in meters; 0 without a surface.
     range_m: f32,
     rise: f32,
-    /// Mean squared differences of beams from a level surface, and from an upright one. The last ones weigh most.
+    /// Mean squared differences of the beams from a level surface and from an upright one. Recent beams have more
+    /// weight.
     off: [f32; 2],
 }
 
 #[derive(Clone, Copy, Default)]
 struct Cell {
     background: Surface,
-    /// Surface that may become the background.
+    /// Surface that may become background.
     candidate: Surface,
     /// Number of sweeps in a row that met the candidate.
     run: u16,
-    /// Surfaces that beams meet now and then, because they are narrower than the distance between two scans.
+    /// Surfaces that beams meet occasionally, because they are narrower than the distance between two scans.
     narrow: [NarrowSurface; MAX_NARROW],
-    /// Number of the last sweep that it was updated in, plus 1. Only one reading of a sweep counts.
+    /// Number of the sweep that last updated the cell, plus 1. Only one reading of a sweep counts.
     last_sweep: u32,
 }
 
-/// A surface that the beams of a cell do not meet in each sweep.
+/// A surface that the beams of a cell do not meet in every sweep.
 #[derive(Clone, Copy, Default)]
 struct NarrowSurface {
     surface: Surface,
-    /// Number of sweeps that met it. Beams that meet a third surface decrease it. 0 if no surface is stored.
+    /// Number of sweeps that met the surface. Beams that meet a third surface decrease it. 0 if no surface is stored.
     hit_count: u16,
-    /// Number of times that a sweep met it and the sweep before did not.
+    /// Number of times that a sweep met the surface after one that did not.
     visits: u16,
-    /// Number of sweeps since the last one that met it. Sweeps that did not measure the cell do not count.
+    /// Number of sweeps since the last one that met the surface. Sweeps that did not measure the cell do not count.
     miss_count: u16,
 }
 
-/// The background of all beams.
+/// Background of all beams.
 pub(crate) struct SurfaceModel {
     beams: usize,
-    /// Number of sweeps in which a surface must be met until it is background.
+    /// Number of sweeps that must meet a surface before it becomes background.
     sweeps: u16,
-    /// Cells by the mount's angle. Rows that it has not reached have no memory.
+    /// Cells by the mount's angle. Rows that the mount has not reached use no memory.
     rows: Box<[Box<[Cell]>]>,
 }
 
@@ -78,7 +80,7 @@ impl SurfaceModel {
         if own.as_ref().is_some_and(explains) {
             return PointClass::Background;
         }
-        // At edges a beam meets the surfaces of its neighbors.
+        // At an edge, a beam may meet the surfaces of neighboring cells.
         let neighbors = || {
             let rows = row.saturating_sub(1)..=row + 1;
             rows.flat_map(|row| (beam.saturating_sub(1)..=beam + 1).map(move |beam| (row, beam)))
@@ -106,8 +108,8 @@ impl SurfaceModel {
     }
 
     /// Returns the error of the mount's angle that the reading shows, in radians: the difference from the angle at
-    /// which it would be on the background. `None` unless the background is a level surface that the beam meets
-    /// steeply.
+    /// which the reading would be on the background. Returns `None` unless the background is a level surface that the
+    /// beam meets at a steep angle.
     pub(crate) fn angle_off(&self, reading: &Reading, row: usize, threshold_m: f32) -> Option<f32> {
         let known = self.background(row, reading.beam.into())?;
         let [level, upright] = known.ends(reading);
@@ -117,7 +119,7 @@ impl SurfaceModel {
         is_usable.then(|| (known.range_m * known.rise / reading.range_m - reading.rise) / reading.rise_change)
     }
 
-    /// Learns from a reading of sweep number `sweep`.
+    /// Updates the model with a reading of sweep number `sweep`.
     pub(crate) fn learn(&mut self, reading: &Reading, row: usize, sweep: u32, settings: &Settings) {
         let beams = self.beams;
         let Some(cells) = self.rows.get_mut(row) else { return };
@@ -153,7 +155,7 @@ impl SurfaceModel {
         }
     }
 
-    /// Forgets everything.
+    /// Clears all cells.
     pub(crate) fn clear(&mut self) {
         self.rows.iter_mut().for_each(|cells| cells.fill(Cell::default()));
     }
@@ -186,13 +188,13 @@ impl Cell {
 }
 
 impl NarrowSurface {
-    /// Returns whether it is background. An object that stands still for a while and leaves visits the cell once. People who
-    /// walk do not return to the same range.
+    /// Returns whether the surface is background. An object that stands for a while and leaves has one visit. People
+    /// who walk do not return to the same range.
     fn is_background(&self, sweeps: u16) -> bool {
         self.hit_count >= sweeps && self.visits >= MIN_VISITS.min(sweeps)
     }
 
-    /// A sweep measures its cell. Forgets the surface if too many sweeps have met something else.
+    /// Starts a sweep that measures this cell. Removes the surface if too many sweeps have met another one.
     fn begin_sweep(&mut self, sweeps: u16) {
         self.miss_count = self.miss_count.saturating_add(1);
         if self.miss_count > sweeps.saturating_mul(FORGET_FACTOR) {
@@ -210,12 +212,13 @@ impl NarrowSurface {
     }
 }
 
-/// Width of a row. Narrower ones would take memory without end.
+/// Returns the width of a row in radians. Narrower rows would need too much memory.
 fn width_rad(settings: &Settings) -> f64 {
     settings.bin_rad.max(MIN_BIN_RAD)
 }
 
-/// Returns the row of the model for a beam at `beam_rad` that was measured at `angle_rad`, and how it is compared with it.
+/// Returns the row of the model for a beam at `beam_rad` that was measured at `angle_rad`, and the reading to compare
+/// with it.
 pub(crate) fn row_for(
     mount: &Mount,
     settings: &Settings,
@@ -240,8 +243,8 @@ impl Surface {
         self.range_m > 0.0
     }
 
-    /// Returns the ranges of a beam that rises as `reading` does: if the surface is level and keeps its height, and
-    /// if it is upright and keeps its distance over ground.
+    /// Returns two ranges of a beam that rises as `reading` does: the one if the surface is level and keeps its height,
+    /// and the one if it is upright and keeps its horizontal distance.
     fn ends(&self, reading: &Reading) -> [f32; 2] {
         let Surface { range_m, rise, .. } = *self;
         let over_ground = |rise: f32| (1.0 - rise * rise).max(0.0).sqrt();
@@ -250,8 +253,8 @@ impl Surface {
         [if is_slope { range_m * rise / reading.rise } else { upright }, upright]
     }
 
-    /// Returns the range limits of that beam. An orientation that earlier beams have ruled out does not count. A
-    /// surface that is neither level nor upright lies between.
+    /// Returns the minimum and maximum range of that beam. Orientations that earlier beams have ruled out do not count.
+    /// A surface that is neither level nor upright lies between the two.
     fn expected(&self, reading: &Reading, threshold_m: f32) -> (f32, f32) {
         let [level, upright] = self.ends(reading);
         let most = (threshold_m / 2.0).powi(2);
@@ -262,7 +265,7 @@ impl Surface {
         }
     }
 
-    /// Takes a beam that ended on it.
+    /// Updates the surface with a beam that ended on it.
     fn update(&mut self, reading: &Reading) {
         if reading.range_m.is_finite() {
             let ends = self.ends(reading);
@@ -281,22 +284,24 @@ impl Surface {
     }
 }
 
-/// Number of narrow surfaces that a cell stores, such as the edge and the top of a board.
+/// Number of narrow surfaces that a cell stores, for example the edge and the top of a board.
 const MAX_NARROW: usize = 2;
-/// Minimum number of visits of a narrow surface that is background. Objects that are put down and people can visit twice.
+/// Minimum number of visits of a narrow surface that is background. People, and objects that are put down, can have two
+/// visits.
 const MIN_VISITS: u16 = 3;
-/// A narrow surface is forgotten when this many times the sweeps of the setting have not met it in a row.
+/// Number of sweeps in a row that must miss a narrow surface before it is removed, as a multiple of
+/// [`Settings::sweeps`].
 const FORGET_FACTOR: u16 = 20;
-/// Less than a planar scanner measures exactly.
+/// Minimum width of a row in radians. A planar scanner does not measure more exactly.
 const MIN_BIN_RAD: f64 = 0.002;
-/// Weight of the last beam in the mean squares of a surface.
+/// Weight of the latest beam in the mean squares of a surface.
 const UPDATE_WEIGHT: f32 = 0.25;
-/// A beam goes nearly straight up or down.
+/// Minimum horizontal share of a beam that is nearly vertical, to avoid a division by zero.
 const MIN_OVER_GROUND: f32 = 0.02;
-/// Beams along the axis keep their height at any angle.
+/// Minimum change of the rise per radian. Beams along the axis keep their height at any angle.
 const MIN_RISE_CHANGE: f32 = 0.3;
-/// A beam that rises less ends on no level surface within reach but one in the plane of the scanner: 8 m away it is 0.16 m from
-/// there.
+/// Minimum rise of a beam that is compared with a level surface. A flatter beam ends on a level surface within reach
+/// only if the surface is near the plane of the scanner: at 8 m, within 0.16 m.
 const MIN_RISE: f32 = 0.02;
 
 #[cfg(test)]
@@ -346,7 +351,8 @@ mod tests {
         assert_eq!(model.class(&Reading { beam: 6, ..reading(2.0) }, 91, 0.06), Background, "beside it");
     }
 
-    /// Returns whether the reading at 2 m is background after `sweeps`. Each has a range, or `None` if it did not measure the cell.
+    /// Returns whether the reading at 2 m is background after `sweeps`, each with a range, or `None` if it did not
+    /// measure the cell.
     fn is_narrow_background(settings: &Settings, sweeps: impl IntoIterator<Item = Option<f32>>) -> bool {
         let mut model = SurfaceModel::new(11, settings);
         for (sweep, range_m) in sweeps.into_iter().enumerate() {
@@ -395,7 +401,7 @@ mod tests {
             }
         };
         learn_ranges(&[4.0; 5], 0, &mut model);
-        // An object stands there until it is background, and leaves.
+        // An object stands there until it is background, and then leaves.
         learn_ranges(&[2.0, 2.0, 2.0, 2.0, 4.0, 4.0, 4.0, 4.0], 5, &mut model);
         assert_eq!(model.class(&reading(2.0), 90, 0.06), Foreground);
         let walks = [1.5, 4.0, 2.5, 3.0, 4.0, 2.0, 1.7, 4.0, 3.3, 2.5, 4.0, 1.5, 2.2, 4.0, 3.6, 2.8, 4.0];
@@ -423,7 +429,8 @@ mod tests {
         (0..4).for_each(|_| floor.update(&at(-0.21, 1.0 / 0.21)));
         assert!(floor.explains(&at(-0.21, 1.0 / 0.21), 0.05), "seen to be level");
         assert!(!floor.explains(&at(-0.21, 5.0), 0.05), "and no wall any more");
-        // A table's top a little below the scanner, from which a beam is met farther away with each minute of arc.
+        // A table top a little below the scanner. A small change of the angle changes the range at which a beam meets
+        // it.
         let mut top = Surface { range_m: 4.76, rise: -0.042, off: [0.0; 2] };
         (1..5).for_each(|i| top.update(&at(-0.042 - 0.001 * i as f32, 0.2 / (0.042 + 0.001 * i as f32))));
         assert!(top.explains(&at(-0.047, 0.2 / 0.047), 0.06) && !top.explains(&at(-0.047, 3.9), 0.06));
@@ -431,8 +438,8 @@ mod tests {
         assert!(sky.explains(&at(0.1, f32::INFINITY), 0.01) && !sky.explains(&at(0.1, 9.0), 0.01));
     }
 
-    /// The same by the definition, from all that a cell was ever met with: one surface a sweep, background is the last that was
-    /// met in enough sweeps in a row.
+    /// Computes the background by definition, from all ranges of a cell, with one surface per sweep. The background is
+    /// the last surface that enough sweeps in a row have met.
     fn reference_background(ranges: &[f32], scans: usize) -> Option<f32> {
         let same = |a: f32, b: f32| a == b || (a - b).abs() <= 0.06;
         let mut background = None;

@@ -1,21 +1,22 @@
-//! Estimates how much later than its angles the stamps of a mount are. With late stamps, a surface is too low in sweeps one
-//! way and too high in sweeps the other way. A play of the gears looks the same.
+//! Estimates the delay of a mount's stamps relative to its angles. With late stamps, a surface appears too low in
+//! sweeps in one direction and too high in the other. Play in the gears looks the same.
 
 use super::sweep::Ray;
 
 /// Number of directions of the scanner that are compared.
 const COLUMN_COUNT: usize = 24;
-/// Fewer points on slopes do not show a delay.
+/// Minimum number of points on slopes that are needed to measure a delay.
 const MIN_VOTES: usize = 60;
-/// Two sweeps that are farther apart than this show a delay, in radians: 0.1 degrees.
+/// Minimum distance between two sweeps that counts as a delay, in radians: 0.1 degrees.
 const MIN_SHIFT_RAD: f64 = 0.0017;
 /// Maximum delay that is corrected, in seconds.
 pub(crate) const MAX_DELAY_S: f64 = 0.15;
-/// Meters that the end of a beam moves by per radian of the mount's angle. On flatter slopes, noise hides the delay.
+/// Minimum distance in meters by which the end of a beam moves per radian of the mount's angle. On flatter slopes,
+/// noise hides the delay.
 const MIN_SLOPE_M: f64 = 3.0;
-/// Two neighboring slopes on one surface differ by at most this share.
+/// Maximum relative difference between neighboring slopes on one surface.
 const MAX_SLOPE_DIFFERENCE: f64 = 0.3;
-/// Points farther apart than this, in radians, are not joined.
+/// Maximum distance in radians between points that are joined.
 const MAX_GAP_RAD: f64 = 0.06;
 
 /// A beam of a sweep.
@@ -23,7 +24,7 @@ const MAX_GAP_RAD: f64 = 0.06;
 struct Sample {
     time_s: f64,
     angle_rad: f64,
-    /// One divided by the range in meters. On a plane, it grows evenly with the angle.
+    /// One divided by the range in meters. On a plane, it changes evenly with the angle.
     inverse: f64,
 }
 
@@ -34,25 +35,25 @@ struct Profile {
     until_ns: u64,
 }
 
-/// Compares each complete sweep with the one before it.
+/// Comparison of each complete sweep with the one before it.
 #[derive(Default)]
 pub(crate) struct Delay {
     before: Profile,
     now: Profile,
-    /// The delay that each point shows, in seconds.
+    /// Delay that each point shows, in seconds.
     votes: Vec<f64>,
-    /// The delay that the last pair of sweeps showed, in seconds.
+    /// Delay that the last pair of sweeps showed, in seconds.
     last: Option<f64>,
 }
 
 impl Delay {
-    /// Forgets all sweeps.
+    /// Removes all sweeps.
     pub(crate) fn reset(&mut self) {
         (self.before.until_ns, self.now.until_ns, self.last) = (0, 0, None);
     }
 
-    /// Takes a sweep of scans that have `beams` beams. Returns the delay in seconds that remains after earlier corrections, once
-    /// two pairs of sweeps in a row show the same one.
+    /// Adds a sweep of scans that have `beams` beams. Returns the delay in seconds that remains after earlier
+    /// corrections, once two successive pairs of sweeps agree on it.
     pub(crate) fn take(
         &mut self,
         rays: &[Ray],
@@ -73,7 +74,7 @@ impl Delay {
         (agrees && is_significant).then_some(late_s)
     }
 
-    /// Returns the delay in seconds, and the rate at which the two sweeps move apart by it, in radians a second.
+    /// Returns the delay in seconds, and the rate at which it moves the two sweeps apart, in rad/s.
     fn measure(&mut self) -> Option<(f64, f64)> {
         let mut late_s = 0.0;
         for _ in 0..4 {
@@ -102,8 +103,8 @@ impl Delay {
     }
 }
 
-/// Returns the delay that the middle one of three samples shows in addition to `late_s`, and the rate at which the sweeps move
-/// apart with it.
+/// Returns the delay in seconds that the middle of three samples shows in addition to `late_s`, and the rate at which
+/// it moves the sweeps apart, in rad/s.
 fn vote(window: &[Sample], before: &[Sample], late_s: f64) -> Option<(f64, f64)> {
     let [first, here, last] = window else { return None };
     let rate = (last.angle_rad - first.angle_rad) / (last.time_s - first.time_s);
@@ -112,12 +113,12 @@ fn vote(window: &[Sample], before: &[Sample], late_s: f64) -> Option<(f64, f64)>
     let there = slopes(before, angle_rad)?;
     let expected = there.at.inverse + there.slope * (angle_rad - there.at.angle_rad);
     let is_steep = there.slope.abs() > MIN_SLOPE_M * here.inverse * here.inverse;
-    // Where the mount turns back, the sweeps are hardly apart.
+    // Near a reversal, the sweeps are too close to show a delay.
     let goes_back = rate * there.rate < 0.0 && apart.abs() > rate.abs();
     (is_steep && goes_back).then(|| ((here.inverse - expected) / (there.slope * apart), apart.abs()))
 }
 
-/// A sample, and how what is around it changes with the angle.
+/// A sample, with the rates at which its surroundings change with the angle.
 struct Slopes {
     at: Sample,
     slope: f64,
@@ -137,7 +138,7 @@ fn slopes(column: &[Sample], angle_rad: f64) -> Option<Slopes> {
 }
 
 impl Profile {
-    /// Takes the beams that are compared, by growing angles.
+    /// Fills the profile with the beams that are compared, by increasing angle.
     fn fill(&mut self, rays: &[Ray], beams: usize, from_ns: u64) {
         let every = (beams / COLUMN_COUNT).max(1);
         self.columns.resize_with(beams.div_ceil(every), Vec::new);
@@ -168,8 +169,8 @@ impl Profile {
 mod tests {
     use super::*;
 
-    /// Sweeps of a mount 0.9 m above the floor that swings like a pendulum from 5 to 45 degrees in 2 s; its encoder has
-    /// a standard deviation of about 0.05 degrees, and its stamps are `late_s` late.
+    /// Returns the delay that each sweep shows. The mount is 0.9 m above the floor and swings like a pendulum from 5 to
+    /// 45 degrees in 2 s. Its encoder has a standard deviation of about 0.05 degrees, and its stamps are `late_s` late.
     fn delays(late_s: f64, seed: u64) -> Vec<Option<f64>> {
         let mut random = fastrand::Rng::with_seed(seed);
         let mut noise = |sigma: f64| (0..12).map(|_| random.f64()).sum::<f64>() * sigma - 6.0 * sigma;

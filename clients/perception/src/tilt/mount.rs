@@ -1,29 +1,29 @@
-//! The geometry of a mount, and a check of its description: with the right axis, arm and level, a flat floor is level and a
+//! Geometry of a mount, and a check of its description: if axis, arm and level are right, a flat floor is level and a
 //! wall ahead is upright.
 
 use super::Sweep;
 
-/// A mount with one axis, and the scanner on it. Positions are in the robot's frame: x ahead, y left, z up from the
-/// floor, in meters.
+/// A mount with one axis, and the scanner on it. Positions are in the robot's frame in meters: x forward, y left, z up
+/// from the floor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mount {
-    /// A point of the axis.
+    /// A point on the axis.
     pub axis_at: [f64; 3],
-    /// Direction of the axis, of any length but 0. Angles are right-handed: around y, which is the default, a larger
-    /// angle tilts the scanner down; around -y, up.
+    /// Direction of the axis, with any length except 0. Angles are right-handed: around y, which is the default, a
+    /// larger angle tilts the scanner down; around -y, it tilts the scanner up.
     pub axis: [f64; 3],
-    /// Angle at which the scanner measures level, with the position and direction below.
+    /// Angle at which the scanner measures level. Position and direction below are given for this angle.
     pub level_rad: f64,
-    /// Origin of its beams.
+    /// Origin of the beams.
     pub sensor_at: [f64; 3],
-    /// Direction of the scanner, counterclockwise from ahead.
+    /// Direction of the scanner, counterclockwise from forward.
     pub yaw_rad: f64,
-    /// Whether it is mounted upside down, so that its beams run clockwise.
+    /// Whether the scanner is mounted upside down, so that its beams run clockwise.
     pub is_upside_down: bool,
 }
 
 impl Default for Mount {
-    /// A scanner at the origin that looks ahead, on an axis through itself.
+    /// Returns a mount whose axis goes through the scanner, which is at the origin and faces forward.
     fn default() -> Mount {
         Mount {
             axis_at: [0.0; 3],
@@ -37,28 +37,28 @@ impl Default for Mount {
 }
 
 impl Mount {
-    /// Returns the direction of the beam at `beam_rad` (counterclockwise from the scanner's direction) while the
-    /// mount's angle is `angle_rad`: a unit vector.
+    /// Returns the direction of the beam at `beam_rad` (counterclockwise from the scanner's direction) at the mount's
+    /// angle `angle_rad`, as a unit vector.
     pub fn direction(&self, angle_rad: f64, beam_rad: f64) -> [f64; 3] {
         let turned = if self.is_upside_down { -beam_rad } else { beam_rad };
         let (sin, cos) = (self.yaw_rad + turned).sin_cos();
         self.rotated([cos, sin, 0.0], angle_rad)
     }
 
-    /// Returns the origin of the beams while the mount's angle is `angle_rad`.
+    /// Returns the origin of the beams at the mount's angle `angle_rad`.
     pub fn origin(&self, angle_rad: f64) -> [f64; 3] {
         let arm = std::array::from_fn(|i| self.sensor_at[i] - self.axis_at[i]);
         let arm = self.rotated(arm, angle_rad);
         std::array::from_fn(|i| self.axis_at[i] + arm[i])
     }
 
-    /// Returns the end of that beam, `range_m` away.
+    /// Returns the point at range `range_m` on that beam.
     pub fn point(&self, angle_rad: f64, beam_rad: f64, range_m: f64) -> [f64; 3] {
         let (origin, direction) = (self.origin(angle_rad), self.direction(angle_rad, beam_rad));
         std::array::from_fn(|i| origin[i] + range_m * direction[i])
     }
 
-    /// Rodrigues' formula.
+    /// Rotates `v` by Rodrigues' formula.
     fn rotated(&self, v: [f64; 3], angle_rad: f64) -> [f64; 3] {
         let length = dot(self.axis, self.axis).sqrt();
         let k = self.axis.map(|value| value / length);
@@ -76,40 +76,40 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// The floor is searched up to this distance from height 0, in meters.
+/// Maximum distance of the floor from height 0, in meters.
 const MAX_FLOOR_OFFSET_M: f64 = 0.4;
-/// Points farther away than this are not used: small angles move them too far.
+/// Maximum distance of a point that is used, in meters. Small errors of the angle move farther points too much.
 const MAX_DISTANCE_M: f64 = 6.0;
-/// Points of the wall have at least this height, in meters.
+/// Minimum height of the points of a wall, in meters.
 const MIN_WALL_POINT_HEIGHT_M: f64 = 0.3;
-/// Width of the distances that are counted to find the wall, in meters.
+/// Width of the distance bins in which points are counted to find the wall, in meters.
 const BIN_M: f64 = 0.1;
-/// Fewer points make no plane.
+/// Minimum number of points on a plane.
 const MIN_POINTS: usize = 300;
-/// A wall is at least this high, in meters.
+/// Minimum height of a wall in meters.
 const MIN_WALL_HEIGHT_M: f64 = 0.4;
-/// Points with a larger standard deviation are not a wall, in meters.
+/// Maximum standard deviation of the points of a wall, in meters.
 const MAX_ROUGHNESS_M: f64 = 0.07;
-/// Maximum number of points that are stored of a sweep. Each sweep has the same share, because up and down sweeps can differ.
+/// Maximum number of points that are stored. Each sweep has the same share, because up and down sweeps can differ.
 const MAX_POINTS: usize = 40_000;
 
-/// Points of sweeps, until they are enough.
+/// Points of sweeps for a check of the mount's description.
 #[derive(Debug, Default)]
 pub struct MountCheck {
     points: Vec<[f64; 3]>,
     sweeps: u32,
-    /// Delay by which the angles of these sweeps are corrected, in ns.
+    /// Delay by which the angles of these sweeps were corrected, in ns.
     late_ns: i64,
 }
 
-/// A flat floor as the points show it.
+/// A flat floor, computed from the points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Floor {
-    /// Height of the floor at the axis, in meters. 0 if the mount is described right.
+    /// Height of the floor at the axis, in meters. It is 0 if the description of the mount is right.
     pub height_m: f64,
-    /// Angle in radians by which the mount looks lower than its description says.
+    /// Angle in radians by which the mount tilts lower than its description states.
     pub level_rad: f64,
-    /// Angle in radians by which the floor rises to the left, apart from that.
+    /// Remaining angle in radians by which the floor rises to the left.
     pub roll_rad: f64,
     /// Standard deviation of the points in meters.
     pub deviation_m: f64,
@@ -117,12 +117,12 @@ pub struct Floor {
     pub points: usize,
 }
 
-/// A wall ahead as the points show it.
+/// A wall ahead, computed from the points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Wall {
     /// Distance from the robot's origin at the floor, in meters.
     pub distance_m: f64,
-    /// Angle in radians by which its top is farther away than upright.
+    /// Angle in radians by which the wall leans backward.
     pub lean_rad: f64,
     /// Standard deviation of the points in meters.
     pub deviation_m: f64,
@@ -131,8 +131,8 @@ pub struct Wall {
 }
 
 impl MountCheck {
-    /// Takes the points of a complete sweep. If another delay corrects its angles than those of the sweeps before, the check
-    /// starts again with this sweep.
+    /// Adds the points of a complete sweep. If its angles were corrected by another delay than those of earlier sweeps,
+    /// the check restarts with this sweep.
     pub fn take(&mut self, sweep: &Sweep<'_>) {
         if !sweep.is_complete {
             return;
@@ -147,12 +147,12 @@ impl MountCheck {
         self.points.extend(near.step_by(every));
     }
 
-    /// Returns how many sweeps were taken.
+    /// Returns the number of sweeps since the start of the check.
     pub fn sweeps(&self) -> u32 {
         self.sweeps
     }
 
-    /// Returns the floor, if there are enough points on one plane.
+    /// Returns the floor, if enough points are on one plane.
     pub fn floor(&self, mount: &Mount) -> Option<Floor> {
         let is_low =
             |at: &&[f64; 3]| at[2].abs() < MAX_FLOOR_OFFSET_M && at[0].hypot(at[1]) < MAX_DISTANCE_M / 2.0;
@@ -164,7 +164,7 @@ impl MountCheck {
         if square == 0.0 {
             return None;
         }
-        // A turn around the axis moves a point up by kx y - ky x for each radian.
+        // A rotation around the axis moves a point up by kx y - ky x per radian.
         let length = (square + mount.axis[2].powi(2)).sqrt();
         let level_rad = (ahead * ky - left * kx) * length / square;
         let roll_rad = (ahead * kx + left * ky) / square.sqrt();
@@ -178,7 +178,7 @@ impl MountCheck {
         })
     }
 
-    /// Returns the wall ahead, within 45 degrees, with the largest area.
+    /// Returns the wall with the largest area within 45 degrees of the forward direction.
     pub fn wall(&self) -> Option<Wall> {
         let high: Vec<[f64; 3]> =
             self.points.iter().filter(|at| at[2] > MIN_WALL_POINT_HEIGHT_M && at[0] > 0.3).copied().collect();
@@ -188,11 +188,12 @@ impl MountCheck {
             let mut areas = [0.0; (MAX_DISTANCE_M / BIN_M) as usize + 2];
             for at in &high {
                 let distance = at[0] * yaw.cos() + at[1] * yaw.sin();
-                // Points of a side wall can be behind the origin.
+                // Points of a side wall can have a negative distance.
                 if distance >= 0.0
                     && let Some(area) = areas.get_mut((distance / BIN_M) as usize)
                 {
-                    // The beams diverge. Without this weight, a slice of near side walls has more points than a wall ahead.
+                    // The beams diverge. Without this weight, a part of a near side wall would have more points than a
+                    // wall ahead.
                     *area += at[0].powi(2) + at[1].powi(2);
                 }
             }
@@ -216,7 +217,7 @@ impl MountCheck {
             return None;
         }
         let plane = Plane::of(on).filter(|plane| plane.deviation < MAX_ROUGHNESS_M)?;
-        // The wall is not exactly across the direction in which it was found.
+        // The wall is not exactly perpendicular to the direction in which it was found.
         let [distance, slope, lean] = plane.terms;
         let across = slope.hypot(1.0);
         Some(Wall {
@@ -228,7 +229,7 @@ impl MountCheck {
     }
 }
 
-/// Terms whose sum is nearest to the values of most points.
+/// Coefficients of the plane with the smallest differences from the values of most points.
 struct Plane {
     terms: [f64; 3],
     deviation: f64,
@@ -236,7 +237,7 @@ struct Plane {
 }
 
 impl Plane {
-    /// Fits a plane by least squares; again and again without the points that are far away from it.
+    /// Fits a plane by least squares, up to 8 times, each time without the points that were far from the last plane.
     fn of(mut points: Vec<([f64; 3], f64)>) -> Option<Plane> {
         let mut plane = None;
         for _ in 0..8 {
@@ -320,8 +321,8 @@ mod tests {
         assert!(is_near(mount.origin(0.3 + FRAC_PI_2), [0.1, 0.0, 0.9]));
     }
 
-    /// Returns what a check finds in a room with a wall 3 m ahead and a box on its floor, if the mount is `real` and is described as
-    /// `told`.
+    /// Returns the result of a check in a room with a wall 3 m ahead and a box on the floor. The mount is `real`, and
+    /// its description is `described`.
     fn check_room(real: &Mount, described: &Mount) -> (Floor, Wall) {
         let mut points = Vec::new();
         for tenth in -150..450 {
@@ -358,7 +359,7 @@ mod tests {
         let grid =
             |points: usize| (0..points).map(|i| (0.005 * (i % 100) as f32, 0.1 * (i / 100 % 10) as f32));
         let ahead = grid(2000).map(|(y, z)| [3.0, 4.0 * y - 1.0, 0.4 + z]);
-        // In a direction to the left, all of it is behind the origin.
+        // Seen in a direction to the left, the whole wall has negative distances.
         let right = grid(2500).map(|(x, z)| [0.35 + 4.0 * x, -3.0 - 4.0 * x, 0.4 + z]);
         let points: Vec<Point> = ahead.chain(right).map(|at| Point { at, ..Point::default() }).collect();
         let mut check = MountCheck::default();
@@ -421,7 +422,7 @@ mod tests {
         assert!((floor.height_m - 0.05).abs() < 2e-3 && floor.level_rad.abs() < 2e-3, "{floor:?}");
         let (floor, _) = check_room(&real, &Mount { axis: [0.0, 1.0, 0.03], ..real });
         assert!(floor.roll_rad.abs() > 5e-3 && floor.level_rad.abs() < 5e-3, "{floor:?}");
-        // An arm that is 0.1 m too long makes the wall lean, and hardly tilts the floor.
+        // If the described arm is 0.1 m too long, the wall leans, but the floor is nearly level.
         let (floor, wall) = check_room(&real, &Mount { sensor_at: [0.06, 0.0, 1.04], ..real });
         assert!((wall.lean_rad + floor.level_rad).abs() > 5e-3, "{floor:?} {wall:?}");
     }

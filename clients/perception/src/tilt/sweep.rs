@@ -1,5 +1,5 @@
-//! Classifies the points of a sweep against the background, decides whether the angles of the sweep are reliable, and finds
-//! obstacles: clusters of points in three dimensions.
+//! Analysis of a sweep: it classifies the points against the background, decides whether the angles are reliable, and
+//! finds obstacles, which are clusters of points in three dimensions.
 
 use scanhub_schema::{MAX_OBSTACLES, Obstacle, PointClass};
 
@@ -12,18 +12,18 @@ const PART_COUNT: usize = 4;
 /// Minimum number of beams on known background for a check of the angles.
 const MIN_BEAMS: usize = 200;
 
-/// A beam with the mount's angle.
+/// A beam with the mount's angle at its time.
 #[derive(Clone, Copy)]
 pub(crate) struct Ray {
     pub(crate) time_ns: u64,
     pub(crate) angle_rad: f64,
     pub(crate) beam_rad: f64,
-    /// Infinite without a return.
+    /// Range in meters; infinite without a return.
     pub(crate) range_m: f32,
     pub(crate) beam: u16,
 }
 
-/// Background, and buffers for a sweep.
+/// Background, with the buffers for the analysis of a sweep.
 pub(crate) struct SweepAnalyzer {
     mount: Mount,
     settings: Settings,
@@ -31,16 +31,16 @@ pub(crate) struct SweepAnalyzer {
     /// Number of resets of the model.
     pub(crate) background_resets: u64,
     points: Vec<Point>,
-    /// Row of the model and reading of each beam.
+    /// Row of the model for each beam, with its reading.
     readings: Vec<(usize, Reading)>,
-    /// Error of the angle that each beam on a level surface shows.
+    /// Error of the angle that each beam on a level surface shows, in radians.
     off: Vec<f32>,
     /// Points that may belong to obstacles.
     standing: Vec<Candidate>,
-    /// Mount's angle and rise of the beam of each point.
+    /// Mount's angle in radians, and rise of the beam, for each point.
     beams: Vec<(f32, f32)>,
     clusters: Clusters,
-    /// Whether the floor has been where the angles put it since their last jump.
+    /// Whether the floor has been at its expected height since the last jump of the angles.
     is_confirmed: bool,
     /// Number of unreliable sweeps in a row.
     unreliable: u16,
@@ -64,19 +64,19 @@ impl SweepAnalyzer {
         }
     }
 
-    /// Starts with a new background for scans with this number of beams.
+    /// Starts a new background for scans with this number of beams.
     pub(crate) fn begin(&mut self, beams: usize, is_first: bool) {
         self.model = SurfaceModel::new(beams, &self.settings);
         self.background_resets += u64::from(!is_first);
     }
 
-    /// Marks the angles as unreliable after a jump, until the floor is where they put it.
+    /// Marks the angles as unreliable after a jump, until the floor is at its expected height.
     pub(crate) fn mark_unreliable(&mut self) {
         self.is_confirmed = false;
     }
 
-    /// Forgets the background, because all angles are corrected from now on. If the last sweep contradicted the background,
-    /// the angles were right when it was learned, and it stays.
+    /// Clears the background, because all angles are corrected from now on. If the last sweep contradicted the
+    /// background, it was learned with right angles and is kept.
     pub(crate) fn correct(&mut self) {
         if self.unreliable == 0 {
             self.model.clear();
@@ -112,8 +112,8 @@ impl SweepAnalyzer {
         Sweep { is_unreliable, generation, points: &self.points, obstacles, dropped, ..sweep }
     }
 
-    /// Computes the points of the rays. Returns the number of rays whose cell has a known background, and the number
-    /// of these that are elsewhere.
+    /// Computes the points of the rays. Returns the number of rays whose cell has a known background, and the number of
+    /// these whose range differs from it.
     fn compare(&mut self, rays: &[Ray]) -> (usize, usize) {
         self.points.clear();
         self.readings.clear();
@@ -140,8 +140,7 @@ impl SweepAnalyzer {
         (known, elsewhere)
     }
 
-    /// Returns whether the level surfaces of the background are where they would be if the angles of a part of the sweep were
-    /// off.
+    /// Returns whether the angles in a part of the sweep are wrong, judging by the level surfaces of the background.
     fn is_angle_off(&mut self) -> bool {
         let most = self.settings.max_error_rad as f32;
         let part = (self.off.len() / PART_COUNT).max(MIN_BEAMS);
@@ -158,7 +157,7 @@ impl SweepAnalyzer {
         }
     }
 
-    /// Picks the points that may belong to obstacles.
+    /// Collects the points that may belong to obstacles.
     fn pick_candidates(&mut self) {
         let near = self.settings.near;
         for (point, &(angle_rad, rise)) in self.points.iter().zip(&self.beams) {
@@ -176,37 +175,37 @@ impl SweepAnalyzer {
 }
 
 impl Ray {
-    /// Returns the row of the background for this ray, and the reading.
+    /// Returns the row of the background for this ray, and its reading.
     fn reading(&self, mount: &Mount, settings: &Settings) -> (usize, Reading) {
         row_for(mount, settings, (self.angle_rad, self.beam_rad), self.beam, self.range_m)
     }
 }
 
-/// A point that can belong to an obstacle.
+/// A point that may belong to an obstacle.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Candidate {
     pub(crate) at: [f32; 3],
-    /// Flags of an obstacle with this point.
+    /// Flags of an obstacle that contains this point.
     pub(crate) flags: u8,
-    /// Angle of the mount.
+    /// Mount's angle in radians.
     pub(crate) angle_rad: f32,
-    /// Height that the beam gains with each meter, -1 to 1.
+    /// Height that the beam gains per meter, -1 to 1.
     pub(crate) rise: f32,
 }
 
-/// Obstacle with the beams that met it.
+/// An obstacle, with properties of the beams that met it.
 struct ObstacleCluster {
     obstacle: Obstacle,
-    /// Lowest and highest angle of the mount.
+    /// Minimum and maximum angle of the mount in radians.
     angles_rad: [f32; 2],
     /// Maximum absolute rise of the beams.
     rise: f32,
 }
 
 impl ObstacleCluster {
-    /// Returns whether a level surface, which stands always, can be all of it. Nearly level beams graze a top in few sweeps,
-    /// each time at another range, and in a span of the mount's angle that is smaller than the distance between two scans. An
-    /// object that is put down is higher.
+    /// Returns whether the cluster may be only a level surface that always exists. Nearly level beams graze a top in
+    /// few sweeps, each time at another range, and in a range of the mount's angle that is smaller than the distance
+    /// between two scans. An object that was put down is higher.
     fn is_grazed(&self) -> bool {
         let [low, high] = self.angles_rad;
         self.obstacle.flags & Obstacle::NEAR == 0
@@ -215,26 +214,26 @@ impl ObstacleCluster {
     }
 }
 
-/// Span of the mount's angle in which beams graze a top: 0.4 degrees.
+/// Maximum range of the mount's angle in which beams graze a top: 0.4 degrees, in radians.
 const MAX_GRAZED_RAD: f32 = 0.007;
-/// Beams that rise or fall more meet a top in more than one scan.
+/// Maximum absolute rise of beams that graze a top. Steeper beams meet a top in more than one scan.
 const MAX_GRAZING_RISE: f32 = 0.1;
 
 /// Finds obstacles: clusters of points whose cubes touch.
 #[derive(Default)]
 pub(crate) struct Clusters {
-    /// Cube and index of each point, in the order of the cubes.
+    /// Cube of each point with the point's index, sorted by cube.
     cubes: Vec<([i16; 3], u32)>,
-    /// Whether each cube has not been reached yet, by its first point.
+    /// Whether the search has not reached the cube that starts at this point.
     open: Vec<bool>,
-    /// Cubes at the front of the search, by their first points.
+    /// Cubes at the front of the search, by the index of their first point.
     front: Vec<usize>,
     found: Vec<Obstacle>,
 }
 
 impl Clusters {
-    /// Returns the obstacles with at least `least` points, the nearest first, and the number of obstacles beyond the
-    /// maximum.
+    /// Returns the obstacles with at least the given number of points, the nearest first, and the number of obstacles
+    /// beyond the maximum.
     pub(crate) fn find(
         &mut self,
         points: &[Candidate],
@@ -346,7 +345,7 @@ mod tests {
         assert!((pole.middle[2] - 0.475).abs() < 1e-6);
     }
 
-    /// The same by the definition: pairs of points whose cubes touch have the same name, until nothing changes.
+    /// Computes the sizes by definition: points whose cubes touch get the same name, until nothing changes.
     fn reference_cluster_sizes(points: &[[f32; 3]], cube_m: f32, min_size: usize) -> Vec<usize> {
         let cube = |at: &[f32; 3]| at.map(|value| (value / cube_m).floor() as i32);
         let mut names: Vec<usize> = (0..points.len()).collect();

@@ -1,5 +1,5 @@
-//! Assigns legs to the expected positions of legs, so that the sum of the gains is maximal. Pairs without competition are
-//! assigned at once; the others go to a solver.
+//! Assignment of legs to the expected positions of legs, so that the sum of the gains is maximal. Pairs without
+//! competition are assigned at once, and a solver assigns the others.
 
 use pathfinding::matrix::Matrix;
 use pathfinding::prelude::kuhn_munkres;
@@ -9,23 +9,23 @@ use pathfinding::prelude::kuhn_munkres;
 pub(crate) struct Edge {
     pub(crate) leg: usize,
     pub(crate) target: usize,
-    /// Gain compared with leaving both unassigned. Always more than 0.
+    /// Gain compared with leaving both unassigned. It is always positive.
     pub(crate) gain: f64,
 }
 
-/// Solver with its buffers.
+/// Solver of assignments, with its buffers.
 #[derive(Default)]
 pub(crate) struct Assignment {
-    /// Group of each leg, and then of each position.
+    /// Group of each leg, followed by the group of each position.
     group: Vec<usize>,
     legs: Vec<usize>,
     targets: Vec<usize>,
-    /// Group and index of each edge.
+    /// Group and index of each edge, sorted.
     order: Vec<(usize, usize)>,
 }
 
 impl Assignment {
-    /// Appends each leg with its position to `pairs`, so that the sum of the gains is maximal.
+    /// Adds each assigned leg with its position to `pairs`, so that the sum of the gains is maximal.
     pub(crate) fn solve(
         &mut self,
         (legs, targets): (usize, usize),
@@ -43,7 +43,7 @@ impl Assignment {
             let root = self.root(edge.leg);
             self.order.push((root, i));
         }
-        // By group, in the order of the edges.
+        // Sort by group, and within a group in the order of the edges.
         self.order.sort_unstable();
         let order = std::mem::take(&mut self.order);
         for group in order.chunk_by(|a, b| a.0 == b.0) {
@@ -67,7 +67,7 @@ impl Assignment {
     }
 
     fn compete(&self, edges: &[Edge], group: &[(usize, usize)], pairs: &mut Vec<(usize, usize)>) {
-        // Usually the two legs of one person.
+        // The most frequent case: two legs of one person.
         if let (&[leg, other_leg], &[target, other_target]) = (&self.legs[..], &self.targets[..]) {
             let find = |leg: usize, target: usize| {
                 group.iter().map(|&(_, i)| &edges[i]).find(|one| (one.leg, one.target) == (leg, target))
@@ -99,7 +99,7 @@ impl Assignment {
         }
     }
 
-    /// Returns the number of elements that memory is allocated for.
+    /// Returns the number of elements for which memory is allocated.
     #[cfg(test)]
     pub(crate) fn capacity(&self) -> usize {
         self.group.capacity() + self.legs.capacity() + self.targets.capacity() + self.order.capacity()
@@ -118,7 +118,7 @@ impl Assignment {
 mod tests {
     use super::*;
 
-    /// The slow algorithm: each leg with each free position, or with none.
+    /// Returns the best sum by trying each leg with each free position, or with none.
     fn best(edges: &[Edge], leg: usize, legs: usize, taken: u32) -> f64 {
         if leg == legs {
             return 0.0;

@@ -1,6 +1,6 @@
-//! Points, segments and polygons of a plan, in meters.
+//! Points, segments and polygons of a map, in meters.
 
-/// A point in the frame of the map: x to the right, y up, in meters.
+/// A point in the map: x to the right, y up, in meters.
 pub type Point = [f64; 2];
 
 /// Returns `a - b`.
@@ -13,7 +13,7 @@ pub fn length2([x, y]: Point) -> f64 {
     x * x + y * y
 }
 
-/// Returns the distance of two points.
+/// Returns the distance between two points.
 pub fn distance(a: Point, b: Point) -> f64 {
     length2(minus(a, b)).sqrt()
 }
@@ -28,12 +28,12 @@ pub fn dot(a: Point, b: Point) -> f64 {
     a[0] * b[0] + a[1] * b[1]
 }
 
-/// Returns the cross product: positive if `b` is counter-clockwise of `a`.
+/// Returns the cross product. It is positive if `b` is counterclockwise of `a`.
 pub fn cross(a: Point, b: Point) -> f64 {
     a[0] * b[1] - a[1] * b[0]
 }
 
-/// Returns the distance of `point` from the nearest point of a segment.
+/// Returns the distance between `point` and the nearest point of a segment.
 pub fn distance_to_segment(point: Point, [a, b]: [Point; 2]) -> f64 {
     let along = minus(b, a);
     let length2 = along[0] * along[0] + along[1] * along[1];
@@ -43,8 +43,8 @@ pub fn distance_to_segment(point: Point, [a, b]: [Point; 2]) -> f64 {
     distance(point, [a[0] + share * along[0], a[1] + share * along[1]])
 }
 
-/// Returns where on the first segment (0 its begin, 1 its end) it crosses the second one, if it does. Segments that only
-/// touch with an end, or lie on one line, do not cross.
+/// Returns the position on the first segment at which it crosses the second one, from 0 at its start to 1 at its end.
+/// Segments that only touch at an end, or lie on one line, do not cross.
 pub fn crossing([a, b]: [Point; 2], [c, d]: [Point; 2]) -> Option<f64> {
     let (first, second) = (minus(b, a), minus(d, c));
     let across = cross(first, second);
@@ -57,17 +57,17 @@ pub fn crossing([a, b]: [Point; 2], [c, d]: [Point; 2]) -> Option<f64> {
     (inside(on_first) && inside(on_second)).then_some(on_first)
 }
 
-/// Returns the sides of a polygon, the last one back to its first corner.
+/// Returns the sides of a polygon. The last one leads back to the first corner.
 pub fn sides(polygon: &[Point]) -> impl Iterator<Item = [Point; 2]> + '_ {
     polygon.iter().zip(polygon.iter().cycle().skip(1)).map(|(&a, &b)| [a, b])
 }
 
-/// Returns the area, positive if the corners go counter-clockwise.
+/// Returns the area of a polygon in square meters. It is positive if the corners run counterclockwise.
 pub fn area(polygon: &[Point]) -> f64 {
     sides(polygon).map(|[a, b]| cross(a, b)).sum::<f64>() / 2.0
 }
 
-/// Returns whether `point` is inside, by the number of sides that a ray from it crosses.
+/// Returns whether `point` is inside a polygon, by the number of sides that a ray from it crosses.
 pub fn contains(polygon: &[Point], point: Point) -> bool {
     let crossed = sides(polygon).filter(|&[a, b]| {
         (a[1] > point[1]) != (b[1] > point[1])
@@ -76,18 +76,19 @@ pub fn contains(polygon: &[Point], point: Point) -> bool {
     crossed.count() % 2 == 1
 }
 
-/// Returns the distance of `point` from the nearest side.
+/// Returns the distance between `point` and the nearest side.
 pub fn distance_to_border(polygon: &[Point], point: Point) -> f64 {
     sides(polygon).map(|side| distance_to_segment(point, side)).fold(f64::INFINITY, f64::min)
 }
 
-/// Returns whether two polygons have more than their borders in common: `tolerance_m` of overlap is allowed, for plans are
-/// measured by hand.
+/// Returns whether two polygons overlap by more than `tolerance_m`, which is allowed because plans are measured by
+/// hand.
 pub fn overlap(first: &[Point], second: &[Point], tolerance_m: f64) -> bool {
     let deep =
         |outer: &[Point], point| contains(outer, point) && distance_to_border(outer, point) > tolerance_m;
     let reaches_in = |outer: &[Point], inner: &[Point]| {
-        // Corners may all lie outside of each other: points on the sides and the middle tell a cross and a copy.
+        // All corners may lie outside the other polygon. Points on the sides and the middle detect crossed and equal
+        // polygons.
         let centre = inner.iter().fold([0.0, 0.0], |sum, point| [sum[0] + point[0], sum[1] + point[1]]);
         let centre = [centre[0] / inner.len() as f64, centre[1] / inner.len() as f64];
         (contains(inner, centre) && deep(outer, centre))
@@ -137,7 +138,7 @@ mod tests {
 
     #[test]
     fn contains_agrees_with_the_sum_of_angles() {
-        // The slow way: corners seen from inside go once around.
+        // Compare with the sum of the angles under which the sides are seen. It is a full turn for a point inside.
         let polygon = [[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]];
         let mut random = fastrand::Rng::with_seed(4);
         for _ in 0..2_000 {

@@ -1,55 +1,55 @@
-//! Likelihood that a person who comes into view is one who went where no sensor looks. It follows from position, walking speed
-//! and time, and from the gaps of the site.
+//! Likelihood that a person who comes into view is one who went out of the sensors' view. It is computed from position,
+//! walking speed and time, and from the gaps of the site.
 
 use super::geometry::{Point, distance_to_segment, length2, middle, minus};
 use super::site::Site;
 
 /// Maximum time of a path that is not in the site file, in seconds.
 pub(crate) const MAX_GAP_S: f64 = 60.0;
-/// Spread of the logarithm of a person's speed around their pace.
+/// Standard deviation of the logarithm of a person's speed, relative to their pace.
 const PACE_SPREAD: f64 = 0.2;
-/// Share of people who walk on without a stop, if they walked when they were last seen, and if they stood.
+/// Share of people who walk on without a stop: those who walked when they were last seen, and those who stood.
 const CONTINUE_SHARE_WALKING: f64 = 0.6;
 const CONTINUE_SHARE_STANDING: f64 = 0.3;
-/// Share of people who stay at their position, and the time for which they do, in seconds.
+/// Share of people who stay at their position, and the time for which they stay, in seconds.
 const STAY_SHARE: f64 = 0.4;
 const STAY_TIME_S: f64 = 4.0;
 /// Share of people who turn back.
 const TURN_BACK_SHARE: f64 = 0.04;
-/// Minimum speed of a person who walks.
+/// Minimum speed of a person who walks on, in m/s.
 const MIN_WALKING_SPEED_M_S: f64 = 0.5;
-/// Minimum speed of a person who goes back.
+/// Minimum speed of a person who turns back, in m/s.
 const MIN_RETURN_SPEED_M_S: f64 = 0.35;
-/// Standard deviations of positions along and across the path. Across, it grows per second, up to the width of a
-/// path.
+/// Standard deviations of positions along and across the path, in meters. The one across grows per second, up to the
+/// width of a path.
 const ALONG_M: f64 = 0.25;
 const ACROSS_M: f64 = 0.25;
 const ACROSS_M_S: f64 = 0.3;
 const MAX_ACROSS_M: f64 = 0.7;
-/// Likelihood of a person who is earlier or much later than the gap allows.
+/// Likelihood of a person who arrives earlier or much later than the gap allows.
 const MIN_LIKELIHOOD: f64 = 1e-6;
-/// Length of a path with an unknown end.
+/// Length of a path with an unknown end, in meters.
 const DEFAULT_PATH_M: f64 = 5.0;
 
 /// A person who is out of sight.
 pub(crate) struct DepartedPerson {
     /// Door through which they went.
     pub(crate) entry: Option<usize>,
-    /// Last position, and speed in m/s.
+    /// Last position in the map, and speed in m/s.
     pub(crate) at: Point,
     pub(crate) speed: f64,
     /// Walking speed in m/s.
     pub(crate) pace: f64,
 }
 
-/// A person who came into view.
+/// A person who has come into view.
 pub(crate) struct ArrivedPerson {
     /// Nearest door.
     pub(crate) exit: usize,
     /// Position at which they were first seen.
     pub(crate) at: Point,
     pub(crate) velocity: Point,
-    /// Whether they are behind that door, in a room with sensors.
+    /// Whether they are beyond that door, in a room with sensors.
     pub(crate) is_out: bool,
 }
 
@@ -60,14 +60,14 @@ impl Site {
         found.map_or([0.0, MAX_GAP_S], |gap| gap.seconds)
     }
 
-    /// Returns the likelihood per square meter that `gone`, who went out of sight `after_s` seconds ago, is at the position of
-    /// `new`. The person is assumed to be still on the path: they walk on at their pace, walk on after a stop, stay, or turn
-    /// back.
+    /// Returns the likelihood per square meter that `departed`, who went out of sight `after_s` seconds ago, is at the
+    /// position of `arrived`. The model is that people are still on the path, and walk on at their pace, walk on after
+    /// a stop, stay, or turn back.
     pub(crate) fn likelihood(&self, departed: &DepartedPerson, arrived: &ArrivedPerson, after_s: f64) -> f64 {
         let t = after_s.max(0.0);
         let off = minus(arrived.at, departed.at);
         let far_m = length2(off).sqrt();
-        // The distance that they would be ahead, the length of the rest of the path, and the speed ahead.
+        // Distance that they would be ahead, length of the rest of the path, and speed ahead.
         let (ahead_m, rest_m, speed) = match departed.entry {
             Some(entry) => {
                 let door = self.doors[entry].between;
@@ -119,13 +119,13 @@ impl Site {
     }
 }
 
-/// Density of a normal distribution at `x`.
+/// Returns the density of a normal distribution at `x`.
 fn normal(x: f64, sigma: f64) -> f64 {
     (-x * x / (2.0 * sigma * sigma)).exp() / (sigma * (2.0 * std::f64::consts::PI).sqrt())
 }
 
-/// Probability that a standard normal number is less than `z`: the error function by Abramowitz and Stegun 7.1.26,
-/// within 2e-7.
+/// Returns the probability that a standard normal number is less than `z`, with the error function of Abramowitz and
+/// Stegun 7.1.26, which is exact within 2e-7.
 fn normal_below(z: f64) -> f64 {
     let x = z.abs() / std::f64::consts::SQRT_2;
     let t = 1.0 / (1.0 + 0.327_591_1 * x);
@@ -187,7 +187,7 @@ seconds = [2, 15]
         let (stays, flies) =
             (site.likelihood(&from_left, &stands, 0.4), site.likelihood(&from_right, &stands, 0.4));
         assert!(stays > 10.0 * flies, "{stays} and {flies}");
-        // The gap says at least 2 s, and at most 15.
+        // The gap allows at least 2 s, and at most 15 s.
         assert!(site.likelihood(&from_right, &new(6.0, -1.0), 1.0) < 1e-4);
         assert!(site.likelihood(&from_right, &new(6.0, -1.0), 31.0) < 1e-4);
     }

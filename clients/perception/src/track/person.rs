@@ -1,8 +1,8 @@
-//! One person as the tracker follows them: the evidence for and against the person, and a linear Kalman filter of position and
-//! velocity.
+//! State of a tracked person: the evidence for and against them, and a linear Kalman filter of position and velocity.
 //!
 //! The state of the filter is the middle between the legs with its velocity, and half of the vector from one leg to the
-//! other, which swings. A leg is at the middle plus or minus this half. Both coordinates have the same covariance.
+//! other, which oscillates. A leg is at the middle plus or minus this half vector. Both coordinates have the same
+//! covariance.
 
 use nalgebra::{Matrix4, Matrix4x2, RowVector2, Vector4};
 use scanhub_schema::TrackState;
@@ -11,7 +11,7 @@ use super::geometry::{Point, distance};
 use super::sensor_view::Leg;
 use super::site::MAX_SENSORS;
 
-/// One person.
+/// State of one tracked person.
 pub(crate) struct Person {
     pub(crate) id: u64,
     pub(crate) filter: Filter,
@@ -21,13 +21,13 @@ pub(crate) struct Person {
     /// Position at which they were first seen.
     pub(crate) first_position: Point,
     pub(crate) phase: TrackPhase,
-    /// Time at which a leg of theirs was last seen.
+    /// Time at which one of their legs was last seen.
     pub(crate) last_seen_ns: u64,
-    /// Time at which a leg of theirs was last seen outside the ignored areas.
+    /// Time at which one of their legs was last seen outside the ignored areas.
     pub(crate) last_free_ns: u64,
-    /// Time at which each sensor last saw them. 0 before the first time.
+    /// Time at which each sensor last saw them; 0 if it has not.
     pub(crate) seen_by_ns: [u64; MAX_SENSORS],
-    /// Number of scans that are evidence for them, at most [`MAX_SUPPORT`]. One of a slow sensor counts up to twice.
+    /// Number of scans that are evidence for them, at most [`MAX_SUPPORT`]. A scan of a slow sensor counts up to twice.
     pub(crate) support: f64,
     /// Number of scans that showed both legs.
     pub(crate) pairs: f64,
@@ -36,9 +36,9 @@ pub(crate) struct Person {
     /// Walking speed in m/s.
     pub(crate) pace: f64,
     pub(crate) room: Option<usize>,
-    /// Door through which they were seen to enter that room.
+    /// Door through which they entered the room, if that was seen.
     pub(crate) entry_door: Option<usize>,
-    /// Share of the recent scans of them that show both legs.
+    /// Share of their recent scans that show both legs.
     pub(crate) both: f64,
 }
 
@@ -47,7 +47,7 @@ pub(crate) struct Person {
 pub(crate) enum TrackPhase {
     Tentative,
     Known,
-    /// Out of sight since this time, after going through this door.
+    /// Out of sight since this time, after passing through this door.
     Away {
         since_ns: u64,
         door: usize,
@@ -57,16 +57,16 @@ pub(crate) enum TrackPhase {
 /// Minimum number of scans that confirm a person.
 const MIN_SCANS: f64 = 8.0;
 pub(crate) const MAX_SUPPORT: f64 = 20.0;
-/// Maximum period of a sensor whose scans count once. Scans of a slower sensor count up to twice; otherwise it would
-/// take a second to confirm a person at 7.5 Hz.
+/// Maximum period of a sensor whose scans count once, in seconds. Scans of a slower sensor count up to twice.
+/// Otherwise, it would take a second to confirm a person at 7.5 Hz.
 const FULL_WEIGHT_PERIOD_S: f64 = 0.0625;
-/// Minimum number of beams on a leg that is certainly not the leg of a chair.
+/// Minimum number of beams on a leg for which a chair leg can be excluded.
 const MIN_CLEAR_BEAMS: usize = 4;
-/// Weight of a leg with fewer beams, compared with a sensor that sees through the position.
+/// Weight of a leg with fewer beams, compared with a scan that sees through the position.
 pub(crate) const COARSE_WEIGHT: f64 = 0.5;
-/// Minimum age of a confirmed person.
+/// Minimum age of a person who can be confirmed, in ns.
 const MIN_TRACK_AGE_NS: u64 = 300_000_000;
-/// A person who was seen within this time is not hidden.
+/// Time after the last sighting during which a person does not count as hidden, in ns.
 const RECENT_NS: u64 = 250_000_000;
 
 impl Person {
@@ -95,7 +95,7 @@ impl Person {
         }
     }
 
-    /// Moves the filter to `at_ns`.
+    /// Predicts the filter's state at `at_ns`.
     pub(crate) fn predict(&mut self, at_ns: u64) {
         if at_ns > self.at_ns {
             let dt = (at_ns - self.at_ns) as f64 * 1e-9;
@@ -105,12 +105,12 @@ impl Person {
         }
     }
 
-    /// Handles a scan of `sensor`, `since_s` after its last one, that showed `legs` of the person, one of them with this number of
-    /// `beams`.
+    /// Handles a scan of `sensor` that showed `legs` legs of the person, one of them with this number of `beams`. The
+    /// sensor's previous scan was `since_s` earlier.
     pub(crate) fn on_detection(&mut self, sensor: usize, since_s: f64, legs: usize, beams: usize) {
         self.last_seen_ns = self.at_ns;
         self.seen_by_ns[sensor] = self.at_ns;
-        // A few beams may also be on the leg of a chair, so another sensor may contradict.
+        // A few beams may also be on a chair leg, so another sensor may contradict.
         self.absent_s =
             if beams < MIN_CLEAR_BEAMS { (self.absent_s - COARSE_WEIGHT * since_s).max(0.0) } else { 0.0 };
         let both = if legs > 1 { 1.0 } else { 0.0 };
@@ -119,7 +119,7 @@ impl Person {
         self.support = (self.support + (since_s / FULL_WEIGHT_PERIOD_S).clamp(1.0, 2.0)).min(MAX_SUPPORT);
         let speed = self.speed();
         if speed > 0.5 {
-            // A person who turns or gives way is slower than their pace.
+            // A person who turns or gives way is slower than their pace, so adapt more slowly to a lower speed.
             self.pace += if speed > self.pace { 0.03 } else { 0.01 } * (speed - self.pace);
         }
     }
@@ -129,7 +129,7 @@ impl Person {
         (x * x + y * y).sqrt()
     }
 
-    /// Returns whether this is certainly a person: seen often enough, with two legs, or in motion.
+    /// Returns whether this is certainly a person: seen often enough, and with two legs or in motion.
     pub(crate) fn is_certain(&self) -> bool {
         let walked_m = distance(self.filter.position(), self.first_position);
         self.support >= MIN_SCANS
@@ -150,7 +150,7 @@ impl Person {
         }
     }
 
-    /// Returns the sensors that have seen them within the last 250 ms, as bits.
+    /// Returns the sensors that have seen them within the last 250 ms. Bit i stands for the sensor with index i.
     pub(crate) fn sensors(&self, now_ns: u64) -> u32 {
         let is_recent = |&at: &u64| at > 0 && now_ns.saturating_sub(at) <= RECENT_NS;
         (0..)
@@ -163,12 +163,12 @@ impl Person {
 
 /// Spectral density of the body's acceleration, m2/s3.
 const BODY_NOISE: f64 = 0.6;
-/// Angular frequency of the swing of legs in rad/s: 0.8 double steps a second.
+/// Angular frequency of the oscillation of legs in rad/s: 0.8 double steps per second.
 const SWING_RATE_RAD_S: f64 = 5.0;
-/// Damping of the swing as a share of the critical damping.
+/// Damping of the oscillation as a share of the critical damping.
 const DAMPING: f64 = 0.5;
-/// Spectral density of a leg's acceleration in m2/s3. With the two constants above, a leg is 0.14 m away from the
-/// middle.
+/// Spectral density of a leg's acceleration in m2/s3. With the two constants above, the distance of a leg from the
+/// middle is 0.14 m.
 const LEG_NOISE: f64 = 5.0;
 /// Maximum length of a prediction step in seconds, and maximum number of steps.
 const MAX_STEP_S: f64 = 0.05;
@@ -184,10 +184,10 @@ pub(crate) enum Side {
     Minus,
 }
 
-/// The filter of one person.
+/// Kalman filter of one person.
 #[derive(Clone, Debug)]
 pub(crate) struct Filter {
-    /// Rows: middle, velocity, half vector between the legs, its velocity. Columns: x and y.
+    /// Rows: middle, velocity of the middle, half vector between the legs, and its velocity. Columns: x and y.
     state: Matrix4x2<f64>,
     covariance: Matrix4<f64>,
 }
@@ -202,7 +202,7 @@ impl Side {
 }
 
 impl Filter {
-    /// Creates the filter of a person whose one leg is seen.
+    /// Creates the filter of a person of whom one leg is seen.
     pub(crate) fn of_leg(at: Point, sigma_m: f64) -> Filter {
         let mut covariance = Matrix4::zeros();
         let half = INITIAL_HALF_M * INITIAL_HALF_M;
@@ -217,8 +217,8 @@ impl Filter {
         Filter { state, covariance }
     }
 
-    /// Predicts the state `dt` seconds later, in steps that are short compared with a swing. If `fades`, the person
-    /// is not seen, and the velocity decays.
+    /// Predicts the state `dt` seconds later, in steps that are short compared with a double step. If `fades` is set,
+    /// the person is not seen, and the velocity decays.
     pub(crate) fn predict(&mut self, dt: f64, fades: bool) {
         let steps = (dt / MAX_STEP_S).ceil().clamp(1.0, MAX_STEPS);
         (0..steps as usize).for_each(|_| self.step(dt / steps, fades));
@@ -243,7 +243,7 @@ impl Filter {
         }
     }
 
-    /// Returns the expected position of a leg, and the variance of each coordinate.
+    /// Returns the expected position of a leg, and the variance of each coordinate in m2.
     pub(crate) fn leg(&self, side: Side) -> (Point, f64) {
         let row = side.row();
         let at = row.transpose() * self.state;
@@ -276,12 +276,12 @@ impl Filter {
         [self.state[(2, 0)], self.state[(2, 1)]]
     }
 
-    /// Returns the variance of each coordinate of the position.
+    /// Returns the variance of each coordinate of the position in m2.
     pub(crate) fn variance(&self) -> f64 {
         self.covariance[(0, 0)]
     }
 
-    /// Stops the person at `place`, in front of a wall.
+    /// Stops the person at `position`, in front of a wall.
     pub(crate) fn stop(&mut self, position: Point) {
         self.state.set_row(0, &RowVector2::new(position[0], position[1]));
         self.state.set_row(1, &RowVector2::zeros());
@@ -328,7 +328,7 @@ mod tests {
 
     #[test]
     fn agrees_with_the_textbook_form_by_whole_matrices() {
-        // The slow algorithm: eight states, with both coordinates and both legs measured at once.
+        // Textbook form: eight states, with both coordinates and both legs measured at once.
         let mut random = fastrand::Rng::with_seed(2);
         let mut filter = Filter::of_leg([1.0, 2.0], 0.03);
         for _ in 0..200 {

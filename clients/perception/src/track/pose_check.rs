@@ -1,5 +1,6 @@
-//! Detects sensors that are not where the site file says. When two sensors see legs at the same time, each pair of legs votes
-//! for an offset between the sensors. Votes from different people scatter; votes from the same person agree.
+//! Detection of sensors that are not at their positions in the site file. When two sensors see legs at the same time,
+//! each pair of legs votes for an offset between the sensors. Votes from different people scatter, and votes from the
+//! same person agree.
 
 use super::MisplacedSensor;
 use super::geometry::Point;
@@ -10,20 +11,21 @@ const CELL_M: f64 = 0.1;
 /// Number of cells on each side of a zero offset.
 const REACH_CELLS: usize = 10;
 const GRID_WIDTH: usize = 2 * REACH_CELLS + 1;
-/// Number of votes that are evaluated.
+/// Number of votes after which they are evaluated and cleared.
 const MIN_VOTES: u32 = 2_000;
-/// Minimum offset. A smaller one may be the two legs of a person who walks from sensor to sensor.
+/// Minimum offset in meters that is reported. A smaller one may come from the two legs of a person who walks from
+/// sensor to sensor.
 const MIN_OFFSET_M: f64 = 0.35;
-/// Minimum share of the votes that agree, and their minimum ratio to the votes for no offset.
+/// Minimum share of the votes that agree, and minimum ratio of these to the votes for no offset.
 const MIN_AGREEING_SHARE: f64 = 0.12;
 const MIN_VOTE_RATIO: u32 = 3;
-/// Maximum standard deviation of a leg that votes.
+/// Maximum standard deviation of a leg that votes, in meters.
 const MAX_SIGMA_M: f64 = 0.065;
 
 /// Votes of all pairs of sensors.
 pub(crate) struct PoseVotes {
     sensors: usize,
-    /// By the index of the later sensor in the site, and then of the earlier one. `None` before the first vote.
+    /// Votes at index `sensor * sensors + other`, where `sensor` comes later in the site. `None` before the first vote.
     pairs: Vec<Option<Box<Votes>>>,
 }
 
@@ -37,8 +39,8 @@ impl PoseVotes {
         PoseVotes { sensors, pairs: (0..sensors * sensors).map(|_| None).collect() }
     }
 
-    /// Takes the legs that two sensors see at the same time. Returns the offset of the later sensor in the site once
-    /// it is known. Its votes then restart.
+    /// Adds the votes of the legs that two sensors see at the same time. Once the votes agree, returns the offset of
+    /// the sensor that comes later in the site. Its votes are then cleared.
     pub(crate) fn take(&mut self, one: (usize, &[Leg]), two: (usize, &[Leg])) -> Option<MisplacedSensor> {
         let ((other, other_legs), (sensor, own)) = if one.0 < two.0 { (one, two) } else { (two, one) };
         for leg in own.iter().filter(|leg| has_vote(leg)) {
@@ -66,7 +68,7 @@ fn has_vote(leg: &Leg) -> bool {
 }
 
 fn cell(off: Point) -> Option<usize> {
-    // Cells lie around the multiples of their side.
+    // Cells are centered on the multiples of their side.
     let [x, y] = off.map(|value| value * (1.0 / CELL_M) + (REACH_CELLS as f64 + 0.5));
     let is_in = |value: f64| (0.0..GRID_WIDTH as f64).contains(&value);
     (is_in(x) && is_in(y)).then_some(y as usize * GRID_WIDTH + x as usize)
@@ -79,7 +81,8 @@ impl Default for Votes {
 }
 
 impl Votes {
-    /// Returns the offset that most votes are for. `None` if they are for no offset, or do not agree.
+    /// Returns the offset with the most votes. Returns `None` if most votes are for a zero offset, or the votes do not
+    /// agree.
     fn offset(&self) -> Option<Point> {
         let inner = || (1..GRID_WIDTH - 1).flat_map(|y| (1..GRID_WIDTH - 1).map(move |x| (x, y)));
         let (x, y) = inner().max_by_key(|&at| self.votes_around(at))?;
@@ -108,7 +111,7 @@ mod tests {
     use super::*;
     use crate::track::sensor_view::DoorProximity;
 
-    /// Returns the result for three people who stand anywhere, if the second sensor is off by `off`.
+    /// Returns the result for three people at random positions, if the second sensor is misplaced by `off`.
     fn detect_misplaced(off: Point) -> Option<MisplacedSensor> {
         let mut random = fastrand::Rng::with_seed(4);
         let mut poses = PoseVotes::new(3);

@@ -1,5 +1,5 @@
-//! One scan as a sensor of the site sees it: its range in each direction, the legs in it, and whether a position is occupied,
-//! free or occluded.
+//! View of one sensor in its last scan: the range in each direction, the legs, and whether a position is occupied, free
+//! or occluded.
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 
@@ -12,97 +12,99 @@ use super::site::{Sensor, Site};
 pub(crate) const MAX_LEGS: usize = 64;
 /// Radius of a leg with its trousers, in meters.
 pub(crate) const LEG_M: f64 = 0.06;
-/// Maximum width of a leg. A wider object is two legs next to each other.
+/// Maximum width of a leg in meters. A wider object is two adjacent legs.
 const MAX_LEG_WIDTH_M: f64 = 0.26;
-/// Minimum width of a leg with its trousers. The legs of chairs and tables are thinner.
+/// Minimum width of a leg with its trousers, in meters. The legs of chairs and tables are thinner.
 const MIN_LEG_WIDTH_M: f64 = 0.09;
-/// Diameter of the spot of a beam at the scanner, and its growth with the range: an LMS 2xx, the widest of the supported
-/// scanners.
+/// Diameter of a beam's light spot at the scanner in meters, and its growth with the range, for an LMS 2xx, which has
+/// the widest spot of the supported scanners.
 const SPOT_M: f64 = 0.01;
 const SPOT_RAD: f64 = 0.0045;
-/// Minimum width of a surface, such as a leaf of a door, in meters. A narrower straight piece may be legs.
+/// Minimum width of a surface, such as the leaf of a door, in meters. A narrower straight object may be legs.
 const MIN_FLAT_WIDTH_M: f64 = 0.4;
-/// Standard deviation of points from the line of a surface: the noise of the ranges.
+/// Maximum standard deviation of points from the line of a surface, in meters: the noise of the ranges.
 const FLATNESS_M: f64 = 0.015;
-/// Minimum distance by which the beams next to a free leg reach behind it, in meters. Points of a surface are closer together.
+/// Minimum distance by which the beams next to a free leg reach farther, in meters. Points of a surface are closer
+/// together.
 const MIN_FREE_DEPTH_M: f64 = 0.6;
-/// Points between the jambs at which a door is checked, and the distance from the line that a closed leaf may have.
+/// Number of points between the jambs at which a door is checked, and maximum distance of a closed leaf from the line
+/// between them, in meters.
 const CLOSED_POINTS: usize = 9;
 const MAX_CLOSED_OFFSET_M: f64 = 0.25;
-/// Maximum width of a person.
+/// Maximum width of a person in meters.
 const MAX_PERSON_WIDTH_M: f64 = 1.3;
-/// Minimum distance of an object from the farthest point that its beam has reached.
+/// Minimum distance of an object from the farthest range of its beam, in meters.
 const MIN_FOREGROUND_DISTANCE_M: f64 = 0.15;
-/// Number of scans in a row that must reach farther than all before.
+/// Number of scans in a row that must reach farther than all before to increase the farthest range.
 const MIN_FARTHER_SCANS: u8 = 5;
-/// Maximum distance of the legs of a person from their position.
+/// Maximum distance of a person's legs from their position, in meters.
 const MAX_LEG_DISTANCE_M: f64 = 0.35;
 
 /// A leg that one sensor sees.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Leg {
-    /// Middle of the leg. A sensor sees the near side, which is corrected.
+    /// Center of the leg. The sensor sees only the near side, so the position is corrected.
     pub(crate) at: Point,
-    /// Standard deviation of each coordinate.
+    /// Standard deviation of each coordinate in meters.
     pub(crate) sigma_m: f64,
-    /// Whether it stands in front of the background, and is not a single beam. An object that the background has
-    /// learned is not fresh.
+    /// Whether the leg is in front of the background and is more than a single beam. An object that has become
+    /// background is not fresh.
     pub(crate) is_fresh: bool,
-    /// Whether it is evidence for a person. A leg of a chair is too thin, and a value between two surfaces is nothing at
-    /// all. Both only support a track that other legs have started.
+    /// Whether the leg is evidence for a person. A chair leg is too thin, and a range between two surfaces does not
+    /// belong to any object. Both only support a track that other legs have started.
     pub(crate) is_solid: bool,
-    /// Number of beams that it reflects.
+    /// Number of beams that the leg reflects.
     pub(crate) beams: usize,
-    /// Whether it is in an ignored area. Such a leg is not fresh.
+    /// Whether the leg is in an ignored area. Such a leg is not fresh.
     pub(crate) is_ignored: bool,
-    /// Whether the beams on both sides of it reach far behind it. The points of a leaf of a door are next to each other.
+    /// Whether the beams on both sides of the leg reach much farther. The points of a door's leaf are adjacent.
     pub(crate) is_free: bool,
     /// Position relative to the leaves of doors.
     pub(crate) at_door: DoorProximity,
 }
 
-/// Whether a leg may be a part of a leaf of a door.
+/// Whether a leg may be a part of a door's leaf.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd)]
 pub(crate) enum DoorProximity {
-    /// No leaf reaches it.
+    /// No leaf reaches the position.
     Clear,
-    /// A leaf that swings about a jamb reaches it.
+    /// A leaf that swings about a jamb reaches the position.
     Swing,
-    /// Between the jambs of a door, on the line along which a leaf may slide.
+    /// The position is between the jambs of a door, on the line along which a leaf may slide.
     Line,
-    /// On this line, at a jamb or outside the opening, where an open leaf ends.
+    /// The position is on this line, at a jamb or outside the opening, where an open leaf ends.
     Jamb,
 }
 
-/// Visibility of a position where a person may stand.
+/// Visibility of a position at which a person may stand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Visibility {
-    /// The sensor sees through the position, so no one stands there.
+    /// The sensor sees through the position, so no person stands there.
     Free,
-    /// Something stands there.
+    /// An object is at the position.
     Occupied,
-    /// A nearer object occludes it, or no beam points there.
+    /// A nearer object occludes the position, or no beam points there.
     Occluded,
 }
 
-/// View of one sensor, and the farthest ranges that it has measured.
+/// View of one sensor, with the farthest ranges that it has measured.
 pub(crate) struct SensorView {
     sensor: Sensor,
     first_angle: f64,
     step: f64,
     /// Direction of each beam in the map.
     directions: Vec<Point>,
-    /// Ranges in meters. NaN: no reading. Infinite: no return.
+    /// Ranges in meters; NaN without a reading, and infinite without a return.
     ranges: Vec<f64>,
-    /// The farthest range that each beam has reached for some scans: the empty room.
+    /// Farthest range that each beam has reached in several scans, which shows the empty room.
     farthest: Vec<f64>,
-    /// Number of scans for which each beam has reached farther, and the minimum range of these.
+    /// For each beam, the number of scans in a row that have reached farther, and the minimum of their ranges.
     farther: Vec<(u8, f64)>,
     is_foreground: Vec<bool>,
     legs: Vec<Leg>,
     /// Beams that end at an object.
     standing: Vec<usize>,
-    /// Beams of the open cluster, and their end points.
+    /// Beams of the current cluster with their end points.
     points: Vec<(usize, Point)>,
 }
 
@@ -123,7 +125,7 @@ impl SensorView {
         }
     }
 
-    /// Takes the next scan and finds the legs in it.
+    /// Handles the next scan, and finds the legs in it.
     pub(crate) fn take(&mut self, scan: &Scan, foreground: &Foreground) {
         self.fit(scan);
         let unit_m = f64::from(scan.unit_um) * 1e-6;
@@ -136,7 +138,7 @@ impl SensorView {
             } else {
                 f64::NAN
             };
-            // Most beams end where they always do.
+            // Most beams end at their usual range, so skip the update for them.
             if *range > *farthest || farther.0 > 0 {
                 update_farthest(*range, farthest, farther);
             }
@@ -155,12 +157,12 @@ impl SensorView {
         self.find_legs();
     }
 
-    /// Corrects the sensor's position by the offset of everything that it sees.
+    /// Corrects the sensor's position, because all that it sees is displaced by `off`.
     pub(crate) fn shift(&mut self, off: Point) {
         self.sensor.position = minus(self.sensor.position, off);
     }
 
-    /// Marks the legs in the ignored areas of `site`, and those that may be leaves of its doors.
+    /// Marks the legs in the ignored areas of `site`, and those that may be parts of door leaves.
     pub(crate) fn mark(&mut self, site: &Site, has_leaves: &[bool]) {
         for leg in &mut self.legs {
             leg.at_door = site.at_door(leg.at, has_leaves);
@@ -170,8 +172,8 @@ impl SensorView {
         }
     }
 
-    /// Returns whether the opening between two jambs is closed: all beams to it end near the line between them. It is never
-    /// closed if fewer than five beams reach it.
+    /// Returns whether the opening between two jambs is closed: all beams into it end near the line between the jambs.
+    /// With fewer than five beams, it never counts as closed.
     pub(crate) fn is_closed(&self, [a, b]: [Point; 2]) -> bool {
         let ends_there = |i: usize| {
             let share = (i + 1) as f64 / (CLOSED_POINTS + 1) as f64;
@@ -182,7 +184,7 @@ impl SensorView {
                 .is_some_and(|range| (range - far).abs() <= MAX_CLOSED_OFFSET_M)
                 .then_some(beam)
         };
-        // An open door fails at its middle, which is the first point.
+        // Begin at the middle, because that is where an open door fails the check.
         let order = (0..CLOSED_POINTS).map(|i| (i + CLOSED_POINTS / 2) % CLOSED_POINTS);
         let (mut first, mut last) = (usize::MAX, 0);
         for i in order {
@@ -196,10 +198,10 @@ impl SensorView {
         &self.legs
     }
 
-    /// Returns the visibility of `place` in the last scan.
+    /// Returns the visibility of `position` in the last scan.
     pub(crate) fn visibility(&self, position: Point) -> Visibility {
         let Some((middle, far)) = self.beam(position) else { return Visibility::Occluded };
-        // Half the width of a person's legs.
+        // Half of the width of a person's legs, in beams.
         let half = ((0.2 / far).min(0.5) / self.step.abs()).ceil();
         let first = (middle - half).max(0.0) as usize;
         let last = ((middle + half) as usize).min(self.ranges.len() - 1);
@@ -212,7 +214,7 @@ impl SensorView {
             let is_here = range > far - MAX_LEG_DISTANCE_M
                 && range <= far + MAX_LEG_DISTANCE_M
                 && range < farthest - MIN_FOREGROUND_DISTANCE_M;
-            // A person is not as thin as this object.
+            // An object that is too thin to be a person does not block the view.
             let is_through = is_here
                 || range > far + MAX_LEG_DISTANCE_M
                 || (range > farthest - MIN_FOREGROUND_DISTANCE_M && range > far - 0.05);
@@ -222,7 +224,7 @@ impl SensorView {
             }
             if is_through {
                 through += 1;
-                // Nor is a person hidden by something thin.
+                // Nor can a thin object occlude a person.
                 hidden += if is_thin(occluded_run, spacing) { 0 } else { occluded_run };
                 occluded_run = 0;
             } else {
@@ -234,7 +236,8 @@ impl SensorView {
         if all >= 2 && 5 * through >= 4 * all { Visibility::Free } else { Visibility::Occluded }
     }
 
-    /// Returns the beam to `place`, as a fraction of beams, and the distance; `None` if no beam points there.
+    /// Returns the beam to `position` as a fractional index, and the distance in meters. Returns `None` if no beam
+    /// points there.
     fn beam(&self, position: Point) -> Option<(f64, f64)> {
         let offset = minus(position, self.sensor.position);
         let far = (offset[0] * offset[0] + offset[1] * offset[1]).sqrt();
@@ -248,7 +251,7 @@ impl SensorView {
         (middle < self.ranges.len() as f64).then_some((middle, far))
     }
 
-    /// Returns the number of elements that memory is allocated for.
+    /// Returns the number of elements for which memory is allocated.
     #[cfg(test)]
     pub(crate) fn capacity(&self) -> usize {
         let of_beams = self.directions.capacity() + self.ranges.capacity() + self.farthest.capacity();
@@ -256,7 +259,7 @@ impl SensorView {
         of_beams + flags + self.legs.capacity() + self.standing.capacity() + self.points.capacity()
     }
 
-    /// Prepares the tables for scans with the shape of `scan`.
+    /// Prepares the tables for scans of this shape, if it has changed.
     fn fit(&mut self, scan: &Scan) {
         let (shape, count) = ((scan.first_angle, scan.step), scan.beams());
         if (self.first_angle, self.step) == shape && self.ranges.len() == count {
@@ -305,7 +308,7 @@ impl SensorView {
         (self.points, self.standing) = (points, standing);
     }
 
-    /// Finds the legs in neighboring points.
+    /// Finds the legs in a cluster of neighboring points.
     fn close_cluster(&mut self, points: &[(usize, Point)]) {
         let (Some(&(first, begin)), Some(&(last, end))) = (points.first(), points.last()) else { return };
         let width = distance(begin, end);
@@ -316,7 +319,7 @@ impl SensorView {
             if width > MIN_FLAT_WIDTH_M && is_flat(points) {
                 return;
             }
-            // Between two legs the points lie farther apart than on one.
+            // Between two legs, neighboring points are farther apart than on one leg.
             let n = points.len();
             let within = n / 4 + 1..=3 * n / 4;
             let cut = within.max_by(|&a, &b| {
@@ -334,7 +337,7 @@ impl SensorView {
         let mean = [sum[0] / n, sum[1] / n];
         let offset = minus(mean, self.sensor.position);
         let range = (offset[0] * offset[0] + offset[1] * offset[1]).sqrt().max(0.05);
-        // Mean depth of the near half of a circle whose points lie at even angles.
+        // Mean depth of the near half of a circle whose points are at equal angles.
         let deeper = LEG_M * FRAC_PI_4 / range;
         let spacing = range * self.step.abs();
         let cut_off = |beam: Option<usize>| {
@@ -342,7 +345,7 @@ impl SensorView {
         };
         let is_partial = cut_off(first.checked_sub(1)) || cut_off(Some(last + 1));
         let is_short = points.len() == 1 && spacing < LEG_M;
-        // A beam that meets two surfaces may report any value between them.
+        // A beam that meets two surfaces may report any range between them.
         let is_between = is_partial && points.len() as f64 <= 1.0 + (SPOT_M + SPOT_RAD * range) / spacing;
         let is_free = |beam: Option<usize>| {
             beam.and_then(|beam| self.ranges.get(beam))
@@ -363,7 +366,7 @@ impl SensorView {
     }
 }
 
-/// Returns whether a leg reflects more than this number of beams, which are `spacing_m` apart.
+/// Returns whether an object with this number of beams, which are `spacing_m` apart, is thinner than a leg.
 fn is_thin(beams: usize, spacing_m: f64) -> bool {
     (beams + 1) as f64 * spacing_m < MIN_LEG_WIDTH_M
 }
@@ -382,7 +385,7 @@ fn is_flat(points: &[(usize, Point)]) -> bool {
     across < FLATNESS_M * FLATNESS_M
 }
 
-/// Takes a range of a beam. Single readings that are too far are noise.
+/// Updates the farthest range of a beam. A single range that is too long counts as noise.
 fn update_farthest(range: f64, farthest: &mut f64, (scans, least): &mut (u8, f64)) {
     if range > *farthest {
         (*scans, *least) = (*scans + 1, least.min(range));

@@ -1,5 +1,5 @@
-//! A site: sensors, rooms and doors in one map, as a site file describes them. Reading a site file checks that it makes a
-//! plan: names are unique, rooms do not overlap, doors are in the walls of their rooms, and every room can be reached.
+//! A site: sensors, rooms and doors in one map, as a site file describes them. Reading a file checks the plan: names
+//! are unique, rooms do not overlap, doors are in the walls of their rooms, and every room can be reached.
 
 use std::fmt::Display;
 use std::ops::Range;
@@ -21,14 +21,14 @@ pub(crate) const MAX_ROOMS: usize = 64;
 /// Maximum number of ignored areas.
 pub(crate) const MAX_IGNORED: usize = 64;
 
-/// A plan that was checked.
+/// A checked plan.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Site {
     /// Sensors in the order of the file.
     pub sensors: Vec<Sensor>,
     /// Rooms, whose polygons do not overlap.
     pub rooms: Vec<Area>,
-    /// Doors from room to room, or to outside.
+    /// Doors between rooms, or between a room and outside.
     pub doors: Vec<Door>,
     /// Paths between doors that no sensor covers.
     pub gaps: Vec<Gap>,
@@ -45,36 +45,36 @@ pub struct Sensor {
     pub position: Point,
     /// Direction in radians, counterclockwise from x.
     pub yaw_rad: f64,
-    /// Whether it is mounted upside down, so that its beams run clockwise.
+    /// Whether the sensor is mounted upside down, so that its beams run clockwise.
     pub is_upside_down: bool,
 }
 
-/// A room, or an area with something that moves and is not a person, such as a fountain, a revolving door or a curtain.
+/// A room, or an area with a moving object that is not a person, such as a fountain, a revolving door or a curtain.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Area {
-    /// Name as in events and in the drawing.
+    /// Name in events and in the drawing.
     pub name: String,
     /// Corners in meters, at least three.
     pub polygon: Vec<Point>,
 }
 
-/// An opening between two rooms, or a room and outside.
+/// An opening between two rooms, or between a room and outside.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Door {
-    /// Name as in events.
+    /// Name in events.
     pub name: String,
-    /// Index of the room on one side. `None` is outside.
+    /// Index of the room on one side; `None` for outside.
     pub from: Option<usize>,
-    /// Index of the room on the other side. `None` is outside.
+    /// Index of the room on the other side; `None` for outside.
     pub to: Option<usize>,
-    /// Both sides of the door frame.
+    /// Positions of both sides of the door frame, in meters.
     pub between: [Point; 2],
 }
 
 /// A path between two doors that no sensor covers, and the time that it takes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gap {
-    /// Indices of the two doors.
+    /// Indexes of the two doors.
     pub doors: [usize; 2],
     /// Minimum and maximum time in seconds.
     pub seconds: [f64; 2],
@@ -86,8 +86,8 @@ impl Site {
         self.ignored.iter().any(|area| contains(&area.polygon, point))
     }
 
-    /// Returns the distance of `point` from a door, in meters. If an ignored area covers the middle of the door, as that of a
-    /// revolving door does, it is the distance from this area.
+    /// Returns the distance between `point` and a door, in meters. If an ignored area covers the middle of the door, as
+    /// for a revolving door, it is the distance from this area.
     pub(crate) fn distance_to_door(&self, point: Point, door: usize) -> f64 {
         let between = self.doors[door].between;
         let area =
@@ -99,12 +99,12 @@ impl Site {
         distance_to_segment(point, between).min(from_area)
     }
 
-    /// Returns whether a leaf may reach `point`, for the doors that have leaves.
+    /// Returns whether a leaf may reach `point`, considering the doors that have leaves.
     pub(crate) fn at_door(&self, point: Point, has_leaves: &[bool]) -> DoorProximity {
         let mut found = DoorProximity::Clear;
         for (Door { between: [a, b], .. }, _) in self.doors.iter().zip(has_leaves).filter(|(_, has)| **has) {
             let width = distance(*a, *b);
-            // A wide door has two leaves. One that slides does so along the wall, as far as it is wide.
+            // A wide door has two leaves. A sliding leaf moves along the wall by its own width.
             let leaf_m = if width > MAX_LEAF_WIDTH_M { width / 2.0 } else { width }.min(MAX_LEAF_WIDTH_M);
             let along = minus(*b, *a).map(|value| value * leaf_m / width);
             let line = [minus(*a, along), [b[0] + along[0], b[1] + along[1]]];
@@ -123,19 +123,19 @@ impl Site {
         found
     }
 
-    /// Returns the room that `point` is in.
+    /// Returns the index of the room that contains `point`.
     pub fn room_at(&self, point: Point) -> Option<usize> {
         self.rooms.iter().position(|room| contains(&room.polygon, point))
     }
 
-    /// Returns the door nearest to `point` of those that `is_candidate` selects.
+    /// Returns the door nearest to `point` for which `is_candidate` returns true.
     pub(crate) fn nearest_door(&self, point: Point, is_candidate: impl Fn(&usize) -> bool) -> Option<usize> {
         let off = |&door: &usize| distance_to_segment(point, self.doors[door].between);
         (0..self.doors.len()).filter(is_candidate).min_by(|a, b| off(a).total_cmp(&off(b)))
     }
 
-    /// Returns the rooms in which there is a sensor, in the order of the rooms. A sensor on a wall is in every room that it
-    /// touches, at most 0.15 m away.
+    /// Returns for each room whether it contains a sensor. A sensor on a wall counts for every room that is at most
+    /// 0.15 m away.
     pub fn rooms_with_sensor(&self) -> Vec<bool> {
         let watched = |room: &Area| {
             let mut positions = self.sensors.iter().map(|sensor| sensor.position);
@@ -144,7 +144,7 @@ impl Site {
         self.rooms.iter().map(watched).collect()
     }
 
-    /// Returns the name of a room, `outside` for none.
+    /// Returns the name of a room, or `outside` for `None`.
     pub fn room_name(&self, room: Option<usize>) -> &str {
         room.and_then(|room| self.rooms.get(room)).map_or(OUTSIDE_NAME, |room| &room.name)
     }
@@ -158,13 +158,13 @@ impl Door {
 }
 
 impl Sensor {
-    /// Returns the name of the hub whose clock stamps its samples: `kitchen` for `kitchen.front`, `""` for a local
-    /// sensor.
+    /// Returns the name of the hub whose clock stamps the sensor's samples: `kitchen` for `kitchen.front`, and `""` for
+    /// a local sensor.
     pub fn hub(&self) -> &str {
         self.name.split_once('.').map_or("", |(hub, _)| hub)
     }
 
-    /// Returns the direction in the map of the beam at `angle` of the sensor: a unit vector.
+    /// Returns the direction in the map of the sensor's beam at `angle` in radians, as a unit vector.
     pub fn direction(&self, angle: f64) -> Point {
         let (sin, cos) = (self.yaw_rad + if self.is_upside_down { -angle } else { angle }).sin_cos();
         [cos, sin]
@@ -173,22 +173,22 @@ impl Sensor {
 
 /// Maximum length of the name of a room or door in bytes, as in an event.
 pub(crate) const MAX_NAME_LEN: usize = 24;
-/// Name of the other side of a door to the street.
+/// Name of the other side of a door that leads outside.
 pub(crate) const OUTSIDE_NAME: &str = "outside";
 /// Maximum width of a leaf of a door, in meters.
 const MAX_LEAF_WIDTH_M: f64 = 1.3;
-/// Distance from a jamb within which an open leaf may end.
+/// Maximum distance between a jamb and the end of an open leaf, in meters.
 const MAX_JAMB_DISTANCE_M: f64 = 0.15;
-/// Maximum distance of a leaf that slides from the line between the jambs.
+/// Maximum distance of a sliding leaf from the line between the jambs, in meters.
 const MAX_LEAF_OFFSET_M: f64 = 0.15;
-/// Maximum distance from a wall of a sensor on it.
+/// Maximum distance of a sensor from the wall on which it is mounted, in meters.
 const MAX_WALL_DISTANCE_M: f64 = 0.15;
 
 fn touches(polygon: &[Point], point: Point, tolerance_m: f64) -> bool {
     contains(polygon, point) || distance_to_border(polygon, point) <= tolerance_m
 }
 
-/// Text of a file, and its name in errors.
+/// Text of a file, with its name for errors.
 struct SourceText<'a> {
     name: &'a str,
     text: &'a str,
@@ -250,7 +250,7 @@ struct GapEntry {
 }
 
 impl Site {
-    /// Returns the site that `text` describes; errors call it `name`.
+    /// Parses the site that `text` describes. Errors use `name` for the file.
     ///
     /// # Errors
     ///
@@ -279,7 +279,7 @@ impl Site {
 }
 
 impl SourceText<'_> {
-    /// Returns the error for an invalid value at `span`.
+    /// Returns the failure for an invalid value at `span`.
     fn refuse(&self, span: Option<Range<usize>>, what: impl Display, remedy: impl Into<String>) -> Failure {
         let location = match span {
             Some(span) => {
@@ -304,21 +304,22 @@ impl SourceText<'_> {
     }
 }
 
-/// Returns a question whether the nearest of `known` was meant.
+/// Returns a question that suggests the name in `known` most similar to `word`.
 fn nearest(word: &str, known: &[&str]) -> String {
     let near = |a: &str| strsim::jaro_winkler(a, word);
     let best = known.iter().max_by(|a, b| near(a).total_cmp(&near(b)));
     best.map_or(String::new(), |best| format!("did you mean `{best}`? "))
 }
 
-/// Maximum overlap of rooms, because they are measured by hand.
+/// Maximum overlap of rooms in meters. It is allowed because they are measured by hand.
 const MAX_OVERLAP_M: f64 = 0.05;
-/// Maximum distance of the middle of a door from the walls of its rooms, because walls are thick.
+/// Maximum distance of the middle of a door from the walls of its rooms, in meters, because walls are thick.
 const MAX_DOOR_OFFSET_M: f64 = 0.5;
-/// Minimum size of a room and of an ignored area in square meters, with the digits that errors show. A curtain is thin.
+/// Minimum area of a room and of an ignored area in square meters, each with the number of digits in errors. The second
+/// is small because a curtain is thin.
 const MIN_ROOM_M2: (f64, usize) = (0.25, 2);
 const MIN_IGNORED_M2: (f64, usize) = (0.02, 3);
-/// Maximum coordinate. Larger ones are probably in millimeters.
+/// Maximum coordinate in meters. Larger ones are probably in millimeters.
 const MAX_COORDINATE_M: f64 = 1_000.0;
 
 fn plan(source: &SourceText<'_>, file: &File) -> Result<Site, Failure> {
@@ -410,7 +411,7 @@ fn sensor(source: &SourceText<'_>, entry: &SensorEntry) -> Result<Sensor, Failur
     })
 }
 
-/// Checks the area `what`: three corners or more, sides that do not cross, and a minimum size.
+/// Checks the area `what`: at least three corners, sides that do not cross, and a minimum area.
 fn checked_area(
     source: &SourceText<'_>,
     what: &str,

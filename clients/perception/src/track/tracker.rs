@@ -1,5 +1,5 @@
-//! Tracks people from scans in the order of their stamps: association of legs with tracks, track initiation and deletion, and
-//! people who go through doors or where no sensor looks.
+//! Tracker of people from scans in the order of their stamps: association of legs with tracks, start and end of tracks,
+//! and people who go through doors or out of the sensors' view.
 
 use scanhub_schema::{Foreground, Scan};
 
@@ -12,64 +12,67 @@ use super::sensor_view::{DoorProximity, Leg, SensorView, Visibility};
 use super::site::{Door, Gap, Site};
 use super::{Event, Kind, MisplacedSensor, Snapshot, Track};
 
-/// Maximum number of people at a time.
+/// Maximum number of people at the same time.
 pub(crate) const MAX_PEOPLE: usize = 64;
-/// Interval between snapshots.
+/// Interval between snapshots in ns.
 pub const SNAPSHOT_INTERVAL_NS: u64 = 40_000_000;
 
-/// Gain of a leg exactly at its expected position, and limit of a leg's squared distance over its variance.
+/// Gain of a leg that is exactly at its expected position. It is also the limit of a leg's squared distance divided by
+/// the variance.
 const GATE: f64 = 11.0;
-/// The same for a tentative person, who has lower priority.
+/// The same for a tentative person, who has a lower priority.
 const GATE_TENTATIVE: f64 = 9.0;
-/// Maximum distance of a leg from its person.
+/// Maximum distance of a leg from its person, in meters.
 const MAX_LEG_DISTANCE_M: f64 = 0.8;
-/// Maximum distance between the legs of a person.
+/// Maximum distance between the legs of a person, in meters.
 const MAX_STEP_WIDTH_M: f64 = 0.9;
-/// Minimum distance of a new track from the legs of every track that is not away.
+/// Minimum distance of a new track from the legs of every track that is not away, in meters.
 const MIN_TRACK_DISTANCE_M: f64 = 0.3;
-/// Time after which a person is deleted whose position sensors see through.
+/// Time in seconds after which a person is deleted because sensors see through their position: a confirmed one, and a
+/// tentative one.
 const DELETE_AFTER_S: f64 = 0.7;
 const DELETE_TENTATIVE_AFTER_S: f64 = 0.25;
-/// Time after which a tentative person is deleted who is not seen.
+/// Time without a detection after which a tentative person is deleted, in ns.
 const MAX_TENTATIVE_SILENCE_NS: u64 = 400_000_000;
-/// Time after which a hidden person is deleted.
+/// Time after which a hidden person is deleted, in ns.
 const MAX_HIDDEN_NS: u64 = 120_000_000_000;
-/// Maximum period of a sensor. A longer one is a gap.
+/// Maximum period of a sensor in seconds. A longer one counts as a gap.
 const MAX_PERIOD_S: f64 = 0.2;
-/// Maximum time between two scans that show the same.
+/// Maximum time between two scans that count as simultaneous, in ns.
 const SAME_TIME_NS: u64 = 45_000_000;
-/// Two people who are nearer to each other, and who never show two pairs of legs, are one.
+/// Distance below which two people are merged if they never show two pairs of legs, in meters.
 const MERGE_DISTANCE_M: f64 = 0.45;
-/// Time for which a known person who went into an ignored area may be associated with the legs in it.
+/// Time for which a confirmed person who has entered an ignored area may be associated with the legs in it, in ns.
 const IGNORED_GRACE_NS: u64 = 5_000_000_000;
 
-/// A known person who was not seen for this time is not found again by a leg that may be a part of a leaf.
+/// Time without a detection after which a confirmed person is not associated with a leg that may be a part of a door's
+/// leaf, in ns.
 const LEAF_SILENCE_NS: u64 = 300_000_000;
-/// Maximum distance from a door at which a person is first seen who comes out of it.
+/// Maximum distance from a door at which a person who comes out of it is first seen, in meters.
 const MAX_BEFORE_DOOR_M: f64 = 3.5;
-/// The same in a room with sensors, where they are seen as soon as they have come through.
+/// The same in a room with sensors, in which people are seen as soon as they have come through.
 const MAX_INSIDE_DOOR_M: f64 = 1.2;
-/// Minimum distance behind a door of a person who has gone through it.
+/// Minimum distance beyond a door of a person who has gone through it, in meters.
 const MIN_BEHIND_DOOR_M: f64 = 0.12;
-/// A person who is nearer to a confirmed one, and never shows two legs, is a part of them.
+/// Distance below which a person who never shows two legs counts as a part of a confirmed person, in meters.
 const PART_DISTANCE_M: f64 = 0.5;
-/// Maximum distance from a door at which a person is first seen who has come through it, in meters.
+/// Maximum distance from a door at which a person who has come through it is first seen, in meters.
 const MAX_AT_DOOR_M: f64 = 0.7;
-/// This distance for a door with leaves, if the person walks away from it at least at the speed below, in m/s.
+/// The same for a door with leaves, if the person walks away from it at least at the following speed, in m/s.
 const MAX_BEFORE_LEAVES_M: f64 = 1.6;
 const MIN_LEAVING_SPEED_M_S: f64 = 0.2;
-/// A new person who is nearer to a known one may be one of their legs.
+/// Distance below which a new person may be a leg of a confirmed one, in meters.
 const MIN_ALONE_M: f64 = 0.9;
-/// Maximum squared distance over variance of a new person who is a hidden one: 98.9 % of the normal distribution in
-/// the plane.
+/// Maximum squared distance, divided by the variance, at which a new person is identified with a hidden one. It covers
+/// 98.9 % of the normal distribution in the plane.
 const HIDDEN_GATE: f64 = 9.0;
-/// Time out of sight in a room without sensors after which a person is away.
+/// Time out of sight in a room without sensors after which a person is away, in ns.
 const AWAY_AFTER_NS: u64 = 250_000_000;
 
-/// A door has leaves if this number of scans of a sensor in a row show it closed.
+/// Number of scans in a row that must show a door closed before it counts as a door with leaves.
 const MIN_CLOSED_SCANS: u32 = 20;
 
-/// Tracks of people.
+/// Tracks of people, with the views of all sensors.
 pub(crate) struct Tracker {
     pub(crate) site: Site,
     watched: Vec<bool>,
@@ -81,14 +84,14 @@ pub(crate) struct Tracker {
     edges: Vec<Edge>,
     pairs: Vec<(usize, usize)>,
     scan_ns: Vec<u64>,
-    /// Whether each door was seen closed.
+    /// Whether each door has leaves, because it was seen closed.
     has_leaves: Vec<bool>,
-    /// Number of scans in a row of each sensor that showed each door closed.
+    /// For each sensor and door, the number of scans in a row that showed the door closed.
     closed: Vec<Vec<u32>>,
     poses: PoseVotes,
     misplaced: Vec<MisplacedSensor>,
-    /// For each sensor, from the legs of walking people: the sum of offset times velocity, and the sum of squared speeds.
-    /// The ratio is the mean time in seconds by which legs are ahead of their expected positions.
+    /// For each sensor, two sums over the legs of walking people: offset times velocity, and squared speed. Their ratio
+    /// is the mean time in seconds by which legs are ahead of their expected positions.
     pub(crate) lateness: Vec<(f64, f64)>,
 }
 
@@ -113,7 +116,7 @@ impl Tracker {
         }
     }
 
-    /// Takes the next scan in the order of time.
+    /// Handles the next scan in the order of time.
     pub(crate) fn take(&mut self, sensor: usize, at_ns: u64, scan: &Scan, foreground: &Foreground) {
         self.sensor_views[sensor].take(scan, foreground);
         self.detect_leaves(sensor);
@@ -133,7 +136,7 @@ impl Tracker {
         self.delete_lost_tracks(at_ns);
     }
 
-    /// Corrects the position of a sensor that sees all people next to the positions at which others see them.
+    /// Corrects the position of a sensor that sees all people displaced, compared with other sensors.
     fn compare_poses(&mut self, sensor: usize, at_ns: u64) {
         for other in 0..self.sensor_views.len() {
             if other == sensor || at_ns.saturating_sub(self.scan_ns[other]) > SAME_TIME_NS {
@@ -147,7 +150,7 @@ impl Tracker {
         }
     }
 
-    /// Predicts all people at `at_ns`. A person who is not seen does not walk through a wall.
+    /// Predicts the states of all people at `at_ns`. A person who is not seen is stopped in front of a wall.
     fn predict(&mut self, at_ns: u64) {
         for person in self.people.iter_mut().filter(|person| !matches!(person.phase, TrackPhase::Away { .. }))
         {
@@ -166,8 +169,8 @@ impl Tracker {
         }
     }
 
-    /// Assigns the legs that the sensor sees to people: pairs of a leg, and twice the index of a person plus the
-    /// side.
+    /// Assigns the legs that the sensor sees to people. A pair consists of the index of a leg, and twice the index of a
+    /// person plus the side.
     fn associate(&mut self, sensor: usize, at_ns: u64, pairs: &mut Vec<(usize, usize)>) {
         let legs = self.sensor_views[sensor].legs();
         self.edges.clear();
@@ -177,7 +180,7 @@ impl Tracker {
                 TrackPhase::Tentative => GATE_TENTATIVE,
                 TrackPhase::Known => GATE,
             };
-            // Learned background keeps a confirmed person who stands, but does not confirm one.
+            // Legs in the learned background keep a standing person, but do not confirm one.
             let (position, stands) = (person.filter.position(), person.is_known() && person.speed() < 0.5);
             let passes = person.is_known() && at_ns.saturating_sub(person.last_free_ns) < IGNORED_GRACE_NS;
             let is_lost = person.is_known() && at_ns.saturating_sub(person.last_seen_ns) > LEAF_SILENCE_NS;
@@ -204,7 +207,7 @@ impl Tracker {
         }
         pairs.clear();
         self.assignment.solve((legs.len(), 2 * self.people.len()), &self.edges, pairs);
-        // By person, the more certain leg first.
+        // Sort by person, with the more accurate leg first.
         pairs.sort_unstable_by_key(|&(leg, target)| (target / 2, (legs[leg].sigma_m * 1e6) as u64, leg));
         let mut i = 1;
         while i < pairs.len() {
@@ -249,7 +252,7 @@ impl Tracker {
         }
     }
 
-    /// Updates the people without a leg in `pairs`: they are hidden, or the sensor sees through their positions.
+    /// Updates the people without a leg in `pairs`. Either they are hidden, or the sensor sees through their positions.
     fn handle_missed_detections(&mut self, sensor: usize, since_s: f64, pairs: &[(usize, usize)]) {
         let view = &self.sensor_views[sensor];
         for (number, person) in self.people.iter_mut().enumerate() {
@@ -263,7 +266,7 @@ impl Tracker {
                 match view.visibility(position) {
                     Visibility::Free => 1.0,
                     Visibility::Occupied => {
-                        // A learned object still stands there.
+                        // An object that has become background still stands there.
                         if person.is_known() && person.speed() < 0.4 {
                             person.absent_s = (person.absent_s - COARSE_WEIGHT * since_s).max(0.0);
                         }
@@ -324,7 +327,7 @@ impl Tracker {
         }
     }
 
-    /// Merges two people who share one pair of legs.
+    /// Merges people who share one pair of legs.
     fn merge(&mut self, at_ns: u64) {
         let mut i = 0;
         while i < self.people.len() {
@@ -346,7 +349,7 @@ impl Tracker {
             };
             match (i + 1..self.people.len()).find(|&j| is_same(&self.people[j])) {
                 Some(other) => {
-                    // The person who was confirmed first stays, with the filter of the one who was seen last.
+                    // Keep the person who was confirmed first, with the filter of the one who was seen last.
                     let (keep, drop) = if self.people[other].is_known() && !self.people[i].is_known() {
                         (other, i)
                     } else {
@@ -366,8 +369,8 @@ impl Tracker {
         }
     }
 
-    /// Deletes people whose position sensors have seen through for long enough, and people who have been away for too
-    /// long.
+    /// Deletes people whose position sensors have seen through for long enough, who have been out of sight for too
+    /// long, who went outside, or who have stayed in an ignored area.
     fn delete_lost_tracks(&mut self, at_ns: u64) {
         let mut number = 0;
         while number < self.people.len() {
@@ -399,7 +402,7 @@ impl Tracker {
         }
     }
 
-    /// Returns the number of elements that memory is allocated for.
+    /// Returns the number of elements for which memory is allocated.
     #[cfg(test)]
     pub(crate) fn capacity(&self) -> usize {
         let views: usize = self.sensor_views.iter().map(SensorView::capacity).sum();
@@ -412,7 +415,7 @@ impl Tracker {
         self.events.push(Event { wall_ns, id, room, kind });
     }
 
-    /// Writes the picture of `at_ns`, which is not before the last scan.
+    /// Writes the snapshot at `at_ns`, which must not be before the last scan.
     pub(crate) fn write_snapshot(&mut self, at_ns: u64, picture: &mut Snapshot) {
         picture.wall_ns = at_ns;
         picture.tracks.clear();
@@ -441,7 +444,7 @@ impl Tracker {
         picture.misplaced.append(&mut self.misplaced);
     }
 
-    /// Finds the doors that have leaves. Only these are ever closed.
+    /// Detects doors that have leaves, because only these are ever closed.
     fn detect_leaves(&mut self, sensor: usize) {
         let doors = self.site.doors.iter().zip(&mut self.has_leaves).zip(&mut self.closed[sensor]);
         for ((door, has_leaves), closed) in doors.filter(|((_, has_leaves), _)| !**has_leaves) {
@@ -454,7 +457,7 @@ impl Tracker {
         }
     }
 
-    /// Confirms people, and detects those who go through doors or where no sensor looks.
+    /// Confirms people, and detects those who go through doors or out of the sensors' view.
     fn detect_crossings(&mut self, at_ns: u64) {
         let mut number = 0;
         while number < self.people.len() {
@@ -471,7 +474,7 @@ impl Tracker {
         }
     }
 
-    /// Returns the hidden person in the same room who is most likely to have been at `place` at that time.
+    /// Returns the hidden person in the same room who is most likely to have been at `position` at `then_ns`.
     fn hidden_near(&self, position: Point, then_ns: u64) -> Option<usize> {
         let room = self.site.room_at(position);
         let off2 = |(number, person): (usize, &Person)| {
@@ -509,7 +512,7 @@ impl Tracker {
                     (self.people[number].room, self.people[number].entry_door) = (to, Some(door));
                     self.add_event(at_ns, number, Kind::Door { door, from, to });
                 }
-                // The person was not seen at the door, or is in a wall.
+                // The person was not seen at a door, or is inside a wall.
                 None if to.is_some() && at_ns - person.last_seen_ns < AWAY_AFTER_NS => {
                     (self.people[number].room, self.people[number].entry_door) = (to, None);
                 }
@@ -528,9 +531,9 @@ impl Tracker {
         }
     }
 
-    /// Returns whether a new person has come through a door that leads where no sensor looks: they were first seen at the door.
-    /// At a door with leaves, a person is not confirmed, so that they may be first seen at some distance. Then they have
-    /// come through it if they walk away from it, and are not a leg of someone who is known.
+    /// Returns whether a new person has come through a door that leads out of the sensors' view. They must be first
+    /// seen near the door. Near a door with leaves, people are not confirmed, so they may be first seen farther away.
+    /// In this case, they have come through it if they walk away from it and are not a leg of a confirmed person.
     fn has_passed_door(&self, number: usize, door: usize) -> bool {
         let person = &self.people[number];
         let off_m = self.site.distance_to_door(person.first_position, door);
@@ -546,14 +549,14 @@ impl Tracker {
         off_m < MAX_BEFORE_LEAVES_M && walks_away && is_alone
     }
 
-    /// Confirms a new person, who may be one who was away or hidden.
+    /// Confirms a new person, or identifies them with one who was away or hidden.
     fn confirm(&mut self, number: usize, at_ns: u64) {
         let new = &self.people[number];
         let (first_position, first_seen_ns) = (new.first_position, new.first_seen_ns);
         let off = |door: usize| distance_to_segment(first_position, self.site.doors[door].between);
         let is_inside = self.site.room_at(first_position).is_some_and(|room| self.watched[room]);
         let before_door_m = if is_inside { MAX_INSIDE_DOOR_M } else { MAX_BEFORE_DOOR_M };
-        // All people who are away, with the door that they would have come out of.
+        // Candidates are all people who are away, each with the door from which they would have come.
         let arrival = |(old, person): (usize, &Person)| {
             let TrackPhase::Away { door: entry, .. } = person.phase else { return None };
             let exit = self.site.nearest_door(first_position, |door| {
@@ -562,7 +565,7 @@ impl Tracker {
                 (leads || self.site.gaps.iter().any(is_gap)) && off(*door) < before_door_m
             })?;
             let after_s = (first_seen_ns as f64 - person.at_ns as f64) * 1e-9;
-            // A person who appeared while the other one was seen is a different one.
+            // Exclude a person who was still seen when the new one appeared.
             let distance_m = distance(first_position, person.filter.position());
             if after_s < -0.75 || after_s < -0.25 && distance_m > 0.7 {
                 return None;
@@ -601,7 +604,7 @@ impl Tracker {
             }
             None => {
                 self.people[number].phase = TrackPhase::Known;
-                // A person who comes out of a door to where no sensor looks has come through it.
+                // A person near a door that leads out of the sensors' view has come through it.
                 let leads = |&door: &usize| {
                     let ends = self.site.doors[door].rooms();
                     let is_unseen = |room: &Option<usize>| room.is_none_or(|room| !self.watched[room]);
@@ -622,7 +625,7 @@ impl Tracker {
     }
 }
 
-/// Returns whether a leg may be a part of a leaf of a door.
+/// Returns whether a leg may be a part of a door's leaf.
 fn may_be_leaf(leg: &Leg) -> bool {
     match leg.at_door {
         DoorProximity::Clear => false,
@@ -631,8 +634,8 @@ fn may_be_leaf(leg: &Leg) -> bool {
     }
 }
 
-/// Returns whether the legs of one scan are evidence for a person: one that no leaf of a door reaches, or two free ones
-/// next to each other.
+/// Returns whether the legs of one scan are evidence for a person: one leg that no leaf of a door reaches, or two
+/// adjacent free legs.
 fn shows_person<'a>(legs: impl Iterator<Item = &'a Leg> + Clone) -> bool {
     let is_clear = |leg: &Leg| leg.at_door == DoorProximity::Clear;
     legs.clone().any(is_clear) || legs.filter(|leg| !may_be_leaf(leg)).count() == 2

@@ -1,4 +1,4 @@
-//! Output of `track` and `tilt`: lines of JSON or text, and two topics under the name that the user gives.
+//! Output of `track` and `tilt`: lines of JSON or text, and two topics under the name that the user chooses.
 
 use std::hash::{BuildHasher, RandomState};
 use std::io::{self, Write};
@@ -14,9 +14,9 @@ use scanhub_verbs::names::{TopicName, position};
 use scanhub_verbs::output::{ExitReason, Output};
 use serde::Serialize;
 
-/// The topics of the name that the results are published under.
+/// Topics under which the results are published.
 pub(super) struct Topics<A: Payload + ?Sized, B: Payload + ?Sized> {
-    // Fields are dropped in this order: the topics first, then the publisher that wakes their subscribers.
+    // Fields are dropped in this order: the topics first, and then the publisher that wakes their subscribers.
     pub(super) publications: (Publication<A>, Publication<B>),
     pub(super) sensor: SensorPublisher,
 }
@@ -30,7 +30,7 @@ pub(super) struct Results<'a, A: Payload + ?Sized, B: Payload + ?Sized> {
     pub(super) header: Header,
     /// `None` until [`publish`](Self::publish) has created them.
     pub(super) topics: Option<Topics<A, B>>,
-    /// Samples of the subscribed topics that were published and not received.
+    /// Number of samples of the subscribed topics that were published but not received.
     pub(super) missed: u64,
     out: Output<'a>,
     notes: Output<'a>,
@@ -80,7 +80,8 @@ impl<'a, A: Payload + ?Sized, B: Payload + ?Sized> Results<'a, A, B> {
             .map_or(0, |topics| topics.publications.0.failed() + topics.publications.1.failed())
     }
 
-    /// Takes the flags of a scan with this `header` over: the results are simulated or replayed if the scan is.
+    /// Copies the flags of a scan's `header`, because results of simulated or replayed scans are simulated or replayed
+    /// too.
     pub(super) fn take_flags(&mut self, header: &Header) {
         self.header.flags = header.flags & (Flags::SIMULATED | Flags::REPLAYED);
     }

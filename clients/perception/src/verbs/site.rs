@@ -38,7 +38,7 @@ enum SiteCommand {
     },
 }
 
-/// Contents of a site file, as a line of JSON.
+/// JSON line with the contents of a site file.
 #[derive(Serialize)]
 struct Plan<'a> {
     class: &'static str,
@@ -115,8 +115,8 @@ impl Site {
         Site::parse(&path.display().to_string(), &text)
     }
 
-    /// Returns a drawing: rooms with their names, ignored areas, doors, gaps, and sensors with the way that they look. One
-    /// meter is 60 pixels; y is up.
+    /// Returns a drawing of the site: rooms with their names, ignored areas, doors, gaps, and sensors with their
+    /// directions. One meter is 60 pixels, and y points up.
     pub fn svg(&self) -> String {
         let corners = self.rooms.iter().flat_map(|room| room.polygon.iter().copied());
         let corners = corners.chain(self.ignored.iter().flat_map(|area| area.polygon.iter().copied()));
@@ -133,7 +133,7 @@ impl Site {
         );
         let text = |svg: &mut String, point: Point, down: f64, color: &str, words: &str| {
             let (x, y) = at(point);
-            // XML has no control characters, not even escaped ones.
+            // XML does not allow control characters, even if they are escaped.
             let words = Printable(words).to_string().replace(['\n', '\u{FFFE}', '\u{FFFF}'], "?");
             let words = words.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
             let _ = writeln!(

@@ -1,4 +1,5 @@
-//! `scanhub tilt`: computes three dimensions with a scanner on a mount, and prints and publishes points and obstacles.
+//! `scanhub tilt`: computes points and obstacles in three dimensions with a scanner on a mount, and prints and
+//! publishes them.
 
 use std::io::{self, Write};
 use std::sync::atomic::Ordering;
@@ -105,15 +106,16 @@ fn cuboid(text: &str) -> Result<[[f64; 2]; 3], String> {
 }
 
 impl TiltArgs {
-    /// Subscribes to the scans of the sensor and the angles of its mount. Writes the obstacles of each sweep to stdout.
-    /// Without `--json`, reports about the angles and notices go to stderr. Ends at the limits, by a signal, or when
-    /// the reader has closed stdout.
+    /// Subscribes to the scans of the sensor and the angles of its mount, and writes the obstacles of each sweep to
+    /// stdout. Without `--json`, reports about the angles and notices go to stderr. Ends at the limits, by a signal, or
+    /// when the reader closes stdout.
     ///
     /// # Errors
     ///
     /// - [`Kind::NoTopic`] if the sensor or the mount does not exist; the message lists the sensors.
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
-    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run or a check before its end.
+    /// - [`Kind::Timeout`] if neither a scan nor an angle arrives in time.
+    /// - [`Kind::Interrupted`] if a signal stops a bounded run or a check before its end.
     /// - [`Kind::Check`] if a check has failed.
     /// - The errors of [`PublishSession::open_named`](scanhub_client::PublishSession::open_named) if it publishes.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
@@ -159,9 +161,9 @@ impl TiltArgs {
     }
 }
 
-/// Name in the lines of a run that publishes nothing.
+/// Name in the lines of a run that does not publish.
 const DEFAULT_NAME: &str = "tilted";
-/// Minimum duration of a problem with the angles that is reported. A shorter one is only counted.
+/// Minimum duration of a problem with the angles before it is reported, in ns. A shorter one is only counted.
 const MIN_PROBLEM_NS: u64 = 300_000_000;
 
 struct TiltRun<'a> {
@@ -169,10 +171,10 @@ struct TiltRun<'a> {
     locations: &'a [Domain],
     scanner: TiltScanner,
     problem: ProblemFilter,
-    /// Delay of the angles' stamps that was reported.
+    /// Delay of the angles' stamps in the last report, in ns.
     late_ns: i64,
     check: Option<MountCheck>,
-    /// Number of beams of the first scan, once it has arrived.
+    /// Number of beams of the first scan; `None` until it has arrived.
     beams: Option<usize>,
     writer: SweepWriter<'a>,
 }
@@ -198,7 +200,7 @@ impl TiltRun<'_> {
         Ok(())
     }
 
-    /// Publishes as soon as the number of beams is known, which limits the length of samples.
+    /// Publishes once the number of beams is known, which determines the maximum length of samples.
     fn publish(&mut self) -> Result<(), ExitReason> {
         let results = &mut self.writer.results;
         if let (Some(_), Some(beams), None) = (&self.args.name, self.beams, &results.topics) {
@@ -236,7 +238,7 @@ impl TiltRun<'_> {
             writer.write_angles(self.problem.reported, self.late_ns, Some(&self.args.angles))?;
         }
         if check.as_ref().is_some_and(|check| check.sweeps() >= CHECKED_SWEEPS) {
-            // Ends without a summary.
+            // End the run without a summary.
             return Err(ExitReason::ReaderClosed);
         }
         std::mem::replace(&mut writer.first_error, Ok(()))
@@ -255,7 +257,7 @@ impl TiltRun<'_> {
     }
 }
 
-/// Filters out short problems with the angles.
+/// Filter for problems with the angles that drops short ones.
 #[derive(Default)]
 struct ProblemFilter {
     reported: Option<DropReason>,
@@ -264,7 +266,8 @@ struct ProblemFilter {
 }
 
 impl ProblemFilter {
-    /// Takes the problem at the time of a scan. Returns the problem, or its end, if it must be reported now.
+    /// Updates the filter with the problem at the time of a scan. Returns a problem, or its end, if it must be reported
+    /// now.
     fn changed(&mut self, stamp_ns: u64, now: Option<DropReason>) -> Option<Option<DropReason>> {
         if now != self.now || self.since_ns == 0 {
             (self.now, self.since_ns) = (now, stamp_ns);
@@ -277,14 +280,14 @@ impl ProblemFilter {
     }
 }
 
-/// Writes and publishes sweeps.
+/// Writer and publisher of sweeps.
 struct SweepWriter<'a> {
     results: Results<'a, Cloud, Obstacles>,
     /// Offset from CLOCK_MONOTONIC to the wall clock, in ns.
     to_wall_ns: i64,
     /// Obstacles of the last sweep.
     obstacles: Box<Obstacles>,
-    /// The first error since the last sample.
+    /// First error since the last sample.
     first_error: Result<(), ExitReason>,
 }
 
@@ -299,7 +302,8 @@ impl SweepWriter<'_> {
         }
     }
 
-    /// Stores the obstacles of a sweep, and publishes the sweep if topics exist. Returns the header of the obstacles.
+    /// Stores the obstacles of a sweep, and publishes the sweep if the topics exist. Returns the header of the
+    /// obstacles.
     fn publish(&mut self, sweep: &Sweep<'_>) -> Header {
         let flags = if sweep.is_complete { Obstacles::COMPLETE } else { 0 }
             | if sweep.is_unreliable { Obstacles::UNRELIABLE } else { 0 };
@@ -342,7 +346,7 @@ impl SweepWriter<'_> {
             let times = || points.iter().map(|point| point.stamp_ns);
             let (from_ns, until_ns) = (times().min().unwrap_or(0), times().max().unwrap_or(0));
             let header = header_of(cloud.next_number(), from_ns, until_ns);
-            // Subscribers notice by its number that a sample is missing, and poll if they cannot be woken.
+            // Ignore errors. Subscribers detect a missing sample by its number, and poll if they cannot be woken.
             let _ = cloud.send_len_with(&header, Cloud::len(points.len()), |sample| {
                 for (slot, point) in sample.begin(head).iter_mut().zip(points) {
                     *slot = CloudPoint {
@@ -359,7 +363,7 @@ impl SweepWriter<'_> {
         header
     }
 
-    /// Reports a problem with the angles, its end, or with `mount` a new delay of their stamps.
+    /// Reports a problem with the angles or its end. If `mount` is given, it reports a new delay of their stamps.
     fn write_angles(
         &mut self,
         problem: Option<DropReason>,
@@ -371,12 +375,12 @@ impl SweepWriter<'_> {
     }
 }
 
-/// Returns the points of each scan, at most `most` together. Beam numbers grow within a scan.
+/// Returns the points of each scan in chunks of at most `most`. Within a scan, beam indexes increase.
 fn scans(points: &[Point], most: usize) -> impl Iterator<Item = &[Point]> {
     points.chunk_by(|one, next| one.beam < next.beam).flat_map(move |scan| scan.chunks(most.max(1)))
 }
 
-/// The lines that only `tilt` has. The variant is the class.
+/// Lines that only `tilt` writes. The variant determines the class.
 #[derive(Serialize)]
 #[serde(tag = "class", rename_all = "snake_case")]
 enum TiltJson<'a> {
@@ -385,7 +389,7 @@ enum TiltJson<'a> {
         problem: Option<DropReason>,
         #[serde(rename = "late_ms", serialize_with = "milliseconds")]
         late_ns: i64,
-        /// Name of the mount if the line reports a new delay.
+        /// Name of the mount, if the line reports a new delay.
         #[serde(skip)]
         mount: Option<&'a str>,
     },
@@ -395,7 +399,7 @@ enum TiltJson<'a> {
         #[serde(flatten)]
         counts: Counts,
         missed: u64,
-        /// Samples that were not published because memory was short.
+        /// Number of samples that were not published because memory was short.
         failed: u64,
         #[serde(rename = "late_ms", serialize_with = "milliseconds")]
         late_ns: i64,
@@ -453,7 +457,7 @@ impl TiltJson<'_> {
     }
 }
 
-/// Returns milliseconds with one decimal.
+/// Returns a time in ms with one decimal.
 fn late_ms(late_ns: i64) -> f64 {
     (late_ns as f64 / 1e5).round() / 10.0
 }
@@ -462,16 +466,16 @@ fn milliseconds<S: Serializer>(late_ns: &i64, serializer: S) -> Result<S::Ok, S:
     serializer.serialize_f64(late_ms(*late_ns))
 }
 
-/// Returns the delay of stamps as text.
+/// Formats the delay of stamps as text.
 fn lateness(late_ns: i64) -> String {
     format!("{:.1} ms {}", late_ms(late_ns).abs(), if late_ns < 0 { "early" } else { "late" })
 }
 
-/// Number of complete sweeps that a check takes.
+/// Number of complete sweeps in a check.
 const CHECKED_SWEEPS: u32 = 6;
-/// Maximum error of the height, in meters.
+/// Maximum error of the floor's height, in meters.
 const MAX_HEIGHT_ERROR_M: f64 = 0.02;
-/// Maximum error of the level and of the roll, in degrees.
+/// Maximum error of level and roll, in degrees.
 const MAX_LEVEL_ERROR_DEG: f64 = 0.3;
 /// Maximum lean of a wall that the level does not explain, in degrees.
 const MAX_LEAN_DEG: f64 = 0.5;
@@ -512,7 +516,7 @@ fn write_findings(
     Ok(())
 }
 
-/// Returns the result of each item of a check.
+/// Evaluates each item of a check.
 fn find<'a>(check: &MountCheck, mount: &Mount, sensor: &'a str) -> Vec<Finding<'a>> {
     let item =
         |name, off_m: Option<f64>, off_deg: Option<f64>, is_ok: bool, finding: String, remedy: String| {
@@ -596,7 +600,7 @@ mod tests {
         const MS: u64 = 1_000_000;
         let mut problem = ProblemFilter::default();
         let (well, silent, jumped) = (None, Some(DropReason::Silent), Some(DropReason::Jumped));
-        // At the start no angle has come yet.
+        // No angle has arrived at the start.
         assert_eq!(problem.changed(1000 * MS, silent), None);
         assert_eq!(problem.changed(1027 * MS, well), None);
         assert_eq!(problem.changed(1400 * MS, silent), None);

@@ -51,17 +51,18 @@ Examples:
   scanhub track --site house.toml --count left";
 
 impl TrackArgs {
-    /// Subscribes to the scans and foregrounds of the site's sensors. Writes tracks and events to stdout, or only the
-    /// counts of some doors. Without `--json`, notices go to stderr. Ends at the limits, by a signal, or when the
-    /// reader has closed stdout.
+    /// Subscribes to the scans and foregrounds of the site's sensors, and writes tracks and events to stdout, or only
+    /// the counts of some doors. Without `--json`, notices go to stderr. Ends at the limits, by a signal, or when the
+    /// reader closes stdout.
     ///
     /// # Errors
     ///
     /// - The errors of [`Site::read`].
-    /// - [`Kind::Configuration`] if the site has no such door.
+    /// - [`Kind::Configuration`] if the site does not have a given door.
     /// - [`Kind::NoTopic`] if a sensor does not exist; the message lists the sensors.
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
-    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run before its end.
+    /// - [`Kind::Timeout`] if no scan arrives in time.
+    /// - [`Kind::Interrupted`] if a signal stops a bounded run before its end.
     /// - The errors of [`PublishSession::open_named`](scanhub_client::PublishSession::open_named) if it publishes.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
@@ -99,7 +100,7 @@ impl TrackArgs {
     }
 }
 
-/// Returns the index of a door.
+/// Returns the index of the door `name`.
 fn door(site: &Site, name: &str) -> Result<usize, Failure> {
     site.doors.iter().position(|door| door.name == name).ok_or_else(|| {
         let known: Vec<&str> = site.doors.iter().map(|door| door.name.as_str()).collect();
@@ -111,7 +112,7 @@ fn door(site: &Site, name: &str) -> Result<usize, Failure> {
     })
 }
 
-/// Name in the lines of a tracker that publishes nothing.
+/// Name in the lines of a tracker that does not publish.
 const DEFAULT_NAME: &str = "people";
 
 type StampedScan = (Header, Box<Scan>);
@@ -120,10 +121,10 @@ struct TrackRun<'a> {
     args: &'a TrackArgs,
     locations: &'a [Domain],
     tracker: PeopleTracker,
-    /// Scans and foregrounds of each sensor of the site.
+    /// Scans and foregrounds of each sensor of the site, which are joined by `seq`.
     joins: Vec<Join<StampedScan, Box<Foreground>>>,
     late: LateReports,
-    /// Whether a topic of a sensor has existed.
+    /// Whether the run has subscribed to a topic of a sensor.
     is_subscribed: bool,
     writer: SnapshotWriter<'a>,
 }
@@ -156,7 +157,7 @@ impl TrackRun<'_> {
         Ok(())
     }
 
-    /// Reports late scans, and publishes as soon as a domain exists.
+    /// Reports late scans, and publishes once a domain exists.
     fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         for (sensor, count) in self.late.due(now, self.tracker.late()) {
             self.writer.report_late(sensor, count, self.args.delay)?;
@@ -204,17 +205,17 @@ impl TrackRun<'_> {
     }
 }
 
-/// Writes and publishes snapshots.
+/// Writer and publisher of snapshots.
 struct SnapshotWriter<'a> {
     site: Site,
-    /// Indices of the doors whose counts alone are printed; empty: everything is.
+    /// Indexes of the doors whose counts are printed. If empty, all tracks and events are printed.
     counted: Vec<usize>,
-    /// Number of people who went through each door: from its `from` to its `to`, and back.
+    /// Number of people who went through each door: forth, which is from `from` to `to`, and back.
     passages: Vec<[u64; 2]>,
     appeared: u64,
     /// Tracks of the last snapshot.
     tracks: Box<Tracks>,
-    /// Number of samples of `tracks` and of `events`.
+    /// Number of published samples of `tracks` and of `events`.
     samples: [u64; 2],
     results: Results<'a, Tracks, Event>,
 }
@@ -224,7 +225,7 @@ impl SnapshotWriter<'_> {
         let events = self.publish(snapshot);
         let SnapshotWriter { site, counted, passages: passed, appeared, tracks, results, .. } = self;
         let (name, prints_all) = (results.name, counted.is_empty());
-        // Where everyone is would be too much text.
+        // Positions of all people would be too much text, so print them only as JSON.
         if prints_all && results.is_json {
             let header = results.header;
             results.result(&json::tracks(name, &header, tracks), |_| Ok(()))?;
@@ -257,7 +258,7 @@ impl SnapshotWriter<'_> {
         Ok(())
     }
 
-    /// Publishes a snapshot if the tracker has topics. Returns its events as samples.
+    /// Publishes a snapshot if the topics exist. Returns its events with their headers.
     fn publish(&mut self, snapshot: &Snapshot) -> Vec<(Header, Event)> {
         let SnapshotWriter { site, tracks, samples: [snapshots, events], results, .. } = self;
         let now_ns = clock::now_ns();
@@ -278,7 +279,7 @@ impl SnapshotWriter<'_> {
         *snapshots += 1;
         *events += numbered.len() as u64;
         if let Some(Topics { publications, sensor }) = &mut results.topics {
-            // Subscribers notice by its number that a sample is missing, and poll if they cannot be woken.
+            // Ignore errors. Subscribers detect a missing sample by its number, and poll if they cannot be woken.
             for (header, event) in &numbered {
                 let _ = publications.1.send_with(header, |sample| *sample = *event);
             }
@@ -310,7 +311,7 @@ impl SnapshotWriter<'_> {
     }
 }
 
-/// The lines that only `track` has. The variant is the class.
+/// Lines that only `track` writes. The variant determines the class.
 #[derive(Serialize)]
 #[serde(tag = "class", rename_all = "snake_case")]
 enum TrackJson<'a> {
@@ -346,12 +347,12 @@ enum TrackJson<'a> {
         #[serde(flatten)]
         counts: Counts,
         missed: u64,
-        /// Samples that were not published because memory was short.
+        /// Number of samples that were not published because memory was short.
         failed: u64,
     },
 }
 
-/// Number of people who went through a door: from its `from` to its `to`, and back.
+/// Number of people who went through a door: forth, which is from `from` to `to`, and back.
 #[derive(Clone, Copy, Serialize)]
 struct PassageCounts<'a> {
     door: &'a str,
@@ -407,14 +408,14 @@ fn milliseconds<S: Serializer>(value: &Duration, serializer: S) -> Result<S::Ok,
     serializer.serialize_u64(u64::try_from(value.as_millis()).unwrap_or(u64::MAX))
 }
 
-/// Minimum time between two reports of late scans. The first one is due at once.
+/// Minimum time between two reports of late scans. The first report is sent at once.
 const LATE_REPORT_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Limits how often late scans are reported.
+/// Limit on how often late scans are reported.
 struct LateReports {
-    /// Late scans of each sensor that were reported.
+    /// Number of reported late scans of each sensor.
     reported: Vec<u64>,
-    /// Earliest time of the next report.
+    /// Earliest time of the next report; `None` before the first one.
     next: Option<Instant>,
 }
 
@@ -423,8 +424,8 @@ impl LateReports {
         LateReports { reported: vec![0; sensors], next: None }
     }
 
-    /// Returns the sensors that have late scans, with their number since the last report, if a report is due. `late` has the
-    /// late scans of each sensor since the start.
+    /// Returns the index of each sensor with late scans and their number since the last report, if a report is due.
+    /// `late` has the numbers since the start.
     fn due(&mut self, now: Instant, late: &[u64]) -> Vec<(usize, u64)> {
         if late == self.reported || self.next.is_some_and(|next| now < next) {
             return Vec::new();
@@ -433,7 +434,7 @@ impl LateReports {
         self.unreported(late)
     }
 
-    /// Returns what the last report does not contain, even if no report is due: for the end of a run.
+    /// Returns the late scans since the last report even if no report is due, for the end of a run.
     fn unreported(&mut self, late: &[u64]) -> Vec<(usize, u64)> {
         let since = late.iter().zip(&self.reported).map(|(late, reported)| late - reported).enumerate();
         let since = since.filter(|&(_, count)| count > 0).collect();

@@ -1,5 +1,5 @@
-//! Points against their definition: each is computed again from all angles and scans, by quaternions, and by looking through
-//! the whole list of angles.
+//! Comparison of points with their definition. The test computes each point again from all scans and the complete list
+//! of angles, with quaternions.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use scanhub_schema::{Scan, ScanHead};
 
 const MS: u64 = 1_000_000;
 
-/// What (w, x, y, z) turns v to.
+/// Rotates `v` by the quaternion `q`, whose components are w, x, y and z.
 fn rotate(q: [f64; 4], v: [f64; 3]) -> [f64; 3] {
     let times = |a: [f64; 4], b: [f64; 4]| {
         [
@@ -47,7 +47,7 @@ fn each_point_is_where_all_angles_together_say() {
             yaw_rad: draw(3.0),
             is_upside_down: seed % 3 == 0,
         };
-        // To and fro by 40 degrees a second, said every 5 to 25 ms.
+        // Up and down at 40 degrees per second, reported every 5 to 25 ms.
         let swing = |ms: f64| (20.0 - ((ms / 1000.0) % 2.0 - 1.0).abs() * 40.0).to_radians();
         let mut angles: Vec<(u64, f64)> = vec![(0, swing(0.0))];
         while angles[angles.len() - 1].0 < 6000 * MS {
@@ -91,7 +91,7 @@ fn each_point_is_where_all_angles_together_say() {
             }
             tilting.take_scan(*stamp, scan, &mut check);
         }
-        // The last sweep is not over.
+        // The last sweep is not complete.
         assert!(made > 4 * 13_000 && made <= expected.len(), "seed {seed}: {made} of {}", expected.len());
         assert_eq!((tilting.counts().points_dropped, tilting.problem()), ([0; 4], None), "seed {seed}");
     }

@@ -1,5 +1,5 @@
-//! Doors with leaves that move: no one is counted when only the leaves move, and each person is counted once, whether they
-//! walk through or stand in the opening.
+//! Tests of doors with moving leaves. No person is counted if only the leaves move. Each person is counted once,
+//! whether they walk through the door or stand in the opening.
 
 use crate::hall::{DOOR_KINDS, DoorKind, HALL_SITE, SCANNERS, Scene, Walker, events};
 use scanhub_perception::track::geometry::Point;
@@ -12,7 +12,7 @@ fn describe(events: &[(f64, Event)]) -> String {
     events.iter().map(|(at_s, event)| format!("{at_s:.2} {} {:?}\n", event.id, event.kind)).collect()
 }
 
-/// Returns the passages that `events` report, and whether into the hall.
+/// Returns the passages in `events`, each with its time and whether it led into the hall.
 fn reported_passages(events: &[(f64, Event)]) -> Vec<(f64, bool)> {
     let door = |(at_s, event): &(f64, Event)| match event.kind {
         Kind::Door { to, .. } => Some((*at_s, to == Some(0))),
@@ -21,8 +21,9 @@ fn reported_passages(events: &[(f64, Event)]) -> Vec<(f64, bool)> {
     events.iter().filter_map(door).collect()
 }
 
-/// Returns the number of passages of `walkers` without a report, and of reports without a passage. Someone who stands in the
-/// opening is counted when they leave it, so that a report may come as long before or after the passage as they stand there.
+/// Returns the number of passages of `walkers` without a report, and of reports without a passage. A person who stands
+/// in the opening is counted when they leave it, so the report may be earlier or later than the passage by the time
+/// that they stand.
 fn count_errors(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (usize, usize) {
     let mut reports = reported_passages(events);
     let mut missed = 0;
@@ -39,7 +40,7 @@ fn count_errors(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (u
     (missed, reports.len())
 }
 
-/// Minutes of each scanner in each position: an hour for all of them.
+/// Simulated time of each scanner in each position, in minutes. Together, it is an hour.
 const EMPTY_MINUTES: u64 = 5;
 
 fn check_no_events(leaves: DoorKind) {
@@ -90,13 +91,14 @@ fn leaves_swinging_into_the_lobby_cause_no_events() {
     check_no_events(DoorKind::SwingOut);
 }
 
-/// Seeds of each scanner.
+/// Number of seeds for each scanner.
 const SEED_COUNT: u64 = 20;
-/// Share of passages that may be wrong with one degree and ten scans a second, where a leg is one beam at the door.
+/// Maximum share of wrong passages with one degree and ten scans per second, where a leg at the door is a single beam.
 const MAX_ERROR_SHARE: f64 = 0.05;
 
-/// Runs the walkers of each seed, with all leaves and scanners. The door opens within the first meters of `opens`, and stays
-/// open for the seconds of the second one. People stand in the opening for up to `stand_s` seconds.
+/// Runs the walkers of each seed with all leaves and scanners. The door opens for people within the first value of
+/// `opens`, in meters, and stays open for the second one, in seconds. People stand in the opening for up to `stand_s`
+/// seconds.
 fn check_counts(
     of_seed: impl Fn(&mut fastrand::Rng) -> Vec<Walker>,
     seconds: u64,

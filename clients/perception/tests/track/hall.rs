@@ -1,6 +1,6 @@
-//! A hall with a door at its end, before a scanner at the other end: leaves that slide or swing, people who walk and stand,
-//! and mixed values where a beam meets two surfaces. Virtual time and seeds.
-#![allow(dead_code)] // Every test file takes what it needs.
+//! A simulated hall with a scanner at one end and a door at the other: leaves that slide or swing, people who walk and
+//! stand, and mixed ranges where a beam meets two surfaces. It uses virtual time and seeds.
+#![allow(dead_code)] // Each test file uses only a part of it.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -10,7 +10,7 @@ use scanhub_preprocess::background::{BackgroundModel, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Foreground, Pose, Scan, ScanHead};
 
-/// The hall has 8 m by 6 m, and the lobby behind it 8 m by 4 m. The opening in the wall between them is 1.8 m wide.
+/// A hall of 8 m by 6 m, and a lobby of 8 m by 4 m behind it. The opening in the wall between them is 1.8 m wide.
 pub(crate) const HALL_SITE: &str = r#"
 [[sensor]]
 name = "front"
@@ -36,26 +36,26 @@ const HALL_WALLS: [[Point; 2]; 7] = [
     [[6.0, 4.0], [10.0, 4.0]],
     [[10.0, -4.0], [10.0, 4.0]],
 ];
-/// Half the width of the opening, which is the width of a leaf, and the way of a leaf that slides.
+/// Width of a leaf, which is half of the opening, and distance by which a sliding leaf moves.
 const LEAF_WIDTH_M: f64 = 0.9;
 const SLIDE_DISTANCE_M: f64 = 0.85;
 /// Time in which a leaf opens or closes.
 const MOVE_TIME_S: f64 = 1.5;
-/// Time until the door moves again by itself, if it does.
+/// Interval at which a door that moves by itself opens.
 const MOVE_INTERVAL_S: f64 = 20.0;
-/// Angle that a beam covers, standard deviation of a range, and the share of beams on an edge with a mixed value.
+/// Angle that a beam covers, standard deviation of a range, and share of beams on an edge with a mixed range.
 const BEAM_RAD: f64 = 0.5 * PI / 180.0;
 const NOISE_M: f64 = 0.01;
 const MIXED_SHARE: f64 = 0.2;
 const LEG_RADIUS_M: f64 = 0.06;
 const START_NS: u64 = 1_800_000_000_000_000_000;
 
-/// The movement of the two leaves.
+/// Movement of the two leaves.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum DoorKind {
-    /// Along the wall, in a plane so far behind it.
+    /// Along the wall, in a plane at this distance behind it, in meters.
     Slide(f64),
-    /// About the two jambs, by a right angle: into the hall, or into the lobby.
+    /// About the two jambs by a right angle, into the hall or into the lobby.
     SwingIn,
     SwingOut,
 }
@@ -76,7 +76,7 @@ pub(crate) const SCANNERS: [Scanner; 4] = [
 ];
 
 impl DoorKind {
-    /// Returns the leaves of a door that is open by `share`.
+    /// Returns the leaves of a door that is open by `share`, from 0 to 1.
     fn at(self, share: f64) -> [[Point; 2]; 2] {
         let (sin, cos) = (share * FRAC_PI_2).sin_cos();
         [1.0, -1.0].map(|side| match self {
@@ -92,18 +92,19 @@ impl DoorKind {
     }
 }
 
-/// A person who comes at `from_s`, and walks from point to point. At each of them, they stand for some seconds.
+/// A person who appears at `from_s` and walks from point to point. Each point has the time for which they stand there,
+/// in seconds.
 pub(crate) struct Walker {
     pub(crate) from_s: f64,
     pub(crate) path: Vec<(Point, f64)>,
     pub(crate) speed: f64,
-    /// Share of a double step that they are ahead at the start.
+    /// Share of a double step by which they are ahead at the start.
     pub(crate) phase: f64,
 }
 
 impl Walker {
-    /// Returns where the person is, in which direction they look, how far they have walked, and whether they stand; `None`
-    /// before they come and after they have left.
+    /// Returns position, heading, walked distance, and whether the person stands. Returns `None` before they appear and
+    /// after they have left.
     pub(crate) fn at(&self, now_s: f64) -> Option<(Point, Point, f64, bool)> {
         let mut left_s = now_s - self.from_s;
         let mut walked_m = 0.0;
@@ -129,11 +130,11 @@ impl Walker {
         None
     }
 
-    /// Returns the middles of both legs.
+    /// Returns the centers of both legs.
     fn legs(&self, now_s: f64) -> Option<[Point; 2]> {
         let (place, [hx, hy], walked_m, stands) = self.at(now_s)?;
         let stride = if stands { 0.0 } else { 0.25 * (TAU * (self.phase + walked_m / 1.4)).sin() };
-        // No one stands quite still.
+        // A standing person sways a little.
         let sway = if stands { 0.03 * (1.3 * now_s).sin() } else { 0.0 };
         Some([1.0, -1.0].map(|side| {
             let (ahead, aside) = (side * stride + sway, side * 0.11 + 0.5 * sway);
@@ -141,7 +142,7 @@ impl Walker {
         }))
     }
 
-    /// Returns when this person goes through the door, and whether into the hall.
+    /// Returns the times at which this person goes through the door, and whether into the hall.
     pub(crate) fn passages(&self) -> Vec<(f64, bool)> {
         let mut passages = Vec::new();
         let mut before: Option<Point> = None;
@@ -164,19 +165,20 @@ pub(crate) struct Scene<'a> {
     pub(crate) site: &'a str,
     pub(crate) leaves: DoorKind,
     pub(crate) scanner: Scanner,
-    /// Position of the scanner, which looks at the wall with the door.
+    /// Position of the scanner, which faces the wall with the door.
     pub(crate) at: Point,
     pub(crate) seed: u64,
     pub(crate) seconds: u64,
-    /// The door opens every 20 s, although no one is near it.
+    /// Whether the door opens every 20 s even without a person near it.
     pub(crate) is_door_moving: bool,
-    /// Distance of a person from the middle of the door within which it opens, and the time for which it then stays open.
+    /// Distance in meters from the middle of the door at which a person opens it, and the time for which it then stays
+    /// open.
     pub(crate) opens_m: f64,
     pub(crate) open_time_s: f64,
     pub(crate) walkers: &'a [Walker],
 }
 
-/// Returns the events in the hall, with their time in seconds.
+/// Returns the events in the hall with their times in seconds.
 pub(crate) fn events(scene: &Scene<'_>) -> Vec<(f64, Event)> {
     let mut events = Vec::new();
     run(scene, |sample| {
@@ -186,7 +188,7 @@ pub(crate) fn events(scene: &Scene<'_>) -> Vec<(f64, Event)> {
     events
 }
 
-/// Runs a scene, and passes each picture to `show`.
+/// Runs a scene, and passes each snapshot to `on_sample`.
 pub(crate) fn run(scene: &Scene<'_>, mut on_sample: impl FnMut(&Snapshot)) {
     let Scene { leaves, scanner, walkers, at, .. } = *scene;
     let from_scanner = |[x, y]: Point| [x - at[0], y - at[1]];
@@ -266,7 +268,7 @@ pub(crate) fn run(scene: &Scene<'_>, mut on_sample: impl FnMut(&Snapshot)) {
     }
 }
 
-/// Returns the range of the nearest wall in a direction from the scanner, and the number of that wall.
+/// Returns the range of the nearest wall in a direction from the scanner, and the index of this wall.
 fn nearest<'a>(ray: Point, walls: impl Iterator<Item = (usize, &'a [Point; 2])>) -> (f64, usize) {
     let meets = |(number, &[a, b]): (usize, &[Point; 2])| {
         let along = [b[0] - a[0], b[1] - a[1]];
@@ -278,7 +280,7 @@ fn nearest<'a>(ray: Point, walls: impl Iterator<Item = (usize, &'a [Point; 2])>)
     walls.filter_map(meets).fold((f64::INFINITY, usize::MAX), |a, b| if b.0 < a.0 { b } else { a })
 }
 
-/// Returns a standard normal number.
+/// Returns a standard normal random number.
 fn normal(random: &mut fastrand::Rng) -> f64 {
     (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
 }

@@ -1,4 +1,4 @@
-//! Ignored areas: no one is found in them, and a person who walks through one keeps their identity.
+//! Tests of ignored areas: no person is detected in them, and a person who walks through one keeps their ID.
 
 use crate::hall::{DoorKind, HALL_SITE, SCANNERS, Scene, Walker, run};
 use scanhub_perception::track::Kind;
@@ -9,20 +9,20 @@ name = "fountain"
 polygon = [[2, -1], [4, -1], [4, 1], [2, 1]]
 "#;
 
-/// Something in the fountain that moves like a person, from second 25 on.
+/// Returns an object in the fountain that moves like a person, from second 25 on.
 fn fountain_walker() -> Walker {
     let corners = [[2.4, -0.6], [3.6, -0.6], [3.6, 0.6], [2.4, 0.6]];
     let path = corners.into_iter().cycle().take(60).map(|corner| (corner, 0.0)).collect();
     Walker { from_s: 25.0, path, speed: 0.8, phase: 0.0 }
 }
 
-/// A person who walks across the hall through the fountain, or stops in it.
+/// Returns a person who walks across the hall through the fountain, and stands in it for `stands_s` seconds.
 fn visitor(stands_s: f64) -> Walker {
     let path = vec![([3.0, 3.5], 0.0), ([3.0, 0.0], stands_s), ([3.0, -3.5], 5.0), ([3.2, -3.5], 0.0)];
     Walker { from_s: 26.0, path, speed: 1.1, phase: 0.3 }
 }
 
-/// Returns what happens in a hall with these people: identities that appear, and those that leave.
+/// Returns the IDs that appear in a hall with these people, and the IDs that leave.
 fn appeared_and_left(site: &str, walkers: &[Walker]) -> (Vec<u64>, Vec<u64>) {
     let scene = Scene {
         site,

@@ -1,6 +1,6 @@
-//! Real people before a real scanner, whose legs others have labelled: tracks are where the labels are. The recordings are no
-//! part of the project; without them the test is left out, which is said. They are of one scanner in one place, so that the
-//! background is learned from those that are not scored, as by a hub that was there before.
+//! Test with recordings of real people, whose legs were labeled by hand: tracks must cover the labels. The recordings
+//! are not a part of the project. Without them, the test is skipped with a message. All are from one scanner in one
+//! place, so the background is learned from the recordings that are not scored, like that of a hub that ran before.
 
 #[path = "../../../../tests/testkit/skip.rs"]
 mod skip;
@@ -18,11 +18,12 @@ use scanhub_schema::{Background, BackgroundHead, Code, Foreground, Pose, Scan, S
 use serde_json::Value;
 
 const BEAM_COUNT: usize = 768;
-/// Ten seconds, after which something is background, of the 7.5 scans a second that there are.
+/// Number of scans after which a surface is background: ten seconds at 7.5 scans per second.
 const SCANS_PER_WALK: u32 = 75;
-/// A track covers the labels within this distance.
+/// Maximum distance between a label and a track that covers it, in meters.
 const SEGMENT_MATCH_M: f64 = 0.35;
-/// Shares of the labels that are covered: with a background at the start, and without; as measured, rounded down.
+/// Minimum shares of the labels that are covered, with a background at the start and without one. They are measured
+/// values, rounded down.
 const MIN_SHARE_WITH_BACKGROUND: f64 = 0.94;
 const MIN_SHARE_WITHOUT_BACKGROUND: f64 = 0.75;
 
@@ -35,14 +36,14 @@ name = "hall"
 polygon = [[-12, -12], [12, -12], [12, 12], [-12, 12]]
 "#;
 
-/// A scan, when it was, and the legs that are labelled in it.
+/// A scan with its stamp and the labeled legs.
 struct RecordedScan {
     stamp_ns: u64,
     scan: Box<Scan>,
     legs: Vec<Point>,
 }
 
-/// The walks in the folder `people`, in the order of time.
+/// Returns the walks in the folder `people` in the order of time; `None` if there are none.
 fn read_walks() -> Option<Vec<Vec<RecordedScan>>> {
     let default_folder = || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data"));
     let people = std::env::var_os("SCANHUB_DATA").map_or_else(default_folder, PathBuf::from).join("people");
@@ -58,7 +59,7 @@ fn read_walks() -> Option<Vec<Vec<RecordedScan>>> {
     Some((1..=3).map(read).collect())
 }
 
-/// Ranges are in metres; null is a beam from which nothing came back: most are of the open way ahead.
+/// Parses a scan. Ranges are in meters; null is a beam without a return, mostly in the open direction ahead.
 fn read_scan(text: &str) -> Option<RecordedScan> {
     let line: Value = serde_json::from_str(text).ok()?;
     let step = line["step"].as_f64()?;
@@ -83,7 +84,7 @@ fn read_scan(text: &str) -> Option<RecordedScan> {
     })
 }
 
-/// What a hub saves that has seen these walks.
+/// Returns the background that a hub has saved after these walks.
 fn background<'a>(walks: impl Iterator<Item = &'a Vec<RecordedScan>>) -> Box<Background> {
     let (mut model, mut foreground) = (
         BackgroundModel::new(Settings { scans: Some(SCANS_PER_WALK), ..Settings::default() }, BEAM_COUNT),
@@ -95,7 +96,7 @@ fn background<'a>(walks: impl Iterator<Item = &'a Vec<RecordedScan>>) -> Box<Bac
     background
 }
 
-/// How many labels of a walk a track covers, of a hub that begins with `background`.
+/// Returns the number of labels of a walk that a track covers, for a hub that starts with `background`.
 fn covered_legs(walk: &[RecordedScan], background: Option<&Background>) -> usize {
     let mut people = PeopleTracker::new(Site::parse("room.toml", ROOM_SITE).expect("a room"), 0);
     let (mut model, mut segmenter) = (

@@ -1,5 +1,5 @@
-//! The tracker from outside: people, doors, ignored areas, recordings of real people, site files, and the site file of
-//! docs/tracks.md with its drawing.
+//! Tests of the tracker from outside: people, doors, ignored areas, recordings of real people, site files, and the site
+//! file in docs/tracks.md with its drawing.
 
 mod doors;
 mod hall;

@@ -1,5 +1,5 @@
-//! The tracker from outside, in the house of the proof: the same tracks in whatever order scans arrive, late scans and clocks that
-//! jump, identities that are never used again, a sensor that dies and comes back, and a person who sits down.
+//! Tests of the tracker in the house of the proof. The tracks must not depend on the order of arrival. The tests also
+//! cover late scans, clock jumps, IDs that are never reused, a sensor that is interrupted, and a person who sits down.
 
 use std::collections::BTreeSet;
 
@@ -30,12 +30,14 @@ fn site() -> Site {
 const IDEAL: House = House { is_ideal: true };
 const FURNISHED: House = House { is_ideal: false };
 
-/// Returns the scans of the ideal house while `count` people walk there from second 12 on: 25 per second and sensor.
+/// Returns the scans of the ideal house, in which `count` people walk from second 12 on. Each sensor sends 25 scans per
+/// second.
 fn simulate(count: usize, seconds: u64) -> Vec<SentScan> {
     simulate_house(IDEAL, (count, 0.0), 3, seconds, |_| {})
 }
 
-/// Returns the scans of a `house`. People spend the share `sits` of their rests on a chair. `each` receives the crowd every 10 ms.
+/// Returns the scans of a `house`. People spend the second value of the pair as the share of their rests on a chair.
+/// `each` receives the crowd every 10 ms.
 fn simulate_house(
     house: House,
     (count, sits): (usize, f64),
@@ -90,7 +92,7 @@ fn order_of_arrival_does_not_change_the_tracks() {
     let (in_order, people) = track(sent.iter());
     assert!(in_order.iter().any(|sample| sample.tracks.len() >= 3));
     assert_eq!((people.counts().scans, people.counts().late), (2_400, 0));
-    // Each group of seven comes backwards: 60 ms, less than is waited for.
+    // Reverse each group of seven scans. This is 60 ms, which is less than the delay.
     let turned: Vec<&SentScan> = sent.chunks(7).flat_map(|some| some.iter().rev()).collect();
     let (turned, people) = track(turned.into_iter());
     assert_eq!(people.counts().late, 0);
@@ -116,7 +118,7 @@ fn late_scans_and_clock_jumps_are_counted_and_dropped() {
     people.finish(|sample| shown.push(sample.clone()));
     let counts = people.counts();
     assert_eq!((counts.late, counts.jumped, counts.invalid), (9, 9, 0));
-    // Sensors send in turn, so that every 200th scan comes from the first one.
+    // Sensors send in turn, so every 200th scan comes from the first one.
     assert_eq!(people.late(), [9, 0, 0, 0]);
     assert!(in_order == shown);
     let other = Foreground::of(181);
@@ -149,7 +151,7 @@ fn sensor_failure_reuses_no_id_and_adds_no_person() {
 #[test]
 fn clock_offset_is_estimated_from_shared_people() {
     let mut sent = simulate(4, 60);
-    // Sensors 1 and 3 are of another hub, whose clock is 40 ms ahead.
+    // Sensors 1 and 3 belong to another hub, whose clock is 40 ms ahead.
     sent.iter_mut().filter(|one| one.sensor % 2 == 1).for_each(|one| one.wall_ns += 40 * MS);
     let (_, people) = track(sent.iter());
     assert_eq!(people.offset_s(0), 0.0);
@@ -175,7 +177,7 @@ fn misplaced_sensor_is_reported_once_and_corrected() {
         (misplaced[0].offset[0] + 0.4).abs() < 0.1 && (misplaced[0].offset[1] - 0.3).abs() < 0.1,
         "{misplaced:?}"
     );
-    // From then on nobody is seen twice.
+    // After the correction, no person is seen twice.
     let since = shown.iter().position(|sample| !sample.misplaced.is_empty()).expect("it is told");
     let is_known = |track: &&scanhub_perception::track::Track| {
         matches!(track.state, TrackState::Confirmed | TrackState::Hidden)
@@ -196,7 +198,7 @@ fn returning_sensor_adds_no_person() {
     };
     let max_people = samples.iter().map(|sample| sample.tracks.iter().filter(is_known).count()).max();
     assert!(max_people <= Some(4), "three people, and one who is not yet joined: {max_people:?}");
-    // While nobody looks, who is there gets uncertain.
+    // While no sensor sees them, the positions of people become uncertain.
     let at = |second: u64| {
         let sample = samples.iter().find(|sample| sample.wall_ns >= START_NS + 1_000 * MS * second);
         sample.expect("a picture").tracks.iter().map(|track| track.covariance[0]).fold(0.0, f64::max)

@@ -1,4 +1,4 @@
-//! Site files: what is read, and what each mistake is told.
+//! Tests of site files: their contents, and the error for each mistake.
 
 use scanhub_perception::track::Site;
 use scanhub_schema::Kind;
