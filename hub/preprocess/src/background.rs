@@ -1,7 +1,8 @@
-//! Decides which beams of a scan hit the permanent surroundings, and which hit something in front of them.
+//! Models of the background, which decide which beams of a scan hit the permanent surroundings, and which hit something
+//! in front of them.
 //!
-//! A [`BackgroundModel`] of the surroundings is learned from the scans: beam by beam by one of two methods (`fixed`), or as a map
-//! around a sensor that moves (`moving`).
+//! A [`BackgroundModel`] learns the surroundings from the scans: beam by beam with one of two methods (`fixed`), or as
+//! a map around a sensor that moves (`moving`).
 
 mod fixed;
 mod moving;
@@ -31,22 +32,22 @@ pub struct Settings {
     pub candidate_mm: Option<u16>,
     /// Number of scans until a surface is background. `None`: 375 at half degrees, 750 at 1, 188 at a quarter, which
     /// are 10 s at the full rate. `multi` knows a surface well enough after 5/8 of this number. At most 8191, which is
-    /// 3.6 minutes at half degrees; a greater number counts as that.
+    /// 3.6 minutes at half degrees; a greater number counts as 8191.
     pub scans: Option<u32>,
     /// Reading that a candidate is compared with (`paper`).
     pub candidate: Candidate,
-    /// Contents of the model at the start.
+    /// Contents of the model at the start and after each reset.
     pub start: Start,
     /// Whether a beam without a return has a far background. Otherwise, it is not a reading. `None`: true for `multi`,
-    /// which then detects people in front of glass, at no cost elsewhere; false for `paper`, whose runs each such beam
-    /// ends.
+    /// which then detects people in front of glass, at no cost elsewhere; false for `paper`, because each such beam
+    /// ends a run.
     pub no_return_is_far: Option<bool>,
 }
 
 /// Method of learning a background.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Method {
-    /// One background per beam, replaced by a range that was read often enough in a row.
+    /// One background per beam, which is replaced by a range that was read in enough consecutive scans.
     Paper,
     /// Several surfaces per beam, and neighbors that must agree before something is in the foreground.
     #[default]
@@ -79,11 +80,12 @@ pub enum Start {
 /// The settings in the units of the scans.
 #[derive(Clone, Copy, Debug)]
 struct Limits {
-    /// In device units. Low enough that no range is near [`scanhub_schema::Background::FAR`].
+    /// Maximum difference of readings of one surface, in device units. It is low enough that no range is near
+    /// [`scanhub_schema::Background::FAR`].
     threshold: u16,
     /// In device units.
     candidate: u16,
-    /// 1 to [`MAX_SCANS`].
+    /// Number of scans until a surface is background, from 1 to [`MAX_SCANS`].
     scans: u16,
     latest: bool,
     no_return_is_far: bool,
@@ -95,17 +97,17 @@ struct Limits {
 
 /// Default of both thresholds: six standard deviations of a range (the paper names no value).
 const THRESHOLD_MM: u16 = 30;
-/// The same in cm mode, where quantization adds to it.
+/// Default in cm mode, where the quantization adds to the noise.
 const THRESHOLD_CM_MODE_MM: u16 = 60;
-/// The same in dm mode, where surfaces 30 mm apart are read as at most one unit apart.
+/// Default in dm mode, where readings of surfaces 30 mm apart differ by at most one unit.
 const THRESHOLD_DM_MODE_MM: u16 = 100;
 /// 750 mirror revolutions of an LMS: this number of scans at 1 degree, half of them at half degrees.
 const LEARNING_TIME_NS: f64 = 9.99e9;
-/// Maximum that the weights of `multi` have room for: eight per scan in 16 bits.
+/// Maximum number of scans. The weights of `multi` grow by 8 per scan and have 16 bits.
 const MAX_SCANS: u32 = 8191;
 /// Maximum difference of two ranges. [`scanhub_schema::Background::FAR`] differs by more from all of them.
 const MAX_DIFFERENCE: u32 = 0x7FFF;
-/// Maximum rounding error of a quotient: a whole number stays that number.
+/// Maximum rounding error of a quotient, so that rounding up keeps a whole number.
 const ROUNDING_ERROR: f64 = 1e-6;
 
 impl Limits {
@@ -140,22 +142,22 @@ impl Limits {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Class {
-    /// It has no reading.
+    /// The beam has no reading.
     Invalid,
-    /// Its background is unknown; or (`multi`) something is nearer, but on too few beams.
+    /// The beam's background is unknown; or (`multi`) something is nearer, but on too few beams.
     Unknown,
-    /// It ends where it always does.
+    /// The beam ends at its background.
     Background,
-    /// It ends nearer than its background.
+    /// The beam ends nearer than its background.
     Foreground,
-    /// It ends farther away than its background: an object was removed.
+    /// The beam ends farther away than its background: an object was removed.
     Behind,
 }
 
 /// The background of one sensor.
 ///
-/// A scan with another shape than the previous one (number of beams, unit, angles) resets it. A reading of 0 is like
-/// any other, but as a background it cannot be distinguished from an unknown one.
+/// A scan with another shape than the previous one (number of beams, unit, angles) resets it. A reading of 0 is treated
+/// like any other, but as a background it cannot be distinguished from an unknown one.
 #[derive(Clone)]
 pub struct BackgroundModel {
     settings: Settings,
@@ -191,7 +193,7 @@ enum MethodState {
 const INVALID: u16 = Background::FAR - 1;
 
 impl BackgroundModel {
-    /// Creates an empty model for scans of at most `beams` beams. It allocates all the memory that it ever needs.
+    /// Creates an empty model for scans of at most `beams` beams. Allocates all the memory that the model ever needs.
     pub fn new(settings: Settings, beams: usize) -> BackgroundModel {
         BackgroundModel {
             settings,
@@ -241,7 +243,7 @@ impl BackgroundModel {
     }
 
     /// Sets the robot's position at the next scan, as in `motion`, and its `velocity` during that scan, for a sensor at
-    /// `pose` and [`Method::Moving`]. If the motion restarts or is refused, the model forgets everything.
+    /// `pose` and [`Method::Moving`]. If the motion restarts or is refused, the model is reset.
     pub fn set_motion(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) {
         if let MethodState::Moving(moving) = &mut self.method_state
             && !moving.set_motion(pose, motion, velocity)
@@ -294,8 +296,7 @@ impl BackgroundModel {
         self.generation
     }
 
-    /// Returns the number of scans in which something must be met until it is background, as set or as computed from
-    /// the last scan.
+    /// Returns the number of scans until a surface is background, as set or as computed from the last scan.
     pub fn scans(&self) -> u16 {
         self.limits.scans
     }
@@ -305,7 +306,7 @@ impl BackgroundModel {
         self.is_frozen
     }
 
-    /// Forgets everything. A frozen model stays frozen, and is empty until it is thawed.
+    /// Empties the model. A frozen model stays frozen, and is empty until it is thawed.
     pub fn reset(&mut self) {
         match &mut self.method_state {
             MethodState::Paper(paper) if self.settings.method == Method::Paper => paper.reset(),
@@ -317,7 +318,7 @@ impl BackgroundModel {
         self.is_empty = true;
     }
 
-    /// Stops learning; scans are compared as before.
+    /// Stops learning. Scans are still compared.
     pub fn freeze(&mut self) {
         self.is_frozen = true;
     }
@@ -327,11 +328,12 @@ impl BackgroundModel {
         self.is_frozen = false;
     }
 
-    /// Uses the ranges of `model` as the background. Candidates are forgotten. Generation and flags of `model` are
-    /// ignored.
+    /// Uses the ranges of `model` as the background, and drops all candidates. Ignores the generation and the flags of
+    /// `model`.
     ///
-    /// Before the first scan, its shape is unknown, so any model is accepted. A first scan with another number of beams
-    /// or unit resets it, like any change.
+    /// Before the first scan, its shape is unknown, so any model is accepted. If the first scan has another number of
+    /// beams or another unit, it resets the model, like any such change. # Errors Returns [`Mismatch`] if the number of
+    /// beams or the unit differs from those of the last scan, or if there are too many beams.
     pub fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
         let ranges = model.ranges();
         let shape = (ranges.len() as u16, model.unit_um);
@@ -348,10 +350,10 @@ impl BackgroundModel {
         Ok(())
     }
 
-    /// Learns by `settings` from the next scan on. The background stays, as well known as possible. Candidates are
-    /// forgotten, and the generation increases, as after [`load`](Self::load).
+    /// Applies `settings` from the next scan on. Keeps the background, fully known, and drops all candidates. The
+    /// generation increases, as after [`load`](Self::load).
     pub fn change(&mut self, settings: Settings) {
-        // Between two scans, there are no readings.
+        // The buffer of readings is free between two scans.
         let beams = self.beams();
         for (i, range) in self.readings[..beams].iter_mut().enumerate() {
             *range = self.method_state.background(i, &self.limits);
@@ -415,8 +417,8 @@ impl MethodState {
     }
 }
 
-/// Writes the readings of `scan` in device units, [`Background::FAR`] or [`INVALID`]. The values themselves are
-/// compared, because there are many.
+/// Writes the readings of `scan` in device units, [`Background::FAR`] or [`INVALID`]. Compares the values without
+/// [`Reading`], because there are many.
 fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16]) {
     let ScanHead { valid_to, no_return, beyond, .. } = **scan;
     let valid_to = valid_to.min(INVALID - 1);
@@ -477,15 +479,15 @@ impl fmt::Display for Mismatch {
 
 impl std::error::Error for Mismatch {}
 
-/// Decides how many neighboring beams, in how many scans, count as an object. Noise and mixed readings at edges are
-/// single beams. People cover several, unless they are far away.
+/// Filter that decides how many neighboring beams, in how many scans, count as an object. Noise and mixed readings at
+/// edges affect single beams. People cover several beams, unless they are far away.
 #[derive(Clone)]
 struct RunFilter {
     /// Readings of beams of the last scan that were nearer than their background; [`INVALID`] for the others.
     foreground: Box<[u16]>,
-    /// Those of them that counted as an object.
+    /// Readings of `foreground` that counted as an object; [`INVALID`] for the others.
     objects: Box<[u16]>,
-    /// The same for the current scan.
+    /// Foreground and objects of the current scan.
     next: [Box<[u16]>; 2],
 }
 
@@ -507,7 +509,7 @@ impl RunFilter {
     ///
     /// A run of three beams counts at once. A shorter one counts if the last scan had a foreground beam of an object
     /// there. It also counts if it is as long as a leg is wide at its range, and the last scan had any foreground beam
-    /// there. There means among or next to its own beams, within 200 mm of its nearest range.
+    /// there. *There* means among or next to the run's own beams, within 200 mm of its nearest range.
     fn retain_objects(&mut self, readings: &[u16], limits: &Limits, classes: &mut [Class]) {
         let beam_count = self.foreground.len();
         let [foreground, objects] = &mut self.next;
@@ -557,10 +559,10 @@ fn leg_beams(range: u16, limits: &Limits) -> u64 {
         .map_or(MIN_OBJECT_BEAMS, |beams| beams.clamp(1, MIN_OBJECT_BEAMS))
 }
 
-/// Number of beams that are never noise. More are not required, however near an object is.
+/// Number of neighboring beams that are never noise. A run never needs more, however near the object is.
 const MIN_OBJECT_BEAMS: u64 = 3;
-/// Width of a leg with its trousers and of a beam. Among 120, 135 and 150 mm, it has the best recall that costs no
-/// precision in the room of Fig. 8.
+/// Width of a leg with trousers, plus that of a beam. Among 120, 135 and 150 mm, this width has the best recall that
+/// costs no precision in the room of Fig. 8.
 const LEG_WIDTH_MM: u64 = 135;
 const MDEG_PER_RADIAN: u64 = 57_296;
 /// Maximum movement of an object between two scans, and its depth: 5 m/s at 37.5 Hz is 133 mm.
@@ -572,14 +574,14 @@ mod tests {
 
     use super::*;
 
-    /// Reading of one beam, as the design states it. [`measure`] does the same for whole scans, but faster.
+    /// Reading of one beam. [`measure`] has the same result for whole scans, but is faster.
     #[derive(Clone, Copy, Debug, PartialEq, Eq)]
     enum Reading {
         /// A range in mm.
         Valid(u32),
         /// No object within reach.
         Far,
-        /// Unknown: dazzled, too weak a signal, a reading error.
+        /// No valid reading: the scanner was dazzled, the signal was too weak, or there was a reading error.
         Invalid,
     }
 

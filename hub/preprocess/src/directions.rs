@@ -4,7 +4,7 @@ use scanhub_schema::{Pose, Scan};
 
 /// Directions of the beams of one sensor in the robot's frame, as unit vectors.
 pub(crate) struct Directions {
-    /// Pose of the sensor, first angle and step of the scans that the grid is for.
+    /// Pose of the sensor, first angle and step of the scans for which the grid was computed.
     layout: Option<(Pose, f64, f64)>,
     grid: Box<[(f64, f64)]>,
 }

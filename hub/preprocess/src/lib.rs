@@ -1,5 +1,5 @@
-//! Results computed from a scan. Each processor is a small struct that reads a scan and fills a payload, with arrays
-//! of fixed size: no heap, no clock, no telegrams. The result of a processor does not depend on which others run.
+//! Processors of scans. Each one is a small struct that reads a scan and fills a payload, without heap allocation,
+//! clock or I/O. The result of a processor does not depend on which others run.
 
 #![forbid(unsafe_code)]
 

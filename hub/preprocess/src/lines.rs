@@ -1,5 +1,5 @@
-//! Finds the straight lines of one scan: those that make the measured ranges likeliest, if each range has normal noise
-//! along its beam. A beam belongs to one line or to none. No state is kept from one scan to the next.
+//! Straight lines of one scan: those that make the measured ranges likeliest, if each range has normal noise along its
+//! beam. A beam belongs to one line or to none. No state is kept from one scan to the next.
 //!
 //! The method is maximum likelihood as in Schaefer, Buescher, Luft, Burgard: "A Maximum Likelihood Approach to Extract
 //! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected: pairs of beams are joined
@@ -27,8 +27,8 @@ pub struct Settings {
     pub max: u8,
     /// Minimum number of beams of a line, at least 3.
     pub min_points: u16,
-    /// Whether to use the slower, better form: cuts are moved to where they help most, and beams at the ends of a line
-    /// that fit worst are dropped.
+    /// Whether to use the slower, better method: it moves cuts to where they help most, and drops beams at the ends of
+    /// a line that fit worst.
     pub refine: bool,
     /// Condition that ends the joining of lines.
     pub stop: StopCriterion,
@@ -37,11 +37,11 @@ pub struct Settings {
 /// Condition that ends the joining of lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum StopCriterion {
-    /// One line less would explain the scan worse than its noise does. Points more than one meter apart are never
-    /// joined. The paper has this distance for real scans.
+    /// Joining ends when one line less would explain the scan worse than noise does. Points more than one meter apart
+    /// are never joined; the paper uses this distance for real scans.
     Likelihood,
-    /// At most `max` lines are left. Points farther apart than this number of meters are never joined. Used for
-    /// comparisons at equal numbers of lines.
+    /// Joining ends when at most `max` lines are left. Points farther apart than this number of meters are never
+    /// joined. For comparisons at equal numbers of lines.
     Number(f64),
 }
 
@@ -56,10 +56,10 @@ pub struct LineFinder {
     pose: Pose,
     settings: Settings,
     directions: Directions,
-    /// Beams that have a range, and their numbers.
+    /// Beams that have a range. `beams` has their indices.
     rays: Box<[Ray]>,
     beams: Box<[u16]>,
-    /// Index after the last ray of each group. Neighbors in a group are near enough to each other.
+    /// Index after the last ray of each group. Neighbors in a group are near enough to each other to be on one line.
     ends: Box<[u16]>,
     /// Memory for estimating the noise.
     steps: Box<[[f64; 2]]>,
@@ -174,7 +174,7 @@ impl LineFinder {
     fn bounds(&self, rays: usize, noise: f64) -> Bounds {
         let Settings { max, min_points, refine, stop } = self.settings;
         let penalty = PARAMETERS_PER_LINE * (rays.max(2) as f64).ln() * noise * noise;
-        // If no distance separates points, all of them end on a line.
+        // Without a maximum distance, all points are on a line.
         let (penalty, variance, loss) = match stop {
             StopCriterion::Likelihood => (penalty, noise * noise, BEAM_LOSS_M * BEAM_LOSS_M),
             StopCriterion::Number(gap_m) if gap_m.is_finite() => {
@@ -190,22 +190,22 @@ impl LineFinder {
             min_points: usize::from(min_points),
             rounds: if refine { 3 } else { 1 },
             exchange: refine,
-            // 19 of 20 beams still end on a line. In rooms drawn like those of PLE, 97.8 % do.
+            // After that, 19 of 20 beams still end on a line. In rooms drawn like those of PLE, 97.8 % do.
             trimmed: if refine { rays / 20 } else { 0 },
         }
     }
 }
 
 /// Number of parameters of a line: its two numbers, and the cut to the next line, which counts twice, as in the
-/// criterion of Zhang and Siegmund (2007) for points of change.
+/// criterion of Zhang and Siegmund (2007) for change points.
 const PARAMETERS_PER_LINE: f64 = 4.0;
 /// Maximum distance of neighboring points of one line in meters. PLE uses it for real scans.
 const MAX_GAP_M: f64 = 1.0;
-/// Error in meters that dropping a beam counts as, if there are more lines than allowed. On logs of four sensors (aces,
+/// Cost of dropping a beam if there are more lines than allowed, as an error in meters. On logs of four sensors (aces,
 /// Freiburg, Intel, Orebro: `cargo bench --bench perception`), ten vertices then cover more beams than those of RANSAC,
 /// and fit better.
 const BEAM_LOSS_M: f64 = 0.2;
-/// Lines are neighbors if fewer beams than this are between them.
+/// Maximum number of beams between neighboring lines.
 const MAX_NEIGHBOR_GAP: f32 = 4.5;
 /// Number of steps of Newton's method to the likeliest line.
 const NEWTON_STEPS: usize = 3;
@@ -248,13 +248,13 @@ fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> 
         reserved: 0,
     };
     let numbers = [x1_m, y1_m, x2_m, y2_m, line.r_m, line.alpha_rad, line.sd_r_m, line.sd_alpha_rad];
-    // A direction that could be any is not known.
+    // With a deviation of 1 rad or more, the line may have any direction.
     let is_known = numbers.iter().all(|number| number.is_finite()) && line.sd_alpha_rad < 1.0;
     is_known.then_some(line)
 }
 
-/// Writes the corners of neighboring lines that are certainly not parallel, and that meet between the directions of the
-/// last beam of the one and the first beam of the other. Both have the same range there, so that no object is between
+/// Writes the corners of neighboring lines that are certainly not parallel, and that meet between the last beam of the
+/// first line and the first beam of the second one. Both lines have about the same range there, so no object is between
 /// them.
 fn corners(out: &mut Lines, pose: &Pose, step: f32) {
     let count = usize::from(out.count);

@@ -1,5 +1,5 @@
-//! Finds reflectors: neighboring beams with a raised intensity become one mark, at their average weighted by intensity
-//! (paper III.B.2).
+//! Detection of reflectors. Neighboring beams with a raised intensity become one mark, at their average position
+//! weighted by intensity (paper III.B.2).
 
 use std::f64::consts::{PI, TAU};
 
@@ -13,7 +13,7 @@ use crate::search::position;
 pub struct Settings {
     /// Minimum level of a beam of a mark, for scanners whose intensities are reflector levels. 0 counts as 1.
     pub min_level: u8,
-    /// Minimum intensity for other scanners. 0 counts as 1; without a value, these have no marks.
+    /// Minimum intensity for other scanners. 0 counts as 1. `None`: other scanners have no marks.
     pub level: Option<u16>,
     /// Maximum difference between the ranges of neighboring beams in a mark, in mm.
     pub max_range_step_mm: u16,
@@ -117,16 +117,16 @@ fn first_bright(intensities: &Intensities<'_>, from: usize, min_intensity: u16) 
     }
 }
 
-/// A mark that may get more beams: sums over its beams, in integers, so that they are the same on every machine.
+/// Mark that may get more beams: sums over its beams. They are integers, so that they are the same on every machine.
 #[derive(Clone, Copy, Default)]
 struct OpenMark {
-    /// Sum of w.
+    /// Sum of the weights w.
     weight: u64,
-    /// Sum of w * i.
+    /// Sum of w * i, with the beam's index i.
     beams: u64,
-    /// Sum of w times the difference of the exact angle from that of the beam, in millionths of a degree.
+    /// Sum of w times the difference of the exact angle from the angle of the beam, in millionths of a degree.
     offset_udeg: i64,
-    /// Sum of w * r in device units.
+    /// Sum of w * r, with the range r in device units.
     ranges: u64,
     last_range: u16,
     peak: u16,
@@ -158,8 +158,7 @@ impl OpenMark {
     }
 
     fn mark(&self, scan: &Scan) -> Mark {
-        // In integers, so that halves are rounded the same way on every machine; so long that nothing overflows,
-        // whatever the scan says.
+        // Integers round halves the same way on every machine. They are wide enough not to overflow with any scan.
         let [first_udeg, step_udeg] =
             [scan.first_angle, scan.step].map(|angle| (1e6 * in_degrees(angle)).round() as i128);
         let weight = 1000 * i128::from(self.weight);
@@ -183,8 +182,8 @@ fn in_range_mdeg(mdeg: i128) -> i32 {
     ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
-/// Returns the difference of the exact angle of beam `i` from that of the beam, in millionths of a degree; 0 without an
-/// exact angle. The angles may differ by whole revolutions.
+/// Returns the difference of the exact angle of beam `i` from its angle on the grid, in millionths of a degree; 0
+/// without an exact angle. The angles may differ by whole revolutions.
 fn offset_udeg(scan: &Scan, i: usize) -> i64 {
     let Some(exact) = exact_angle(scan.exact_angles(), i) else { return 0 };
     let off = exact - (scan.first_angle + i as f64 * scan.step);

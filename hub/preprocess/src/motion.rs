@@ -1,12 +1,12 @@
-//! Estimates how a robot moved from scan to scan. Corners and lines of both scans are matched first, and then all
-//! beams: each ends on a surface of the scan that it is compared with.
+//! Estimation of a robot's motion from scan to scan. Corners and lines of both scans are matched first, and then all
+//! beams, each of which should end on a surface of the reference scan.
 //!
 //! The method is point-to-line matching as in Censi: "An ICP variant using a point-to-line metric" (ICRA 2008), with
-//! the covariance of Censi: "An accurate closed-form estimate of ICP's covariance" (ICRA 2007). Surfaces are the lines
-//! of the scan, and otherwise those of a few neighbors.
+//! the covariance of Censi: "An accurate closed-form estimate of ICP's covariance" (ICRA 2007). Surfaces are the line
+//! features of the scan; elsewhere, a few neighboring readings define a surface.
 //!
-//! Scans are compared with a scan that is kept until the robot has left its position, so a robot that stands does not
-//! drift.
+//! Each scan is compared with a reference scan, which is kept until the robot has left its position. A robot that
+//! stands therefore does not drift.
 
 mod covariance;
 mod matching;
@@ -49,16 +49,16 @@ impl Settings {
 pub struct MotionEstimator {
     pose: Pose,
     settings: Settings,
-    /// The scan that others are compared with, and the current one.
+    /// The reference scan, and the current one.
     reference: PreparedScan,
     current: PreparedScan,
     matcher: ScanMatcher,
-    /// `None` before the first scan.
+    /// State of the odometry; `None` before the first scan.
     odometry: Option<OdometryState>,
     /// Stamp of the last scan, in ns.
     stamp_ns: u64,
     velocity: Velocity,
-    /// Velocity of the last step, if it was rejected because no robot changes its velocity so fast.
+    /// Velocity of the last step, if it was rejected because it differs too much from the one before.
     rejected: Option<Velocity>,
     undistorted: UndistortedScan,
     finder: LineFinder,
@@ -68,16 +68,16 @@ pub struct MotionEstimator {
 /// Position of the robot, and its last step.
 #[derive(Clone, Copy, Default)]
 struct OdometryState {
-    /// Position at the kept scan, since the start, and its covariance.
+    /// Position at the reference scan, relative to the start, and its covariance.
     origin: Pose2,
     of_origin: Square,
-    /// Position at the last scan, in the frame of the kept one.
+    /// Position at the last scan, in the frame of the reference scan.
     last: Pose2,
-    /// Covariance of that position by the last scan's own noise; `None` if that is the kept one.
+    /// Covariance of `last` by the last scan's own noise; `None` if the last scan is the reference.
     extra_covariance: Option<Square>,
-    /// Covariance of that position by all causes.
+    /// Covariance of `last` by all causes.
     of_last: Square,
-    /// Whether the surroundings left a direction of that position open.
+    /// Whether the surroundings left a direction of `last` open.
     is_degenerate: bool,
     /// Whether the sum of all steps contains a degenerate one.
     is_open: bool,
@@ -115,7 +115,7 @@ impl MotionEstimator {
         (self.pose, self.settings) = (pose, settings);
     }
 
-    /// Forgets the motion so far. The next scan is the first one.
+    /// Restarts the odometry. The next scan is the first one.
     pub fn reset(&mut self) {
         self.odometry = None;
     }
@@ -174,7 +174,7 @@ impl MotionEstimator {
             }
             None => {
                 if self.velocity != Velocity::default() {
-                    // The next scan is compared with this one, which no velocity is known for.
+                    // This scan becomes the reference, and its velocity is unknown.
                     self.velocity = Velocity::default();
                     self.take(scan);
                 }
@@ -186,8 +186,8 @@ impl MotionEstimator {
         }
     }
 
-    /// Corrects the current scan by the velocity of the `first` step, which the robot made in `seconds`, until the
-    /// velocity is that of the step. Returns the position and the step, and by how much the beams may still be off.
+    /// Corrects the current scan by the velocity of the `first` step, which the robot made in `seconds`, and repeats
+    /// the match until velocity and step agree. Returns the position, the step, and the remaining offset of the beams.
     fn correct(
         &mut self,
         scan: &Scan,
@@ -204,8 +204,8 @@ impl MotionEstimator {
             let offset = change.offset(scan);
             let is_again = self.rejected.is_some_and(|rejected| rejected.difference(&measured).is_possible());
             if !change.is_possible() && !is_again {
-                // No robot does that: the step is an error, or the sensor was carried. If the next step agrees, it was
-                // right.
+                // No robot changes its velocity that fast: the step is an error, or the sensor was carried. If the next
+                // step agrees, this one was right.
                 self.rejected = Some(measured);
                 return (self.stop_or_continue(scan, odometry, found), offset);
             }
@@ -220,7 +220,7 @@ impl MotionEstimator {
             match self.find(odometry, Some(before.pose)) {
                 Some(again) => found = again,
                 None => {
-                    // The correction was wrong, and the step without it is the best one.
+                    // The correction was wrong, so use the step without it.
                     self.velocity = expected;
                     self.take(scan);
                     return (first, offset);
@@ -230,8 +230,8 @@ impl MotionEstimator {
     }
 
     /// Decides after a rejected velocity whether the robot stands, because the sensor was carried, or continues as
-    /// before, because the `found` step is an error. The scan fits better with the right velocity. Returns the position
-    /// and the step.
+    /// before, because the `found` step is an error. The scan fits better with the right velocity, so both are tried.
+    /// Returns the position and the step.
     fn stop_or_continue(
         &mut self,
         scan: &Scan,
@@ -254,7 +254,7 @@ impl MotionEstimator {
         self.find(odometry, begin).unwrap_or(found)
     }
 
-    /// Takes the current scan as if it had been measured at one moment.
+    /// Prepares the current scan, corrected as if all beams had been measured at once.
     fn take(&mut self, scan: &Scan) {
         let scan = match self.velocity.distorts(scan, MIN_DISTORTION_M) {
             true => self.undistorted.compute(scan, &self.velocity.of_sensor(&self.pose)),
@@ -275,7 +275,7 @@ impl MotionEstimator {
         (settings.allows(&step) && found.overlap >= settings.min_overlap).then_some((found, step))
     }
 
-    /// Keeps the current scan, with which later ones are compared.
+    /// Makes the current scan the reference for later ones.
     fn set_reference(&mut self, odometry: OdometryState) {
         self.current.set_ignored_scans(self.matcher.ignored_scans());
         std::mem::swap(&mut self.reference, &mut self.current);
@@ -292,13 +292,13 @@ impl MotionEstimator {
     }
 }
 
-/// Returns `elapsed_ns` as a multiple of the period. A stamp has jitter if it is that of a telegram.
+/// Rounds `elapsed_ns` to a multiple of the period, because stamps of telegrams have jitter.
 fn without_jitter(elapsed_ns: u64, period_ns: u64) -> u64 {
     let periods = elapsed_ns.saturating_add(period_ns / 2).checked_div(period_ns);
     periods.map_or(elapsed_ns, |periods| periods.saturating_mul(period_ns))
 }
 
-/// Writes `step`, which leads to `found`. The beams may be off by `offset` because of a changing velocity.
+/// Writes `step`, which leads to `found`. The beams may be off by `offset`, because the velocity changes.
 fn write(
     odometry: &OdometryState,
     found: &Match,
@@ -308,7 +308,7 @@ fn write(
     out: &mut Motion,
 ) {
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
-    // Both scans have their own noise. That of the kept one moves both positions alike.
+    // Both scans have their own noise. The noise of the reference moves both positions alike, so it counts only once.
     let reference_covariance = odometry.extra_covariance.unwrap_or(found.of_reference);
     let mut covariance = covariance::of_step(&found.own, &reference_covariance, &odometry.last, step);
     add_uncertainty(&mut covariance, odometry, found, step, offset);
@@ -334,8 +334,8 @@ fn write(
     }
 }
 
-/// Returns the covariance of the position that `step` leads to, in the frame of the kept scan. All positions in that
-/// frame are found independently of each other, so the covariances of the steps between them are not summed.
+/// Returns the covariance of the position that `step` leads to, in the frame of the reference scan. All positions in
+/// that frame are found independently of each other, so the covariances of the steps between them are not summed.
 fn covariance_in_reference(
     odometry: &OdometryState,
     found: &Match,
@@ -356,7 +356,7 @@ fn add_uncertainty(
     step: &Pose2,
     offset: &[f64; 3],
 ) {
-    // Readings on no surface contradict this step: according to them, the robot moved as before.
+    // Readings that are on no surface contradict this step. They may mean that the robot moved as before.
     let other = [step.x - odometry.step.x, step.y - odometry.step.y, step.yaw - odometry.step.yaw];
     covariance::add_outer(covariance, &other, 1.0 - found.overlap);
     covariance::add_outer(covariance, offset, 1.0);
@@ -371,14 +371,15 @@ const MAX_CORRECTIONS: u8 = 4;
 /// Time between two scans from which a velocity is computed, in seconds.
 const MIN_INTERVAL_S: f64 = 0.005;
 const MAX_INTERVAL_S: f64 = 1.0;
-/// Distance from the kept scan at which another one is kept. Its surfaces are still seen from about the same side.
+/// Distance from the reference scan at which another one takes its place. Up to there, the robot sees its surfaces from
+/// about the same side.
 const MAX_REFERENCE_DISTANCE_M: f64 = 0.15;
 const MAX_REFERENCE_ANGLE_RAD: f64 = 0.15;
-/// Minimum share of readings on surfaces of the kept scan. With less, another scan is kept.
+/// Minimum share of readings on surfaces of the reference scan. With less, another scan becomes the reference.
 const MIN_REFERENCE_OVERLAP: f64 = 0.5;
 
-/// Returns the position in `kept`, at which the matching of `now` starts: the one that most beams agree with. Corners
-/// and lines of the two scans that may be the same propose positions, and a few beams choose among them.
+/// Returns the position at which the matching starts: the one that most of a few sampled beams agree with. Corners and
+/// lines that may be the same in both scans propose the positions.
 fn initial_guess(
     reference: &PreparedScan,
     current: &PreparedScan,
@@ -435,7 +436,7 @@ impl Guess<'_> {
         self.current.points().iter().step_by(self.stride()).filter(fits).count()
     }
 
-    /// Uses `place` if the robot can be there and more beams agree with it.
+    /// Makes `pose` the best position, if it is possible and more beams agree with it.
     fn try_pose(&mut self, pose: Pose2) {
         let step = self.odometry.last.inverse().then(&pose);
         if !self.settings.allows(&step) || self.tries >= MAX_TRIES {
@@ -448,7 +449,7 @@ impl Guess<'_> {
         }
     }
 
-    /// Tries the positions at which corners coincide. Corners that open alike may be the same.
+    /// Tries the positions at which corners coincide. Corners with the same opening may be the same.
     fn try_corners(&mut self) {
         let (reference, current) = (self.reference, self.current);
         let opening = |view: &PreparedScan, corner: &Corner| {

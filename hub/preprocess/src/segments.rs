@@ -1,5 +1,5 @@
-//! Groups neighboring foreground beams into segments, and computes the position of each segment and whether it is
-//! supported. A distant edge flickers in single beams. An object is seen by several beams, or for longer.
+//! Segments of neighboring foreground beams, with their positions and whether they are supported. A distant edge
+//! flickers in single beams, but an object is seen by several beams, or for longer.
 
 use std::f64::consts::{PI, TAU};
 use std::mem::{replace, take};
@@ -19,7 +19,7 @@ pub struct Segmenter {
     step_limit: StepLimit,
     /// Foreground of the previous scan.
     previous: Points,
-    /// Memory for that of the next scan.
+    /// Buffer for the foreground of the current scan.
     scratch: Points,
 }
 
@@ -61,14 +61,14 @@ impl Segmenter {
         }
     }
 
-    /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.
+    /// Fills in the segments of `foreground`, which was computed from `scan`. Writes every byte of them.
     ///
-    /// Two foreground beams belong together if they are neighbours and their points lie as near to each other as those
-    /// of a surface seen at 10 degrees: r sin(step) / sin(10 degrees - step) + 15 mm, r being the first one's range,
-    /// and the step from one exact angle to the other where there are such.
+    /// Two neighboring foreground beams belong to one segment if their points are as near to each other as those of a
+    /// surface seen at 10 degrees. The limit is r sin(step) / sin(10 degrees - step) + 15 mm, where r is the range of
+    /// the first beam. The step is the one between the exact angles, if the scan has them.
     ///
-    /// A segment is supported if it has several beams, or if its point is at most 0.3 m from one of the foreground of
-    /// the scan before: of the last one that was given here.
+    /// A segment is supported if it has several beams, or if its point is at most 0.3 m from a foreground point of the
+    /// previous scan that was passed to this function or to [`pass`](Self::pass).
     pub fn update(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.fit(scan);
         let unit_mm = f64::from(scan.unit_um) / 1000.0;
@@ -122,7 +122,7 @@ impl Segmenter {
         self.scratch = replace(&mut self.previous, now);
     }
 
-    /// Calls `visit` with each beam whose bit is set: its number, its range in device units, its range in mm with its
+    /// Calls `visit` with each beam whose bit is set: its index, its range in device units, its range in mm with its
     /// exact angle if it has one, and its point.
     fn each_point(
         &self,
@@ -193,7 +193,7 @@ impl StepLimit {
     fn of(radians: f64) -> StepLimit {
         let step = ((radians + PI).rem_euclid(TAU) - PI).abs();
         let spread = 2.0 * (1.0 - step.cos());
-        // No scanner has steps of 10 degrees or more. Only the noise can join them.
+        // No scanner has steps of 10 degrees or more. With such a step, only the margin for noise can join two points.
         let flattest = MIN_INCIDENCE_DEG.to_radians();
         let slope = if step < flattest { step.sin() / (flattest - step).sin() } else { 0.0 };
         StepLimit { spread, slope }
@@ -207,7 +207,7 @@ struct OpenSegment {
     nearest: u16,
     last_mm: f64,
     last_exact: Option<f64>,
-    /// Relative to the sensor, along the axes of the robot's frame.
+    /// Point of the first beam, relative to the sensor, along the axes of the robot's frame, in mm.
     first_point: (f64, f64),
     last_point: (f64, f64),
     sum: (f64, f64),

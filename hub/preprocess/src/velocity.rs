@@ -1,5 +1,5 @@
-//! Motion of a robot in the plane: its velocity, transforms between its positions, and scans without the distortion by
-//! its motion, because it measures each beam from another position.
+//! Motion of a robot in the plane: its velocity, transforms between its positions, and the correction of scans, because
+//! a moving robot measures each beam from another position.
 
 use std::f64::consts::{PI, TAU};
 
@@ -48,12 +48,12 @@ impl Velocity {
         }
     }
 
-    /// Returns `other` less this velocity.
+    /// Returns `other` minus this velocity.
     pub(crate) fn difference(&self, other: &Velocity) -> Velocity {
         Velocity { x: other.x - self.x, y: other.y - self.y, yaw: other.yaw - self.yaw }
     }
 
-    /// Moves a part of the way to the `measured` velocity, which has noise.
+    /// Moves this velocity a part of the way toward the `measured` one, which has noise.
     pub(crate) fn approach(&mut self, measured: &Velocity) {
         let Velocity { x, y, yaw } = self.difference(measured);
         (self.x, self.y, self.yaw) =
@@ -73,23 +73,23 @@ impl Velocity {
         self.x.hypot(self.y) < MAX_CHANGE_M_S && self.yaw.abs() < MAX_CHANGE_RAD_S
     }
 
-    /// Returns how far the beams of `scan` are off on average if they are corrected by a velocity that differs by this
-    /// one.
+    /// Returns the mean offset of the beams of `scan`, if they were corrected by a velocity that differs from the true
+    /// one by this velocity.
     pub(crate) fn offset(&self, scan: &Scan) -> [f64; 3] {
         let [first_s, last_s] = times(scan);
         [self.x, self.y, self.yaw].map(|speed| speed * (first_s + last_s) / 2.0)
     }
 }
 
-/// A position and a direction in some frame: meters, and radians counterclockwise from -pi to pi. Also the transform
-/// from the frame of a robot there into that frame.
+/// Position and direction in some frame: meters, and radians counterclockwise from -pi to pi. It is also the transform
+/// from the frame of a robot at this pose into that frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose2 {
-    /// Ahead.
+    /// Position ahead, in meters.
     pub x: f64,
-    /// To the left.
+    /// Position to the left, in meters.
     pub y: f64,
-    /// Direction.
+    /// Direction, in radians.
     pub yaw: f64,
     cos: f64,
     sin: f64,
@@ -138,7 +138,7 @@ impl Pose2 {
     }
 }
 
-/// A scan as if the sensor had measured all beams at the scan's stamp.
+/// Scan without the distortion by motion, as if the sensor had measured all beams at the scan's stamp.
 pub(crate) struct UndistortedScan {
     words: Box<[ScanWord]>,
     beams: usize,
@@ -191,8 +191,7 @@ impl UndistortedScan {
                 usize::try_from(beam).ok().filter(|beam| *beam < count)
             };
             let Some(mut beam) = beam_of(slot).filter(|_| range >= 1.0) else { continue };
-            // Revolutions that are measured one after the other may meet the same beams, and leave those next to them
-            // empty.
+            // Points of consecutive revolutions may fall on the same beams, and leave neighboring beams empty.
             if arrays.ranges[beam] != NO_RETURN {
                 let other = (f64::from(arrays.angles[beam]) - first_angle) / scan.step;
                 let next = beam_of(if slot > other { slot.round() + 1.0 } else { slot.round() - 1.0 });
@@ -223,14 +222,15 @@ pub(crate) fn is_whole(beams: usize, step: f64) -> bool {
 
 /// Value of a beam without a reading in an undistorted scan.
 const NO_RETURN: u16 = u16::MAX;
-/// Half the turn of a step below which an arc equals its chord.
+/// Half the turn of a step below which the arc counts as its chord, in radians.
 const MIN_ARC_RAD: f64 = 1e-6;
 /// Part of the way to the measured velocity, per scan.
 const FILTER_GAIN: f64 = 0.3;
-/// Maximum change of velocity from one scan to the next. A robot brakes and turns less hard.
+/// Maximum change of velocity from one scan to the next, in m/s. Robots brake and turn less hard.
 const MAX_CHANGE_M_S: f64 = 2.0;
 const MAX_CHANGE_RAD_S: f64 = 6.0;
-/// Distance of walls that a turn moves as far as the same motion, in meters.
+/// Distance of walls in meters for comparing turns with motion: a turn by 1 rad moves the points of such a wall by this
+/// distance.
 const WALL_DISTANCE_M: f64 = 5.0;
 
 #[cfg(test)]

@@ -1,9 +1,9 @@
-//! Checks whether something is near the robot: the minimal distance check of the paper, with circles around the robot's
+//! Check whether something is near the robot: the minimal distance check of the paper, with circles around the robot's
 //! center.
 //!
-//! A [`ZoneChecker`] counts violations over scans. Its table has, for each beam, the ranges that lie inside each circle. It
-//! is computed once per layout of the scans, in floating point and millimeters. A scan then costs only comparisons of
-//! integers in device units.
+//! A [`ZoneChecker`] counts violations over scans. Its table has the ranges of each beam that lie inside each circle.
+//! The table is computed once per layout of the scans, in floating point and millimeters. A scan then needs only
+//! comparisons of integers in device units.
 
 use std::f64::consts::TAU;
 
@@ -32,11 +32,11 @@ pub struct Settings {
     pub radii_mm: Vec<u16>,
     /// The robot's own body. Where sectors overlap, the largest range counts.
     pub body_mask: Vec<Sector>,
-    /// Distance that is added to a circle along every beam that meets it.
+    /// Distance in mm by which a circle is extended along every beam that meets it.
     pub margin_mm: u16,
-    /// Number of beams of a scan that violate a zone; 0 counts as 1.
+    /// Number of beams that must be inside for a scan to violate a zone; 0 counts as 1.
     pub min_beams: u16,
-    /// Number of consecutive scans that violate a zone; 0 counts as 1.
+    /// Number of consecutive scans that must violate a zone; 0 counts as 1.
     pub min_scans: u16,
     /// Maximum share of invalid beams among those through the largest circle. With more, the verdict is unknown.
     pub max_invalid: f64,
@@ -69,28 +69,28 @@ pub struct Warning {
     pub verdict: Verdict,
     /// Beam of the nearest point so far.
     pub beam: u16,
-    /// Its distance from the robot's center in mm, rounded down.
+    /// Distance of that point from the robot's center in mm, rounded down.
     pub distance_mm: u32,
 }
 
 /// Compares scans of one sensor with its circles.
 ///
-/// Where the design leaves something open:
+/// Rules for cases that the paper leaves open:
 /// - Until `min_scans` scans have been seen since the start, a silence, a scan with too many invalid beams or a change
 ///   of the sensor's layout, the absence of a violation proves nothing. The verdict is unknown then, because clear
 ///   would be a guess.
 /// - A beam is relevant if one of its readings, in the scan's units and below its codes, can lie inside the largest
 ///   circle and outside the robot's own body. All other beams count neither as invalid nor in the total.
-/// - If fewer beams are relevant than a violation takes, no zone can ever be violated, so the verdict is unknown. This
-///   includes an empty scan, no circle at all, a pose that is not finite, and a sensor that looks past the largest
-///   circle.
+/// - If fewer beams are relevant than a violation takes, no zone can ever be violated, so the verdict is unknown.
+///   Examples are an empty scan, a check without circles, a pose that is not finite, and a sensor that looks past the
+///   largest circle.
 pub struct ZoneChecker {
     min_beams: u16,
     min_scans: u16,
     table: Table,
     /// Number of scans since the start, a silence, a scan with too many invalid beams or a change of the layout.
     scan_count: u16,
-    /// Number of consecutive scans in which enough beams met something, by circle.
+    /// Number of consecutive scans in which enough beams met something, for each circle.
     streaks: [u16; MAX_ZONES],
     /// Whether scans may be older than they seem.
     is_backlogged: bool,
@@ -133,7 +133,7 @@ impl ZoneChecker {
         out.invalid_beams = invalid;
         self.write_circles(&inside, out);
         if !is_valid {
-            // The scan may have ended the streak of a zone whose object is still there.
+            // The scan may have ended the streak of a zone although its object is still there.
             self.scan_count = 0;
         }
     }
@@ -164,8 +164,8 @@ impl ZoneChecker {
         Some(Warning { verdict, beam, distance_mm })
     }
 
-    /// Writes the result of missing scans into `out`: only the circles are known. Scans have to be consecutive again
-    /// afterwards.
+    /// Writes the result of missing scans into `out`: only the circles are known. Afterwards, the count of consecutive
+    /// scans restarts.
     pub fn write_stale(&mut self, out: &mut Zones) {
         self.reset();
         *out = Zones { count: self.table.circles as u8, ..Zones::unknown() };
@@ -235,7 +235,7 @@ struct Layout {
 }
 
 impl Layout {
-    /// Returns the layout of `scan`. At most `most` beams are used.
+    /// Returns the layout of `scan`. At most `max_beams` beams are used.
     fn of(scan: &Scan, max_beams: usize) -> Layout {
         let ScanHead { unit_um, valid_to, no_return, beyond, first_angle, step, .. } = **scan;
         let count = scan.beams().min(max_beams);
@@ -271,7 +271,7 @@ struct Table {
     /// Valid readings inside each circle, beyond the robot's own body.
     inside: [Spans; MAX_ZONES],
     nearest: Nearest,
-    /// 1 for relevant beams: a reading of them may lie inside the largest circle.
+    /// 1 for relevant beams, which can have a reading inside the largest circle; 0 for the others.
     is_effective: Box<[u16]>,
     /// Number of relevant beams.
     effective_beams: u16,
@@ -357,7 +357,7 @@ impl Table {
         let own = in_units(self.body_mask_mm(angle) as f64, self.layout.unit_mm());
         let (sx, sy) = self.sensor_mm();
         if (sx, sy) == (0.0, 0.0) && self.pose.yaw_rad.is_finite() {
-            // From the robot's center, all beams are alike, and exact ones are many.
+            // At the robot's center, all beams are equal, and scans with exact angles need this function often.
             return Beam { q: 0.0, own };
         }
         let (ux, uy) = self.pose.direction(angle);
@@ -420,8 +420,8 @@ impl Table {
         unmeasured
     }
 
-    /// Returns the points inside the circles for these `ranges`, the first ones of a scan of the table's layout. If
-    /// there are `angles`, the exact points count.
+    /// Returns the points inside the circles for `ranges`, which are the first ones of a scan of the table's layout. If
+    /// there are exact `angles`, the points are computed from them.
     fn hits(&mut self, ranges: &[u16], angles: &[f32]) -> ZoneHits {
         if !angles.is_empty() {
             return self.exact_hits(ranges, angles);
@@ -440,7 +440,7 @@ impl Table {
         let radius_mm = self.radii_mm[..self.circles].iter().max().map_or(0.0, |&radius| f64::from(radius));
         let reach = (sensor_distance_mm + radius_mm + f64::from(self.margin_mm) + 1.0) / unit_mm;
         let (mut zone_hits, mut best) = (ZoneHits::default(), (f64::INFINITY, None));
-        // A greater range is neither inside a circle nor nearer than the nearest point so far.
+        // A greater range than `limit` is neither inside a circle nor nearer than the nearest point so far.
         let mut limit = self.layout.valid_to;
         let mut next = 0;
         while let Some(i) = position(ranges, next, |range| range <= limit)
@@ -470,8 +470,8 @@ impl Table {
         zone_hits
     }
 
-    /// Returns beam and distance in mm of a point. `square` is the square of its distance without that of the sensor,
-    /// in device units.
+    /// Returns beam and distance in mm of a point. `square` is the square of its distance minus that of the sensor's
+    /// distance, in device units.
     fn at_distance(&self, beam: usize, square: f64) -> (u16, u32) {
         let unit_mm = self.layout.unit_mm();
         let (sx, sy) = self.sensor_mm();
@@ -514,8 +514,8 @@ impl Table {
     }
 }
 
-/// A beam: s.u, with the sensor's position s and the beam's direction u, in mm, and the range at which the robot's own
-/// body ends, in device units.
+/// Beam with precomputed values: `q` is s.u in mm, with the sensor's position s and the beam's direction u, and `own`
+/// is the range at which the robot's own body ends, in device units.
 struct Beam {
     q: f64,
     own: u64,
@@ -529,8 +529,8 @@ fn in_units(mm: f64, unit_mm: f64) -> u64 {
 /// Maximum rounding error of a quotient.
 const ROUNDING_ERROR: f64 = 1e-6;
 
-/// Values within this number of mm of a whole number count as that number. Rounding is never towards clear, but an
-/// object exactly on a circle is outside, whatever sine and cosine lose.
+/// Tolerance in mm within which a value counts as a whole number. Rounding is never toward clear, but an object exactly
+/// on a circle is outside, whatever the errors of sine and cosine.
 const ROUNDING_MM: f64 = 1e-6;
 
 fn floor(value: f64) -> f64 {
@@ -541,22 +541,22 @@ fn ceil(value: f64) -> f64 {
     if (value - value.round()).abs() <= ROUNDING_MM { value.round() } else { value.ceil() }
 }
 
-/// Finds the reading that is nearest to the robot's center, exact to the millimeter (rounded down), while only a few
+/// Search for the reading that is nearest to the robot's center, exact to the millimeter (rounded down). Only a few
 /// beams are computed one by one.
 struct Nearest {
     /// Readings that count: valid ones beyond the robot's own body.
     measurable: Spans,
     /// Twice s.u for each beam, in device units, with the sensor's position s and the beam's direction u.
     twice_q: Box<[f64]>,
-    /// For each block of beams: the minimum of `twice_q`, the shortest reading that counts in the current scan, and the
-    /// lower bound of its readings.
+    /// Values for each block of beams: the minimum of `twice_q`, the shortest reading that counts in the current scan,
+    /// and the lower bound of the readings' squared distances.
     min_twice_q: Box<[f64]>,
     shortest: Box<[u16]>,
     bounds: Box<[f64]>,
 }
 
 impl Nearest {
-    /// Creates the search for at most `beams` beams. There are none yet.
+    /// Creates an empty search for at most `beams` beams.
     fn none(beams: usize) -> Nearest {
         Nearest {
             measurable: Spans::none(beams),
@@ -575,7 +575,7 @@ impl Nearest {
     }
 
     /// Returns the beam whose point is nearest to the center, the first one of several, and the square of its distance
-    /// without that of the sensor: r^2 + 2qr, in device units.
+    /// minus that of the sensor's distance: r^2 + 2qr, in device units.
     fn find(&mut self, ranges: &[u16]) -> Option<(usize, f64)> {
         self.bound(ranges);
         let bounds = &self.bounds[..ranges.len().div_ceil(BLOCK_LEN)];
@@ -591,11 +591,11 @@ impl Nearest {
         (beam != usize::MAX).then_some((beam, square))
     }
 
-    /// Computes the lower bound of each block: its shortest reading that counts, along its most favorable beam.
+    /// Computes the lower bound of each block, from its shortest reading that counts and its most favorable beam.
     fn bound(&mut self, ranges: &[u16]) {
         let (blocks, rest) = ranges.as_chunks::<BLOCK_LEN>();
         let (from_blocks, from_rest) = self.measurable.from[..ranges.len()].as_chunks::<BLOCK_LEN>();
-        // A code is greater than any range, so it does no harm here.
+        // Codes are greater than any range, so they do not change the minimum.
         let shortest = |ranges: &[u16], from: &[u16]| {
             ranges.iter().zip(from).map(|(&range, &from)| range.max(from)).fold(u16::MAX, u16::min)
         };
@@ -629,16 +629,16 @@ impl Nearest {
     }
 }
 
-/// Number of beams of a block. Their directions differ little, and there are few blocks.
+/// Number of beams of a block: few enough that their directions differ little, and enough that there are few blocks.
 const BLOCK_LEN: usize = 32;
 
-/// The values `from..from + len` of each beam, tested by one comparison of integers in device units.
+/// Ranges `from..from + len` of each beam in device units. One comparison of integers tests a value.
 #[derive(Clone)]
 struct Spans {
     /// Minimum value; the maximum of the type for beams that do not exist.
     from: Box<[u16]>,
     len: Box<[u16]>,
-    /// For each block of beams: the first value from which on none counts.
+    /// First value of each block of beams from which on no value counts.
     ends: Box<[u16]>,
 }
 
@@ -674,8 +674,8 @@ impl Spans {
         self.len[i] > 0
     }
 
-    /// Returns the number of beams whose value counts. `shortest` are the shortest values of the blocks that may count.
-    /// In most rooms, those of most blocks are too long.
+    /// Returns the number of beams whose value counts. `shortest` has the shortest value of each block that may count.
+    /// In most rooms, most blocks can be skipped, because their shortest value is too long.
     fn count(&self, ranges: &[u16], shortest: &[u16]) -> u16 {
         let may_count = |&block: &usize| shortest[block] < self.ends[block];
         let blocks = (0..ranges.len().div_ceil(BLOCK_LEN).min(self.ends.len())).filter(may_count);

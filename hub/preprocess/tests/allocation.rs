@@ -1,4 +1,4 @@
-//! No processor takes anything from the heap: not for a scan, not for the first one of another layout.
+//! Test that no processor allocates: neither for a scan, nor for the first scan of another layout.
 
 #[path = "../../daemon/tests/counting/mod.rs"]
 mod counting;

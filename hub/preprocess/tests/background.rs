@@ -1,5 +1,6 @@
-//! Background models: each method against a slow, independent version in floating point, beam by beam, over many surroundings
-//! and with commands in between; and their shapes, commands, saved models, and scans that no scanner sends.
+//! Tests of background models. Each method is compared with a slow, independent version in floating point, beam by
+//! beam, in many surroundings and with commands in between. Other tests cover shapes, commands, saved models, and scans
+//! that no scanner sends.
 
 mod surroundings;
 
@@ -11,12 +12,12 @@ use surroundings::{
     ranges_mm, reading_mm, unit_mm,
 };
 
-/// One beam as the paper has it.
+/// State of one beam by the paper's method.
 #[derive(Clone, Default)]
 struct Beam {
-    /// 0: not known.
+    /// Background in mm; 0 if it is unknown.
     background_mm: f64,
-    /// Readings in a row that belong to one candidate.
+    /// Consecutive readings in mm that belong to one candidate.
     run_mm: Vec<f64>,
 }
 
@@ -27,7 +28,7 @@ struct ReferencePaper {
     is_fresh: bool,
 }
 
-/// Two readings that may be infinite.
+/// Returns the difference of two readings, which may be infinite.
 fn distance_mm(a: f64, b: f64) -> f64 {
     if a == b { 0.0 } else { (a - b).abs() }
 }
@@ -180,12 +181,12 @@ fn paper_is_identical_beam_by_beam() {
     );
 }
 
-/// A surface as a beam remembers it.
+/// Surface that a beam has met.
 #[derive(Clone, Copy, Debug)]
 struct SlowSurface {
-    /// In device units.
+    /// Range in device units.
     range: f64,
-    /// In scans.
+    /// Weight in scans.
     weight: f64,
 }
 
@@ -195,21 +196,22 @@ impl SlowSurface {
     }
 }
 
-/// A far range in device units.
+/// Range in device units that is farther than any other.
 const FAR_RANGE: f64 = 1e9;
 const NO_SURFACE: SlowSurface = SlowSurface { range: -FAR_RANGE, weight: 0.0 };
 
 struct ReferenceMulti {
     settings: Settings,
     beams: Vec<[SlowSurface; 3]>,
-    /// Times in a row that each beam, whenever it told anything, told that nothing came back.
+    /// For each beam, the number of consecutive readings without a return. Scans in which the beam had no reading do
+    /// not count.
     lost_scans: Vec<u32>,
-    /// Foreground beams of the last scan with their readings: all of them, and the reported ones.
+    /// Foreground beams of the last scan with their readings. `reported` has those that counted as objects.
     foreground: Vec<(usize, f64)>,
     reported: Vec<(usize, f64)>,
     is_frozen: bool,
     is_fresh: bool,
-    /// Scans that are set, for the last scan.
+    /// Number of scans until a surface is background, as of the last scan.
     scans: f64,
 }
 
@@ -307,7 +309,7 @@ impl ReferenceMulti {
         }
     }
 
-    /// Removes foreground that is not confirmed.
+    /// Removes foreground that does not count as an object.
     fn remove_unconfirmed(
         &mut self,
         classes: &mut [Class],
@@ -320,7 +322,7 @@ impl ReferenceMulti {
             .map(|i| (i, readings[i].expect("only readings are in the foreground")))
             .collect();
         let mut reported = Vec::new();
-        // Two belong to one run if there is nothing but codes between them.
+        // Two beams belong to one run if only codes are between them.
         let codes = |from: usize, to: usize| (from + 1..to).all(|i| readings[i].is_none());
         for run in foreground.chunk_by(|a, b| codes(a.0, b.0)) {
             let (first, last) = (run[0].0, run[run.len() - 1].0);
@@ -419,14 +421,14 @@ fn multi_is_identical_beam_by_beam() {
             let known: Vec<f64> =
                 slow.beams[i].iter().filter(|s| s.is_background(slow.scans)).map(|s| s.range).collect();
             let at = if range == Background::FAR { FAR_RANGE } else { f64::from(range) };
-            // A surface at 0 looks like none.
+            // A surface at range 0 cannot be distinguished from an unknown one.
             assert!(known.contains(&at) || range == 0 && known.is_empty(), "beam {i}: {range}, {known:?}");
         }
     }
     assert!(class_counts.iter().all(|&n| n > 10_000), "{class_counts:?}: nothing was tried");
 }
 
-/// Both methods that learn a background.
+/// Both methods that learn a background beam by beam.
 const METHODS: [Method; 2] = [Method::Paper, Method::Multi];
 
 fn scan(count: usize, unit_mm: u32, range: u16) -> Box<Scan> {
@@ -443,7 +445,7 @@ fn background_of(model: &BackgroundModel) -> Box<Background> {
     background
 }
 
-/// `model` with another head.
+/// Returns `model` with its head changed by `change`.
 fn with(model: &Background, change: impl FnOnce(&mut BackgroundHead)) -> Box<Background> {
     let mut other = model.boxed();
     change(&mut other);
@@ -515,7 +517,7 @@ fn a_saved_model_is_taken_if_it_fits() {
         saved.ranges_mut()[..3].copy_from_slice(&[0, Background::FAR, 2_500]);
         let short = |unit_um| Background::of(BackgroundHead { unit_um, ..head }, &saved.ranges()[..181]);
 
-        // Before the first scan.
+        // A model may be loaded before the first scan.
         let mut early = model(method);
         early.load(&saved).unwrap();
         assert_eq!(
@@ -525,13 +527,13 @@ fn a_saved_model_is_taken_if_it_fits() {
         let out = update_times(&mut early, &scan(361, 1, 1_000), 1);
         assert_eq!((out.generation, out.beams), (1, 360));
 
-        // It does not fit the first scan, so the model drops it.
+        // The loaded background does not fit the first scan, so the model is reset.
         let mut wrong = model(method);
         wrong.load(&saved).unwrap();
         assert_eq!(update_times(&mut wrong, &scan(181, 1, 1_000), 1).generation, 2);
         assert_eq!((background_of(&wrong).known_beams, background_of(&wrong).count), (0, 181));
 
-        // Later it is refused, and the model stays what it was.
+        // After the first scan, a background that does not fit is refused, and the model stays as it was.
         let before = background_of(&wrong);
         let refusal = wrong.load(&saved).unwrap_err();
         assert_eq!(refusal, Mismatch { model: (361, 1000), sensor: (181, 1000) });
@@ -612,7 +614,7 @@ fn no_scan_makes_it_panic() {
                 Segmenter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() }, MAX_TEST_BEAMS);
             let mut bytes = [0_u8; Scan::len(MAX_TEST_BEAMS + 20, 1)];
             for _ in 0..40 {
-                // A sensor keeps the shape of its scans for a while, however odd it is.
+                // Most scans keep the shape of the previous one, however unusual it is.
                 let from = if random.u8(..8) == 0 { 0 } else { Scan::HEAD };
                 random.fill(&mut bytes[from..]);
                 let scan = Scan::of_bytes(&bytes);

@@ -1,4 +1,5 @@
-//! The lines of a scan: beside a slow version that tries all cuts, with truth, and with input that says nothing.
+//! Tests of line features: comparison with a slow version that tries all cuts, scans with known lines, and input
+//! without information.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -21,27 +22,27 @@ fn head(count: usize, first_angle: f64, step: f64) -> ScanHead {
     }
 }
 
-/// A scan of these ranges in metres; none is no return.
+/// Returns a scan whose ranges `range` returns in meters for each angle. `None` becomes the code of no return.
 fn scan(head: ScanHead, range: impl Fn(f64) -> Option<f64>) -> Box<Scan> {
     let angle = |i: usize| head.first_angle + i as f64 * head.step;
     let unit = |i| range(angle(i)).map_or(head.no_return, |range: f64| (1000.0 * range).round() as u16);
     Scan::of(head, &(0..head.count.into()).map(unit).collect::<Vec<_>>())
 }
 
-/// By Box and Muller.
+/// Returns a normally distributed number with deviation 1, by the method of Box and Muller.
 fn normal(random: &mut Rng) -> f64 {
     (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
 }
 
 fn find(scan: &Scan, pose: Pose, settings: Settings) -> Box<Lines> {
-    // What was there before does not stay.
+    // Fill the payload with garbage, which must not remain.
     let mut lines = Box::new(Lines::default());
     bytemuck::bytes_of_mut(&mut *lines).fill(0xA5);
     LineFinder::new(pose, settings, scan.beams()).update(scan, &mut lines);
     lines
 }
 
-/// To the walls of a room: x from -2 to 4, y from -3 to 2.5.
+/// Returns the range in meters to the walls of a room: x from -2 to 4, y from -3 to 2.5.
 fn room(angle: f64) -> f64 {
     let (sin, cos) = angle.sin_cos();
     let x = if cos > 0.0 { 4.0 / cos } else { -2.0 / cos };
@@ -49,7 +50,7 @@ fn room(angle: f64) -> f64 {
     x.min(y)
 }
 
-/// A room of `seed` that is a star of 6 to 20 corners, with 20 mm of noise.
+/// Returns a scan of a room of `seed`, a star of 6 to 20 corners, with 20 mm of noise.
 fn star(seed: u64, beams: usize) -> Box<Scan> {
     let mut random = Rng::with_seed(seed);
     let corners = random.usize(6..=20);
@@ -69,7 +70,8 @@ fn star(seed: u64, beams: usize) -> Box<Scan> {
     scan(head, |angle| ranges.get(((angle + PI) / head.step).round() as usize).copied())
 }
 
-/// The least sum of squares along the beams for one line, by its distance and direction: slow, with slopes by differences.
+/// Returns the minimum sum of squares along the beams for one line. Searches distance and direction of the line step by
+/// step, which is slow.
 fn slow_line(beams: &[(f64, f64)]) -> f64 {
     let error = |r: f64, alpha: f64| -> f64 {
         let off = |&(angle, range): &(f64, f64)| {
@@ -111,7 +113,7 @@ fn slow_line(beams: &[(f64, f64)]) -> f64 {
     best
 }
 
-/// The least sum of squares of `count` lines: all cuts are tried.
+/// Returns the minimum sum of squares for `count` lines, by trying all cuts.
 fn reference_match(scan: &Scan, count: usize) -> f64 {
     let beams: Vec<(f64, f64)> =
         (0..scan.beams()).filter_map(|i| Some((scan.angle(i), scan.distance_m(i)?))).collect();
@@ -131,7 +133,7 @@ fn reference_match(scan: &Scan, count: usize) -> f64 {
     best[n]
 }
 
-/// The sum of squares of what was found, and beams on it.
+/// Returns the sum of squares of the found lines, and the number of beams on them.
 fn fit_error(scan: &Scan, lines: &Lines) -> (f64, usize) {
     let (mut sum, mut beams) = (0.0, 0);
     for line in lines.lines() {
@@ -173,7 +175,7 @@ fn is_near(one: f32, two: f64, tolerance: f64) -> bool {
     (f64::from(one) - two).abs() < tolerance
 }
 
-/// Walls, their ends and their corners, for a sensor that sits anywhere.
+/// The lines are the walls with their ends and corners, wherever the sensor is mounted.
 #[test]
 fn a_room_has_four_lines_and_its_corners() {
     let mut random = Rng::with_seed(3);
@@ -190,12 +192,12 @@ fn a_room_has_four_lines_and_its_corners() {
         });
         for refine in [false, true] {
             let lines = find(&scan, pose, Settings { refine, ..Settings::default() });
-            // The wall that beam 0 looks at is cut there.
+            // Beam 0 cuts the wall that it meets.
             assert_eq!((lines.lines().len(), lines.corners().len()), (5, 4), "{lines:?}");
             assert!(is_near(lines.noise_m, 0.01, 0.002), "{}", lines.noise_m);
             assert!(usize::from(lines.on_lines) >= 98 * count / 100 && usize::from(lines.readings) == count);
             for corner in lines.corners() {
-                // Back into the sensor's frame.
+                // Transform the corner back into the sensor's frame.
                 let (x, y) = (f64::from(corner.x_m) - pose.x_m, f64::from(corner.y_m) - pose.y_m);
                 let (sin, cos) = pose.yaw_rad.sin_cos();
                 let (x, y) = (cos * x + sin * y, cos * y - sin * x);
@@ -213,7 +215,7 @@ fn a_room_has_four_lines_and_its_corners() {
     }
 }
 
-/// The deviations are those that the lines of many scans have.
+/// The reported deviations equal those of the lines of many scans.
 #[test]
 fn a_line_says_how_well_it_is_known() {
     let mut random = Rng::with_seed(4);
@@ -231,7 +233,7 @@ fn a_line_says_how_well_it_is_known() {
             found.push(*line);
         }
     }
-    // By its criterion noise makes two lines of one in about one scan of as many as there are beams.
+    // By the criterion, noise splits a line in about one of N scans, where N is the number of beams.
     assert!(found.len() >= 390, "noise alone makes no lines: one line in {} of 400", found.len());
     let count = found.len() as f64;
     let spread = |of: fn(&Line) -> f32| {
@@ -245,7 +247,7 @@ fn a_line_says_how_well_it_is_known() {
     assert!((0.8..1.25).contains(&(said_alpha / alpha)), "{said_alpha}, and it is {alpha}");
 }
 
-/// A scanner whose points fall where they like: exact angles beside the grid's.
+/// The points of a scanner with exact angles lie off the grid.
 #[test]
 fn exact_angles_are_those_that_count() {
     let mut random = Rng::with_seed(5);
@@ -295,7 +297,7 @@ fn assert_sound(lines: &Lines, scan: &Scan, settings: &Settings) {
     assert!(unused.iter().all(|line| *line == Line::default()));
 }
 
-/// What says nothing is no line, or a line that is hardly known.
+/// Input without information gives no line, or a line with large deviations.
 #[test]
 fn input_that_says_nothing() {
     let mut random = Rng::with_seed(6);
@@ -305,7 +307,7 @@ fn input_that_says_nothing() {
     assert_eq!((none.count, none.corners, none.readings), (0, 0, 0));
     let one = find(&scan(head(1, 0.0, 0.01), |_| Some(3.0)), Pose::default(), settings);
     assert_eq!((one.count, one.readings), (0, 1));
-    // Nine of ten beams without an echo, the others anywhere.
+    // Nine of ten beams have no return, and the others have random ranges.
     for seed in 0..50 {
         let mut random = Rng::with_seed(seed);
         let ranges: Vec<Option<f64>> =
@@ -315,7 +317,7 @@ fn input_that_says_nothing() {
         assert_sound(&lines, &scan, &settings);
         assert_eq!(lines.count, 0, "{lines:?}");
     }
-    // Noise: no line is known to better than its points are.
+    // With noise alone, no line is more certain than its points.
     for refine in [false, true] {
         let settings = Settings { refine, ..settings };
         let ranges: Vec<f64> = (0..361).map(|_| 3.0 + random.f64()).collect();
@@ -325,14 +327,14 @@ fn input_that_says_nothing() {
         assert!(lines.noise_m > 0.1, "{}", lines.noise_m);
         assert!(lines.lines().iter().all(|line| line.sd_r_m > 0.02), "{lines:?}");
     }
-    // All at the same distance: a circle, of which short lines are parts.
+    // All ranges are equal. Short lines approximate such a circle.
     let circle = scan(wide, |_| Some(5.0));
     let lines = find(&circle, Pose::default(), settings);
     assert_sound(&lines, &circle, &settings);
     assert!(lines.lines().iter().all(|line| (f64::from(line.r_m) - 5.0).abs() < 0.02), "{lines:?}");
 }
 
-/// Whatever a scan says: nothing stops, and what is told is sound.
+/// No scan causes a panic, and all results are plausible.
 #[test]
 fn any_scan() {
     for seed in 0..3000 {

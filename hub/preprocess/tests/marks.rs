@@ -1,4 +1,4 @@
-//! Marks against a slow version, straight from their definition and in floating point.
+//! Tests of marks, against a slow version that follows their definition in floating point.
 
 mod scans;
 
@@ -14,7 +14,7 @@ struct Hit {
     intensity: u8,
 }
 
-/// All that qualify, then cut where beams lie too far apart or ranges jump.
+/// Returns the beams that qualify, in groups that end where beams are too far apart or ranges jump.
 fn groups(scan: &Scan, settings: Settings) -> Vec<Vec<Hit>> {
     let mut groups: Vec<Vec<Hit>> = Vec::new();
     for beam in 0..usize::from(scan.count) {
@@ -42,7 +42,7 @@ fn assert_mark(scan: &Scan, group: &[Hit], mark: &Mark) {
     let weight: f64 = sum(&|_| 1.0);
     let angle: f64 = sum(&|hit| 1000.0 * (scan.first_angle + hit.beam as f64 * scan.step).to_degrees());
     let range: f64 = sum(&|hit| hit.range_mm);
-    // The nearest thousandth of a degree and tenth of a millimetre; halves go up.
+    // Values are rounded to a thousandth of a degree and a tenth of a millimeter; halves are rounded up.
     let nearest = |exact: f64, reported: f64| (-0.5 - 1e-6..0.5 + 1e-6).contains(&(exact - reported));
     assert!(nearest(angle / weight, f64::from(mark.angle_mdeg)), "{} {mark:?}", angle / weight);
     assert!(nearest(10.0 * range / weight, f64::from(mark.range_dmm)), "{} {mark:?}", range / weight);
@@ -53,7 +53,7 @@ fn assert_mark(scan: &Scan, group: &[Hit], mark: &Mark) {
     assert_eq!(mark.edge == 1, first == 0 || last == usize::from(scan.count) - 1);
 }
 
-/// A wall with steps in it, reflectors here and there.
+/// Fills `scan` with a wall that has steps and a few reflectors.
 fn fill(random: &mut Rng, scan: &mut Scan) {
     let max = scan.no_return;
     let unit_mm = scans::unit_mm(scan) as u16;
@@ -109,7 +109,7 @@ fn marks_are_those_of_the_definition() {
     assert!(marks > 10_000 && edges > 100 && overflows > 10, "{marks} {edges} {overflows}");
 }
 
-/// Eleven beams at 1 m, a degree apart.
+/// Returns a scan of eleven beams at 1 m, one degree apart.
 fn scan_with_intensities(intensities: &[(usize, u8)]) -> Box<Scan> {
     let head = ScanHead { intensity_bits: 3, ..ScanHead::lms(11, -1000, 1000, 1, 13) };
     let mut scan = Scan::of(head, &[1000; 11]);
@@ -132,7 +132,7 @@ fn halves_are_rounded_up() {
     scan.step = 0.001_f64.to_radians();
     let mark = find(&scan, Settings::default()).mark_array[0];
     assert_eq!((mark.angle_mdeg, mark.range_dmm), (-1000 + 5, 10_005));
-    // 8/3 and 7/3 degrees after the first.
+    // The centers are 8/3 and 7/3 degrees after the first beam.
     let angle = |beams| find(&scan_with_intensities(beams), Settings::default()).mark_array[0].angle_mdeg;
     assert_eq!((angle(&[(2, 1), (3, 2)]), angle(&[(2, 2), (3, 1)])), (1667, 1333));
 }
@@ -159,14 +159,15 @@ fn without_reflector_bits_nothing_is_known() {
     assert_eq!((nothing.count, nothing.is_available()), (0, true), "nothing there is something known");
 }
 
-/// A turn of eight beams at 1 m, with these intensities, each an eighth of a beam behind its middle.
+/// Returns a revolution of eight beams at 1 m with these intensities. Each exact angle is an eighth of a beam after the
+/// middle of its beam.
 fn revolution(intensities: [u8; 8]) -> Box<Scan> {
     let mut scan = Scan::of(ScanHead::of_revolution(Family::Ld, 8), &[1000; 8]);
     let step = scan.step;
     let arrays = scan.arrays();
     arrays.upper.copy_from_slice(&intensities);
     for (i, exact) in arrays.angles.iter_mut().enumerate() {
-        // The first one is told from the end of the turn.
+        // The exact angle of the first beam is counted from the next revolution.
         *exact = ((i as f64 + 0.125) * step - if i == 0 { std::f64::consts::TAU } else { 0.0 }) as f32;
     }
     scan
@@ -182,7 +183,7 @@ fn counts_of_any_surface_are_marks_from_a_level_on() {
     assert_eq!((found.count, found.is_available(), found.lacks_level()), (1, true, false));
     let mark = found.mark_array[0];
     assert_eq!((mark.first_beam, mark.last_beam, mark.peak, mark.weight), (2, 4, 255, 240 + 255 + 241));
-    // A level is not for reflector levels, and these are not for it.
+    // `level` does not apply to reflector levels, and `min_level` does not apply to intensities.
     let lms = find(&scan_with_intensities(&[(4, 3)]), Settings { level: Some(5), ..Settings::PAPER });
     assert_eq!((lms.count, lms.is_available(), lms.lacks_level()), (1, true, false));
     assert_eq!(find(&scan_with_intensities(&[(4, 3)]), settings).count, 0);

@@ -1,5 +1,5 @@
-//! The motion of a robot from its scans: beside a slow version that tries all pairs, with truth, in surroundings that leave
-//! it open, and with input that says nothing.
+//! Tests of the motion of a robot: comparison with a slow version that tries all pairs of points, drives with known
+//! motion, surroundings that leave directions open, and input without information.
 
 mod drives;
 
@@ -10,7 +10,7 @@ use fastrand::Rng;
 use scanhub_preprocess::motion::{MotionEstimator, Pose2, Settings};
 use scanhub_schema::{ArrayFlags, Motion, MotionMethod, Pose, Scan};
 
-/// What is said of each of `scans`; what was in the payload before does not stay.
+/// Returns the motion for each of `scans`. The old content of a payload must not remain in it.
 fn estimate_motion(scans: &[Box<Scan>], pose: Pose, settings: Settings) -> Vec<Motion> {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
     let mut estimator = MotionEstimator::new(pose, settings, beams);
@@ -27,21 +27,21 @@ fn step(motion: &Motion) -> Pose2 {
     Pose2::new(motion.dx_m.into(), motion.dy_m.into(), motion.dyaw_rad.into())
 }
 
-/// Metres and radians apart.
+/// Returns how far apart two poses are, in meters and radians.
 fn pose_difference(one: &Pose2, other: &Pose2) -> (f64, f64) {
     let between = one.inverse().then(other);
     (between.x.hypot(between.y), between.yaw.abs())
 }
 
-/// The place of `now` on `kept` by all pairs of points: each point is drawn to the line through the nearest one and its
-/// neighbours, near ones more than far ones.
+/// Returns the position of `now` relative to `reference` by all pairs of points. Each point is pulled to the line
+/// through the nearest point and its neighbors, near points more than far ones.
 fn reference_match(reference: &Scan, now: &Scan) -> Pose2 {
     let points = |scan: &Scan| -> Vec<(f64, f64)> {
         let of = |i: usize| Some((scan.distance_m(i)?, scan.angle(i)));
         (0..scan.beams()).filter_map(of).map(|(r, a)| (r * a.cos(), r * a.sin())).collect()
     };
     let (kept, now) = (points(reference), points(now));
-    // Through seven neighbours each: the direction of least spread, found by trying many.
+    // The line goes through seven neighbors. Its normal is the direction of minimum spread, found by trying many.
     let normal_at = |at: usize| -> (f64, f64) {
         let near = &kept[at.saturating_sub(3)..(at + 4).min(kept.len())];
         let spread = |angle: f64| -> f64 {
@@ -136,8 +136,8 @@ fn steps_sum_to_the_pose_with_right_covariance() {
     assert!((0.5..2.0).contains(&mean), "in variances: {mean}");
 }
 
-/// Returns the square of `off` in standard deviations of `covariance`. Its mean is 3 if the covariance is right. It is NaN if the
-/// covariance is not positive definite.
+/// Returns the square of `error` in standard deviations of `covariance`. Its mean is 3 if the covariance is right. It
+/// is NaN if the covariance is not positive definite.
 fn normalized(error: [f64; 3], covariance: &[f32; 9]) -> f64 {
     let (mut lower, mut whitened) = ([[0.0; 3]; 3], [0.0; 3]);
     for i in 0..3 {
@@ -278,7 +278,7 @@ fn motion_does_not_depend_on_the_mounting_pose() {
             upside_down: random.u8(..2),
             ..Pose::default()
         };
-        // What the sensor turns and moves, as seen from the robot that it sits on.
+        // Pose of the sensor on the robot.
         let seat = Pose2::new(pose.x_m, pose.y_m, pose.yaw_rad);
         let found = estimate_motion(&drive.scans, pose, Settings::default());
         for (one, other) in own.iter().zip(&found).skip(1) {
@@ -362,7 +362,8 @@ fn people_around_the_robot_do_not_carry_it_away() {
 fn uninformative_scans_are_refused_or_uncertain() {
     let drive = Drive::through_a_room(2, 361, 60, 0.01);
     let mut random = Rng::with_seed(9);
-    // Nine of ten beams have no reading, then all, then the robot is lifted: everything is near, then elsewhere.
+    // In scans 10 to 19, nine of ten beams have no return. In scans 20 to 29, no beam has one. In scans 30 to 39, the
+    // robot is lifted, and ranges are random.
     let mut scans = drive.scans.clone();
     for (at, scan) in scans.iter_mut().enumerate() {
         let no_return = scan.no_return;

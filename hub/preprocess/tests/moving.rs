@@ -1,6 +1,6 @@
-//! The map of a scanner that moves, against a slow version with a square that does not scroll, in drives with truth, and with
-//! places without information. Lines, motion and the map of a lifted robot, with few returns or with a clock that jumps: no
-//! panic, and no result that is more certain than it may be.
+//! Tests of the map of a scanner that moves: comparison with a slow version whose map does not scroll, drives with
+//! known people, and positions without information. Other tests check lines, motion and map of a lifted robot, with few
+//! returns, and with a clock that jumps: they must not panic, and no result may be too certain.
 
 mod drives;
 
@@ -25,22 +25,22 @@ const MAP_SETTINGS: Settings = Settings {
     no_return_is_far: None,
 };
 
-/// Returns the motion of a robot at `place`.
+/// Returns the motion of a robot at `pose`.
 fn motion_at(pose: &Pose2, is_first: bool) -> Motion {
     let method = if is_first { MotionMethod::First } else { MotionMethod::Both };
     Motion { x_m: pose.x, y_m: pose.y, yaw_rad: pose.yaw, method: method as u8, ..Motion::default() }
 }
 
-/// The robot's velocity during the scan with this number.
+/// Returns the robot's velocity during the scan with this number.
 fn velocity(drive: &Drive, number: usize) -> Velocity {
     let step = drive.poses[number.saturating_sub(1)].inverse().then(&drive.poses[number]);
     Velocity::of_step((step.x, step.y, step.yaw), drives::SCAN_PERIOD_S)
 }
 
-/// The same method, square by square in a map without an end.
+/// Slow version of the method, with a map of unlimited size.
 #[derive(Default)]
 struct ReferenceModel {
-    /// Hits and free of each square.
+    /// `hits` and `free` of each square.
     squares: HashMap<(i32, i32), (i32, i32)>,
 }
 
@@ -53,7 +53,7 @@ impl ReferenceModel {
         self.squares.get(&(x + dx, y + dy)).copied().unwrap_or_default()
     }
 
-    /// What each beam is, without a look at its neighbours.
+    /// Returns the class of each beam before short runs are filtered, and adds the scan to the map.
     fn update(&mut self, pose: &Pose2, velocity: &Velocity, scan: &Scan) -> Vec<Class> {
         let neighbors =
             |reach: i32| (-reach..=reach).flat_map(move |dx| (-reach..=reach).map(move |dy| (dx, dy)));
@@ -120,20 +120,21 @@ fn classes_are_those_of_a_slow_version() {
             model.set_motion(&Pose::default(), &motion_at(place, number == 0), &velocity);
             model.update(scan, &mut out);
             for (one, other) in model.classes().iter().zip(&expected) {
-                // Which of the short runs are believed is the runs' business.
+                // The filter of runs makes foreground of short runs unknown, which this version does not do.
                 let is_same = one == other || (*one, *other) == (Class::Unknown, Class::Foreground);
                 same += usize::from(is_same);
                 foreground += usize::from(*one == Class::Foreground && is_same);
                 all += 1;
             }
         }
-        // The borders of squares are rounded in other ways.
+        // The two versions round the borders of squares differently.
         assert!(same as f64 > 0.9998 * all as f64, "{seed}: {same} of {all}");
         assert!(foreground > 100, "{seed}: {foreground}");
     }
 }
 
-/// What is told of persons, what is not, and what else is, from scan `from` on.
+/// Returns the number of beams from scan `from` on that met people and are foreground, that met people and are not, and
+/// that are foreground without having met people.
 fn count_moving(drive: &Drive, from: usize) -> (usize, usize, usize) {
     let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), 361);
     let mut model = BackgroundModel::new(Settings { scans: None, ..MAP_SETTINGS }, 361);
@@ -165,7 +166,7 @@ fn distinguishes_walkers_from_a_driving_robot() {
     }
 }
 
-/// A beam meets the leg of a chair in some scans only.
+/// A beam meets the leg of a chair only in some scans.
 #[test]
 fn legs_of_chairs_stand_while_people_walk() {
     for seed in 200..203 {
@@ -228,7 +229,7 @@ fn shows_the_static_scene_as_background() {
     };
     let count = (0..361).filter(near).count();
     assert!(count > 300, "{count} of 361, those along walls aside");
-    // A model of one place is no map.
+    // A background of one position is not a map.
     let generation = model.generation();
     model.load(&shown).unwrap();
     model.update(scan, &mut out);
@@ -301,7 +302,7 @@ fn deviations(truth: &Pose2, motion: &Motion) -> f64 {
     off.into_iter().enumerate().map(of).fold(0.0, f64::max)
 }
 
-/// Each range as `change` says of it and its beam.
+/// Replaces each range by the result of `change` for its beam and range.
 fn change_ranges(scan: &mut Scan, mut change: impl FnMut(usize, f64) -> f64) {
     let valid_to = scan.valid_to;
     for (i, range) in scan.arrays().ranges.iter_mut().enumerate().filter(|(_, range)| **range <= valid_to) {
@@ -309,7 +310,8 @@ fn change_ranges(scan: &mut Scan, mut change: impl FnMut(usize, f64) -> f64) {
     }
 }
 
-/// Higher up a sensor sees other things at other ranges; tilted, less on the one side and more on the other.
+/// A lifted sensor sees other objects at other ranges. A tilted one has shorter ranges on one side and longer ones on
+/// the other.
 #[test]
 fn lifting_the_scanner_is_refused_or_uncertain() {
     for seed in 0..6 {
@@ -329,7 +331,7 @@ fn lifting_the_scanner_is_refused_or_uncertain() {
                     assert!(off < 5.0, "{place}, scan {at}: off by {off} deviations, {:?}", result.motion);
                 }
                 assert!(results[..20].iter().all(|result| result.foreground == 0), "{place}");
-                // Where the ranges are quite other ones, there is nothing to be unsure of.
+                // If the ranges are very different, the step must be refused, not just uncertain.
                 if (factor - 1.0_f64).abs() > 0.3 {
                     for at in [20, 30] {
                         assert_eq!(results[at].motion.method(), MotionMethod::Refused, "{place}, scan {at}");

@@ -1,12 +1,13 @@
-//! Segments against a slow version of them: every point by sine and cosine, every distance from two points.
+//! Tests of segments, against a slow version that computes each point with sine and cosine, and each distance from two
+//! points.
 
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{ArrayFlags, Foreground, ForegroundHead, MAX_SEGMENTS, Pose, Scan, ScanHead, Segment};
 
-/// Beams of every scan here.
+/// Number of beams of all scans in these tests.
 const BEAM_COUNT: usize = 401;
 
-/// A foreground with the beams `ranges`, in the order of the beams.
+/// Returns a foreground with the beams and ranges in `ranges`, in the order of the beams.
 fn foreground(ranges: &[(usize, u16)]) -> Box<Foreground> {
     let mut foreground = Foreground::of_bytes(&vec![0xA5; Foreground::len(BEAM_COUNT)]);
     let head =
@@ -21,7 +22,7 @@ fn foreground(ranges: &[(usize, u16)]) -> Box<Foreground> {
     foreground
 }
 
-/// Where beam `i` of `scan` ends in the robot's frame, in mm.
+/// Returns the end of beam `i` of `scan` in the robot's frame, in mm.
 fn point(scan: &Scan, pose: &Pose, i: usize, range: u16) -> (f64, f64) {
     let turned = scan.angle(i);
     let turned = if pose.upside_down == 1 { -turned } else { turned };
@@ -38,7 +39,7 @@ fn pose_difference(a: (f64, f64), b: (f64, f64)) -> f64 {
 fn segments_are_those_of_the_formula() {
     let mut random = fastrand::Rng::with_seed(3);
     let mut maximum = 0;
-    // Of those where it makes a difference.
+    // Number of scans in which the exact angles change the result.
     let mut others = 0;
     for round in 0..3_000 {
         let is_exact = round % 2 == 1;
@@ -62,7 +63,7 @@ fn segments_are_those_of_the_formula() {
         let (mut range_mm, share) = (2_000.0, 0.3 + 0.7 * random.f64());
         let mut ranges = Vec::new();
         for i in 0..BEAM_COUNT {
-            // Mostly a surface with noise, at times a step that may or may not divide it.
+            // Most ranges are a surface with noise, and some have a step that may divide it.
             let step_mm = if random.u8(..8) == 0 { 600.0 } else { 30.0 };
             range_mm = (range_mm + step_mm * (random.f64() - 0.5)).clamp(50.0, 8_000.0);
             if random.f64() < share {
@@ -128,7 +129,7 @@ fn segment_points_follow_a_change_of_angles() {
     assert_eq!(x_mm(-180_000, 1000), (1_000, 0));
 }
 
-/// Scan after scan of one sensor: walls of several beams, and single ones that come again, go elsewhere, or stay away.
+/// Consecutive scans have walls of several beams, and single foreground beams that appear again, move, or disappear.
 #[test]
 fn several_beams_or_the_scan_before_support_a_segment() {
     let mut random = fastrand::Rng::with_seed(27);
@@ -141,7 +142,7 @@ fn several_beams_or_the_scan_before_support_a_segment() {
         for round in 0..2_000 {
             let mut ranges = Vec::new();
             for i in (0..BEAM_COUNT).filter(|i| i % 3 != 2) {
-                // A beam in two has a neighbour, at a range of its own or at that of a wall.
+                // One beam in two has a neighbor, at another range or at that of a wall.
                 let range_mm = if random.bool() { 2_000 } else { random.u32(500..8_000) };
                 if random.u8(..10) == 0 {
                     ranges.push((i, (range_mm / unit_mm) as u16));
@@ -158,7 +159,7 @@ fn several_beams_or_the_scan_before_support_a_segment() {
                 let nearest_mm =
                     before.iter().map(|&other| pose_difference(points[beam], other)).reduce(f64::min);
                 let is_near = nearest_mm.is_some_and(|nearest_mm| nearest_mm < 300.0);
-                // Sine and cosine are not those of the fast one.
+                // The two versions compute sine and cosine differently, so skip distances at the limit.
                 if nearest_mm.is_some_and(|nearest_mm| (nearest_mm - 300.0).abs() < 1e-6) {
                     continue;
                 }

@@ -1,5 +1,6 @@
-//! Segments, lines and marks of simulated scans, whose beams are as wide as real ones and report values between two surfaces,
-//! against the truth of the world. `cargo test -p scanhub-preprocess --test spot -- --nocapture` prints the figures.
+//! Tests of segments, lines and marks of simulated scans against the truth of the world. The beams are as wide as real
+//! ones, and can report ranges between two surfaces. `cargo test -p scanhub-preprocess --test spot -- --nocapture`
+//! prints the figures.
 
 #[path = "../../../tests/testkit/decoded_scan.rs"]
 mod decoded_scan;
@@ -19,7 +20,7 @@ use scanhub_sim::world::World;
 const SCAN_PERIOD_NS: u64 = 26_640_000;
 
 const WORLDS: [&str; 5] = ["room", "fig8", "crowd", "house", "demo"];
-/// A seed that nothing was tuned on.
+/// Seed that was not used for tuning.
 const SEED: u64 = 20;
 
 fn room(name: &str, change: impl Fn(NoiseModel) -> NoiseModel) -> Room {
@@ -28,7 +29,7 @@ fn room(name: &str, change: impl Fn(NoiseModel) -> NoiseModel) -> Room {
     Room::of_port(&world.with_noise(layers), SEED, 0)
 }
 
-/// Returns the rooms of a world, as its file has it and with beams without width.
+/// Returns two rooms of a world: one as in its file, and one whose beams have no width.
 fn wide_and_narrow(name: &str) -> [Room; 2] {
     [room(name, |layers| layers), room(name, |layers| NoiseModel { spot: false, ..layers })]
 }
@@ -39,8 +40,8 @@ fn update_times(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
     (decoded_scan::scan(&look.words, Unit::Mm), look.truth)
 }
 
-/// Counts false segments in 1400 scans: all, and those with support. No beam of a false segment meets a person, or a thing
-/// that was put down, moved or taken away.
+/// Counts false segments in 1400 scans: all, and those with support. A false segment is one whose beams meet neither a
+/// person nor an object that was put down, moved or taken away.
 fn false_segments(room: &Room) -> [usize; 2] {
     let beams = Variant::HALF.beams();
     let mut model = BackgroundModel::new(BackgroundSettings::default(), beams);
@@ -50,7 +51,7 @@ fn false_segments(room: &Room) -> [usize; 2] {
         let (scan, target) = update_times(room, number);
         model.update(&scan, &mut foreground);
         segmenter.update(&scan, &mut foreground);
-        // First, the background is learned.
+        // The first 600 scans learn the background.
         for (i, segment) in foreground.segments().iter().enumerate().filter(|_| number >= 600) {
             let target = &target[usize::from(segment.first)..=usize::from(segment.last)];
             if target.iter().all(|target| *target == (BeamTarget::Static { since_ns: 0 })) {
@@ -75,14 +76,15 @@ fn values_between_hardly_make_segments_with_support() {
             *sum += supported;
         }
     }
-    // In 7000 scans.
+    // Limits for 7000 scans.
     assert!(sums[0] <= 21 && sums[0] <= sums[1] + 10, "{sums:?}");
 }
 
 /// Counts lines in 100 scans, without lines at people and at things that were put down or moved:
 ///
 /// - all lines
-/// - lines with a value between: the range of a beam is off by more than 60 mm from that of a beam without width and noise
+/// - lines with a mixed range: the range of a beam is off by more than 60 mm from that of a beam without width and
+///   noise
 /// - false ones among these: more than 60 mm from the surfaces that most of their beams meet
 fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
     let mut finder = LineFinder::new(Pose::default(), LineSettings::default(), Variant::HALF.beams());
@@ -131,8 +133,8 @@ fn values_between_make_no_lines() {
     assert!(lines > 3_000 && mixed > 50 && wrong * 500 <= lines, "{sums:?}");
 }
 
-/// A reflecting strip that stands squarely to its beam, half a meter in front of a wall. Its scans have the usual noise, but
-/// no constant error of the device, and no codes, which part a mark.
+/// Returns a room with a reflecting strip that is perpendicular to its beam, half a meter in front of a wall. Its scans
+/// have the usual noise, but no constant error of the device, and no codes, which would split a mark.
 fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: NoiseModel, seed: u64) -> Room {
     let (sin, cos) = angle_deg.to_radians().sin_cos();
     let board = |width_mm: f64, range_mm: f64, surface: &str| {
@@ -146,7 +148,7 @@ fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: NoiseModel, seed:
     Room::new(&world.with_noise(NoiseModel { bias_mm: 0.0, errors: 0.0, ..layers }), seed)
 }
 
-/// RMS errors of angle in degrees and range in mm, and the number of scans without a mark.
+/// Returns the RMS errors of angle in degrees and of range in mm, and the number of scans without a mark.
 fn mark_errors(width_mm: f64, range_mm: f64, layers: NoiseModel, random: &mut Rng) -> (f64, f64, u32) {
     let mut detector = MarkDetector::new(MarkSettings::default());
     let mut marks = Marks::default();

@@ -1,6 +1,7 @@
-//! Zones, verdicts and early warnings. Two slow versions without tables judge the zones: the formula, beam by beam, which must
-//! give the same results, and plain geometry, which must agree except within a millimeter of a circle. Warnings of a part of a
-//! scan are judged by a new check that gets the same scans, with no object in the beams that have not arrived.
+//! Tests of zones, verdicts and early warnings. Zones are compared with two slow versions without tables: the formula,
+//! beam by beam, which must give the same results, and plain geometry, which must agree except within a millimeter of a
+//! circle. Warnings of a partial scan are compared with a new check that gets the same scans, without objects in the
+//! beams that have not arrived.
 
 mod scans;
 
@@ -8,7 +9,7 @@ use fastrand::Rng;
 use scanhub_preprocess::zones::{Sector, Settings, Warning, ZoneChecker};
 use scanhub_schema::{ArrayFlags, Code, Pose, Scan, ScanHead, Verdict, Zones};
 
-/// One random configuration.
+/// Random configuration.
 struct Case {
     pose: Pose,
     settings: Settings,
@@ -40,7 +41,7 @@ impl Case {
         ZoneChecker::new(self.pose, &self.settings, 401)
     }
 
-    /// Direction of a beam and what the robot's own body takes of it, in mm.
+    /// Returns the direction of a beam as a unit vector, and the range in mm at which the robot's own body ends.
     fn beam(&self, scan: &Scan, i: usize) -> ([f64; 2], f64) {
         let mdeg = (1000.0 * (scan.first_angle + i as f64 * scan.step).to_degrees()).round() as i32;
         let sense = if self.pose.upside_down == 1 { -1.0 } else { 1.0 };
@@ -55,7 +56,7 @@ impl Case {
         [self.pose.x_m * 1000.0, self.pose.y_m * 1000.0]
     }
 
-    /// Between which ranges a beam is inside, from the formula.
+    /// Returns the ranges in mm between which a beam is inside a circle, by the formula.
     fn chord(&self, u: [f64; 2], radius: f64) -> (f64, f64) {
         let [x, y] = self.sensor_mm();
         let (q, square) = (x * u[0] + y * u[1], x * x + y * y);
@@ -71,14 +72,14 @@ impl Case {
         ((lo - margin + 1e-6).floor().max(0.0), (hi + margin - 1e-6).ceil())
     }
 
-    /// A reading by the formula is inside.
+    /// Returns whether a reading is inside a circle by the formula.
     fn violates(&self, u: [f64; 2], own_range: f64, range: f64, radius: f64) -> bool {
         let (lo, hi) = self.chord(u, radius);
         range >= own_range && range < hi && (!self.settings.exact || lo == 0.0 || range > lo)
     }
 
-    /// There is a reading of the scan's kind that would be inside the largest circle: the shortest one beyond the
-    /// robot's own body and the circle's near side, if any.
+    /// Returns whether a reading of this beam can be inside the largest circle. Checks the shortest readings beyond the
+    /// robot's own body and the circle's near side.
     fn can_violate(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
         let (unit, radius) = (scans::unit_mm(scan), f64::from(self.settings.radii_mm[0]));
         let shortest = (own.max(self.chord(u, radius).0) / unit).floor();
@@ -86,8 +87,8 @@ impl Case {
         values.into_iter().any(|value| self.violates(u, own, value * unit, radius))
     }
 
-    /// How far the part of a beam that counts as met by this reading stays from the centre: the point itself, so much
-    /// to and fro as the margin allows, and what comes behind it if that counts.
+    /// Returns the minimum distance from the center of the part of a beam that counts as occupied by this reading. The
+    /// part has the point, the margin on both sides, and everything behind the point unless `exact` is set.
     fn distance(&self, u: [f64; 2], range: f64) -> f64 {
         let [x, y] = self.sensor_mm();
         let margin = f64::from(self.settings.margin_mm);
@@ -96,7 +97,7 @@ impl Case {
         (x + at * u[0]).hypot(y + at * u[1])
     }
 
-    /// Readings, many of them about the circles and the robot's own body.
+    /// Fills `scan` with readings, many of them near the circles and the end of the robot's own body.
     fn fill(&self, random: &mut Rng, scan: &mut Scan) {
         let max = max(scan);
         let crowded = random.bool();
@@ -119,12 +120,12 @@ impl Case {
     }
 }
 
-/// The greatest value of a range.
+/// Returns the maximum value of the scan's bits.
 fn max(scan: &Scan) -> u16 {
     scan.no_return
 }
 
-/// What a beam tells, from its word: a range in mm, that nothing is near, or nothing.
+/// Reading of a beam: a range in mm, nothing in range, or no reading.
 enum BeamReading {
     Range(f64),
     Far,
@@ -140,7 +141,7 @@ fn count_moving(scan: &Scan, i: usize, no_return_is_far: bool) -> BeamReading {
     }
 }
 
-/// The formula and geometry over one scan: asserts what `out` says of it, but for the verdict.
+/// Compares `out`, apart from the verdict, with the formula and with geometry.
 fn compare(case: &Case, scan: &Scan, out: &Zones) -> CaseTally {
     let mut tally = CaseTally::default();
     let mut beams = vec![0; case.settings.radii_mm.len()];
@@ -204,15 +205,15 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> CaseTally {
     tally
 }
 
-/// What one scan was good for.
+/// Tally of one scan, for the expected verdict and for the coverage of the test.
 #[derive(Default)]
 struct CaseTally {
     sure: u32,
     close: u32,
     unknown: bool,
-    /// Too many beams are invalid.
+    /// Whether too many beams are invalid.
     invalid: bool,
-    /// A violation takes more beams than can tell something.
+    /// Whether fewer beams are relevant than a violation takes.
     blind: bool,
 }
 
@@ -225,7 +226,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
         let case = Case::new(&mut random);
         let mut check = case.check();
         let mut out = uninitialized_zones();
-        // Another unit is another layout, and all begins anew.
+        // Another unit is another layout, so the counts restart.
         for unit_mm in [1, 10, 100] {
             let mut scan = scans::layout(&mut random, unit_mm);
             let mut streaks = vec![0; case.settings.radii_mm.len()];
@@ -266,7 +267,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
     assert!(close > 1000 && sure > 10_000 && blind > 100, "{close} {sure} {blind}");
 }
 
-/// An object stays inside the circle, and one scan in between cannot show it.
+/// An object stays inside the circle, but one scan in between is invalid.
 #[test]
 fn invalid_scan_delays_a_clear_verdict() {
     let settings = Settings { radii_mm: vec![1000, 600], min_scans: 2, ..Settings::default() };
@@ -288,7 +289,8 @@ fn invalid_scan_delays_a_clear_verdict() {
 #[test]
 fn on_a_circle_is_outside_wherever_it_is_seen_from() {
     let mut random = Rng::with_seed(2);
-    // The sensor's place when it looks ahead, the beam ahead's way in and out of the circle of 1 m.
+    // Position of a sensor that looks ahead, and the ranges at which the beam ahead enters and leaves the circle of 1
+    // m.
     let places = [
         ([0.0, 0.0], 0, 1000),
         ([0.3, 0.0], 0, 700),
@@ -300,7 +302,7 @@ fn on_a_circle_is_outside_wherever_it_is_seen_from() {
     ];
     for (place, lo_mm, hi_mm) in places {
         for round in 0..200 {
-            // The robot turned about its centre: nothing changes for the beam.
+            // Turn the sensor about the robot's center, which changes nothing for the beam.
             let yaw_rad = if round < 4 { f64::from(round).to_radians() * 90.0 } else { 7.0 * random.f64() };
             let (sin, cos) = yaw_rad.sin_cos();
             let pose = Pose {
@@ -331,7 +333,7 @@ fn on_a_circle_is_outside_wherever_it_is_seen_from() {
     }
 }
 
-/// As a loan comes.
+/// Returns a payload with garbage, as in a loan of shared memory.
 fn uninitialized_zones() -> Zones {
     bytemuck::pod_read_unaligned(&[0xA5; size_of::<Zones>()])
 }
@@ -341,7 +343,7 @@ const SCANS_PER_CASE: u16 = 6;
 
 const INVALID_CODE: u16 = 0x1FFF - 5;
 
-/// A hundred beams of 180 degrees: nothing within 5 m but what is named.
+/// Returns a scan of a hundred beams over 180 degrees. All ranges are 5 m, except those in `beams`.
 fn scan(beams: &[(usize, u16)]) -> Box<Scan> {
     let mut scan = Scan::of(ScanHead::lms(100, -90_000, 1800, 1, 13), &[5000; 100]);
     beams.iter().for_each(|&(i, range_mm)| scan.arrays().ranges[i] = range_mm);
@@ -423,7 +425,7 @@ fn too_many_invalid_beams_hide_all_but_a_stop() {
 
 #[test]
 fn the_robot_itself_is_neither_near_nor_invalid() {
-    // Beams 0 to 10; there the body ends before the circle, or hides all of it.
+    // The sectors cover beams 0 to 10. The body ends inside the circle, or hides all of it.
     let partly = [Sector { from_mdeg: -90_000, to_mdeg: -72_000, range_mm: 400 }];
     let wholly = [Sector { range_mm: 1000, ..partly[0] }, partly[0]];
     let body: Vec<_> = (0..12).map(|i| (i, 399)).collect();
@@ -486,12 +488,12 @@ fn a_circle_that_cannot_be_violated_is_never_clear() {
         of(whole, &Settings { body_mask: all.to_vec(), ..settings.clone() }, &scan(&[])).0,
         Verdict::Unknown
     );
-    // 2 m ahead of the center, the sensor looks away from the circle; turned by 180 degrees, into it.
+    // A sensor 2 m ahead of the center looks away from the circle. Turned by 180 degrees, it looks into the circle.
     let facing_away = Pose { x_m: 2.0, ..Pose::default() };
     assert_eq!(of(facing_away, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
     let back = Pose { yaw_rad: std::f64::consts::PI, ..facing_away };
     assert_eq!(of(back, &settings, &scan(&[])).0, Verdict::Clear);
-    // So far away that 13 bits of mm do not reach it; those of cm do.
+    // The circle is too far away for 13 bits in mm, but not in cm.
     let far = Pose { x_m: 9.2, ..back };
     assert_eq!(of(far, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
     let mut cm = scan(&[]);
@@ -499,8 +501,8 @@ fn a_circle_that_cannot_be_violated_is_never_clear() {
     assert_eq!(of(far, &settings, &cm).0, Verdict::Clear);
 }
 
-/// A clockwise turn of 200 bins of 1.8 degrees, of a sensor whose own points are 1.8 degrees apart: nothing within 5 m but
-/// what is named, at its exact angle in degrees.
+/// Returns a clockwise revolution of 200 beams, 1.8 degrees apart, of a scanner whose own points are 1.8 degrees apart.
+/// All ranges are 5 m, except those in `beams`, which have an exact angle in degrees.
 fn revolution(beams: &[(usize, u16, f32)]) -> Box<Scan> {
     let head = ScanHead {
         step: -1.8_f64.to_radians(),
@@ -535,8 +537,8 @@ fn the_exact_point_counts_where_there_is_one() {
         zones_of_revolution(Pose::default(), &settings, &revolution(&[(7, 700, -12.0), (190, 999, 17.5)]));
     assert_eq!((near.verdict(), near.nearest()), (Verdict::Slow, Some((7, 700))));
     assert_eq!((near.zones()[0].beams, near.zones()[1].beams), (2, 0));
-    // 2 m ahead of the center, an object straight behind at 1001 mm is just inside, and one half a bin to the side is
-    // not.
+    // From a sensor 2 m ahead of the center, an object straight behind at 1001 mm is just inside, and an object half a
+    // beam to the side is not.
     let ahead = Pose { x_m: 2.0, ..Pose::default() };
     assert_eq!(
         zones_of_revolution(ahead, &settings, &revolution(&[(100, 1001, -180.0)])).zones()[0].beams,
@@ -550,7 +552,7 @@ fn the_exact_point_counts_where_there_is_one() {
         zones_of_revolution(ahead, &settings, &revolution(&[(100, 1001, -182.6)])).zones()[0].beams,
         0
     );
-    // The middle of bin 99 is beside the robot's body, a point in it may not be.
+    // The middle of beam 99 is next to the robot's body, but a point of the beam may be on the body.
     let body = [Sector { from_mdeg: -180_000, to_mdeg: -179_000, range_mm: 2000 }];
     let masked = Settings { body_mask: body.to_vec(), ..settings };
     assert_eq!(zones_of_revolution(ahead, &masked, &revolution(&[(99, 1500, -178.3)])).zones()[0].beams, 1);
@@ -596,7 +598,7 @@ fn changing_speed_does_not_interrupt_scan_counting() {
 const BEAM_COUNT: usize = 100;
 const FAR_RANGE: u16 = 5000;
 
-/// A scan of 180 degrees: nothing near but in `near` beams.
+/// Returns a scan of 180 degrees, in which only `near` beams have short ranges.
 fn random_scan(random: &mut Rng, near: usize) -> Box<Scan> {
     let mut scan = Scan::of(ScanHead::lms(BEAM_COUNT, -90_000, 1800, 1, 13), &[FAR_RANGE; BEAM_COUNT]);
     (0..near).for_each(|_| scan.arrays().ranges[random.usize(..BEAM_COUNT)] = random.u16(..1200));
@@ -639,7 +641,7 @@ fn partial_scan_warns_and_complete_scan_confirms() {
                 scans.push(part);
                 let zones = zones_of(pose, &settings, &scans);
                 scans.pop();
-                // The first scan of a layout makes the table: there is nothing to judge by before it.
+                // The first complete scan of a layout builds the table, so there is no warning before it.
                 let expected = worst(&zones).filter(|_| !scans.is_empty());
                 assert_eq!(early.map(|warning| warning.verdict), expected, "{received} of {near}");
                 if let Some(Warning { beam, distance_mm, .. }) = early {
@@ -675,7 +677,7 @@ fn scans_of_another_form_warn_of_nothing() {
     assert_eq!(check.check_partial(BEAM_COUNT, 1000, &[], &[]), None);
 }
 
-/// A turn of a head: a second of arc more or less in how far its own points are apart does not make another sensor of it.
+/// The spacing of the points of a rotating scanner may vary by an arc second without changing the layout.
 #[test]
 fn slightly_uneven_revolutions_count_in_a_row() {
     let settings = Settings { min_scans: 2, ..Settings::default() };

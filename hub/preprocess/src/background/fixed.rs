@@ -1,15 +1,15 @@
-//! The two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one
-//! range per beam ([`Paper`]), and one with several surfaces per beam ([`Multi`]).
+//! Two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one range
+//! per beam ([`SingleSurface`]), and one with several surfaces per beam ([`MultiSurface`]).
 //!
-//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of [`Multi`]
-//! were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
+//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of
+//! [`MultiSurface`] were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
 use super::{Class, INVALID, Limits, RunFilter};
 use crate::search::position;
 use scanhub_schema::Background;
 
-/// State of the paper's method: one range per beam, which is replaced by a new range once that was read a number of
-/// times in a row. A beam that flips between two surfaces never learns either of them.
+/// State of the paper's method: one range per beam, which is replaced by a new range once it was read in a number of
+/// consecutive scans. A beam that flips between two surfaces never learns either of them.
 #[derive(Clone)]
 pub(super) struct SingleSurface {
     /// Ranges in device units, [`Background::UNKNOWN`] or [`Background::FAR`].
@@ -33,8 +33,9 @@ impl SingleSurface {
         self.run.fill(0);
     }
 
-    /// Compares and learns (paper III.B.3). Readings without a range neither count nor end a run. Farther ones count,
-    /// but are never foreground. The scan that completes a run is compared with the old background.
+    /// Classifies the beams and learns from them (paper III.B.3). Beams without a reading neither count nor end a run.
+    /// Readings beyond the background count, but are never foreground. The scan that completes a run is compared with
+    /// the old background.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
         for ((&reading, &background), class) in readings.iter().zip(&self.background).zip(classes) {
             let other = if reading < background { Class::Foreground } else { Class::Behind };
@@ -85,36 +86,37 @@ impl SingleSurface {
 pub(super) struct MultiSurface {
     blocks: Box<[BeamBlock]>,
     run_filter: RunFilter,
-    /// The nearest background of each beam, while a scan is processed.
+    /// Nearest background of each beam, while a scan is processed.
     nearest: Box<[u16]>,
 }
 
 /// Surfaces of neighboring beams.
 ///
-/// In a room where nothing moves, all beams of most blocks meet the same surface scan after scan, which is fully known.
-/// Such a scan changes only its range, so the block takes a short path with the same result.
+/// In a room where nothing moves, each beam of most blocks meets the same fully known surface in every scan. Such a
+/// scan changes only the surface's range, so the block takes a short path with the same result.
 #[derive(Clone)]
 #[cfg_attr(test, derive(Debug, PartialEq))]
 struct BeamBlock {
     slots: [Slots; SLOT_COUNT],
     /// Weight that the next surface of the beam gains: more if previous scans had no return.
     gain: [i16; BLOCK_LEN],
-    /// Ranges of the surfaces, if each beam has one only, which is fully known. The slots then have older ranges.
+    /// Ranges of the surfaces, if each beam has only one surface, and it is fully known. The slots then have older
+    /// ranges.
     single_surfaces: Option<[u16; BLOCK_LEN]>,
 }
 
-/// A surface of each beam of a block, if it has one.
+/// One slot of each beam of a block, which may have a surface.
 #[derive(Clone)]
 #[cfg_attr(test, derive(Debug, PartialEq))]
 struct Slots {
-    /// In device units.
+    /// Range of the surface, in device units.
     range: [u16; BLOCK_LEN],
-    /// How well the surface is known. It grows with each scan in which the beam met it, and decreases in others.
-    /// [`NONE`]: there is no surface.
+    /// Weight of the surface, a measure of how well it is known. It grows with each scan in which the beam met the
+    /// surface, and decreases in others. [`NO_WEIGHT`]: there is no surface.
     weight: [i16; BLOCK_LEN],
 }
 
-/// Limits of the steps, as numbers that compare like signed ranges and weights.
+/// Bounds of ranges and weights, as numbers that compare like signed ranges and weights.
 #[derive(Clone, Copy)]
 struct WeightBounds {
     threshold: i16,
@@ -166,8 +168,9 @@ impl MultiSurface {
         }
     }
 
-    /// Classifies the beams between `right` and `left`, which are the only ones of them with a known background. A beam
-    /// that is near both is foreground if it ends nearer than both, and meets nothing that it has met for a while.
+    /// Classifies the beams between `right` and `left`, the nearest beams with a known background on either side. A
+    /// beam that is near both is foreground if it ends nearer than both, and meets no surface that it has met for a
+    /// while.
     fn compare_with_neighbors(
         &self,
         right: usize,
@@ -204,8 +207,9 @@ impl MultiSurface {
         block.slots[0].weight[beam] = i16::MAX;
     }
 
-    /// Returns the best known background of beam `i`, and of equal ones the nearer one. A surface takes precedence over
-    /// no return, however frequent: a model that starts with that range alone would report the surface as foreground.
+    /// Returns the best known background of beam `i`, or the nearer one of two that are equally well known. A surface
+    /// takes precedence over no return, however frequent: a model that starts without a surface would report it as
+    /// foreground.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         if let Some(ranges) = &self.blocks[i / BLOCK_LEN].single_surfaces {
             return ranges[i % BLOCK_LEN];
@@ -259,7 +263,7 @@ impl BeamBlock {
         }
     }
 
-    /// Compares with all surfaces.
+    /// Classifies each beam by comparison with all of its surfaces.
     #[inline]
     fn compare_surfaces(
         &self,
@@ -284,9 +288,9 @@ impl BeamBlock {
         }
     }
 
-    /// Updates the surfaces. The one nearest to a reading, within the threshold, was met. The others lose weight: those
-    /// that the beam passed through more than those that may be hidden. A reading of no surface replaces the least
-    /// known one, unless all are known too well.
+    /// Updates the surfaces. The beam met the surface that is nearest to the reading, if it is within the threshold.
+    /// The others lose weight: surfaces that the beam passed through lose more than those that may be hidden. If the
+    /// reading meets no surface, it replaces the surface with the lowest weight, unless all weights are too high.
     #[inline]
     fn learn(&mut self, readings: &[u16; BLOCK_LEN], bounds: WeightBounds) {
         match &mut self.single_surfaces {
@@ -302,7 +306,7 @@ impl BeamBlock {
         }
     }
 
-    /// Updates all surfaces.
+    /// Updates all surfaces, without the short path.
     #[inline]
     fn learn_surfaces(&mut self, readings: &[u16; BLOCK_LEN], bounds: WeightBounds) {
         let gains = self.gain(*readings, bounds);
@@ -318,7 +322,7 @@ impl BeamBlock {
         self.single_surfaces = self.single_surfaces(bounds.full);
     }
 
-    /// Returns the ranges of the surfaces if each beam has one only, of weight `full`.
+    /// Returns the ranges of the surfaces, if each beam has only one, and its weight is `full`.
     #[inline]
     fn single_surfaces(&self, full: i16) -> Option<[u16; BLOCK_LEN]> {
         let (mut ranges, mut known, mut empty) = ([0; BLOCK_LEN], [0; BLOCK_LEN], [0; BLOCK_LEN]);
@@ -357,21 +361,21 @@ fn all_meet(range: &[u16; BLOCK_LEN], readings: &[u16; BLOCK_LEN], bounds: Weigh
     })
 }
 
-/// Returns the change of the `range` of a surface after a `reading` that met it: their difference divided by 16 and
-/// rounded to zero. Shifts stay 16 bits wide, which a division does not.
+/// Returns the change of the `range` of a surface after a `reading` that met it: their difference divided by 16,
+/// rounded to zero. It uses shifts, which stay 16 bits wide, unlike a division.
 #[inline]
 fn step(range: u16, reading: u16) -> i16 {
     let difference = reading.wrapping_sub(range) as i16;
     difference.wrapping_add((difference >> 15) & ((1 << DRIFT_SHIFT) - 1)) >> DRIFT_SHIFT
 }
 
-/// Returns -1, which has all bits, or 0. An `if` in a short loop would become a branch for each beam.
+/// Returns -1, which has all bits set, or 0. An `if` in a short loop would become a branch for each beam.
 #[inline]
 fn mask(is_set: bool) -> i16 {
     -i16::from(is_set)
 }
 
-/// Returns the surfaces of one beam after `reading`. The one that was met gains this weight.
+/// Returns the surfaces of one beam after `reading`. The surface that was met gains this weight.
 #[inline]
 fn learned(
     range: [u16; SLOT_COUNT],
@@ -433,34 +437,36 @@ impl WeightBounds {
 
 /// Number of surfaces per beam: two at an edge, and one that may replace either.
 const SLOT_COUNT: usize = 3;
-/// Number of beams of a [`BeamBlock`]: the 16-bit numbers that the processor computes at once.
+/// Number of beams of a [`BeamBlock`]: as many 16-bit numbers as the processor handles in one instruction.
 pub(super) const BLOCK_LEN: usize = 8;
 /// Share of the distance between a surface and a reading by which the surface moves, in whole units: 1/16, as a number
-/// of bits. Too slow to follow a person who walks.
+/// of bits. The surface moves too slowly to follow a person who walks.
 const DRIFT_SHIFT: u32 = 4;
 
 /// Weight of a surface that does not exist.
 const NO_WEIGHT: i16 = i16::MIN;
 /// Weight of a scan in which the surface was met. It is fully known after the configured number of scans.
 const MET_WEIGHT: i16 = 8;
-/// A surface also counts as met in the scans just before that had no return: at most this number, including the one in
-/// which it was met, and at most one per this number of configured scans. So a wall that returns 15 % of the beams is
-/// background after 5/4 of the configured scans, and a person who stands there no sooner because of a lost beam.
+/// A surface also counts as met in the preceding scans without a return. It is at most this number of scans, including
+/// the one in which it was met, and at most one per this number of configured scans. A wall that returns 15 % of the
+/// beams therefore becomes background after 5/4 of the configured scans, and a lost beam does not make a standing
+/// person background any sooner.
 const MAX_NO_RETURN_SCANS: u16 = 16;
 const SCANS_PER_NO_RETURN: u16 = 16;
 /// Weight lost in a scan that saw something behind the surface. An object that was removed is no longer background
 /// after 3/4 of the configured scans, and a surface that is met in more than a third of the scans finally becomes
 /// background.
 const PASSED_LOSS: i16 = 4;
-/// Weight lost in a scan that saw something in front of the surface, which may still exist. Not 0, because otherwise
-/// all slots could be taken by hidden surfaces.
+/// Weight lost in a scan that saw something in front of the surface, which may still exist. It is not 0, because
+/// otherwise hidden surfaces could take all slots.
 const HIDDEN_LOSS: i16 = 1;
 /// Weight per configured scan from which on a surface is background: 5/8 of the full weight, so that readings may be
 /// missing.
 const KNOWN_WEIGHT: u16 = 5;
 /// Weight per configured scan below which a surface can be replaced.
 const REPLACEABLE_WEIGHT: u16 = 2;
-/// Number of beams on either side among which one must be known, to replace an unknown one.
+/// Number of beams on either side of an unknown beam. One of them must have a known background to replace the unknown
+/// one.
 const MAX_NEIGHBORS: usize = 8;
 
 #[cfg(test)]
@@ -468,7 +474,7 @@ mod tests {
     use super::super::{ScanHead, Settings};
     use super::*;
 
-    /// Beams of two blocks and a part of one, which have one surface each, or a window.
+    /// Two whole blocks of beams and a part of one. Each beam has one surface, or a window.
     const BEAMS: usize = 19;
 
     #[test]
@@ -485,13 +491,13 @@ mod tests {
                 *reading = match random.u16(..10_000) {
                     0..100 => INVALID,
                     100..110 => Background::FAR,
-                    // Beams of windows seldom return.
+                    // Beams through windows seldom have a return.
                     110..9_990 if i % 5 == 0 => Background::FAR,
                     _ => 1_000 + 10 * i as u16 + random.u16(..noise),
                 };
             }
             if number % 1_000 == 0 {
-                // A model is loaded, so the windows are known before the gains of their beams have grown.
+                // Load a model, so that the windows are known before the gains of their beams have grown.
                 for multi in [&mut short, &mut long] {
                     multi.reset();
                     let valid = readings.iter().enumerate().filter(|&(_, &reading)| reading != INVALID);

@@ -1,6 +1,6 @@
-//! A background for a scanner that moves: a map of the objects around the robot that stand, which scrolls with it. A
-//! beam that ends in space that was seen free is in the foreground. Shadows, and the edge of the space that was seen,
-//! are unknown. The robot's position comes with each scan.
+//! Background for a scanner that moves: a map of the standing objects around the robot, which scrolls with the robot. A
+//! beam that ends in space that was seen free is in the foreground. Space behind objects, and the edge of the space
+//! that was seen, are unknown. The robot's position is given with each scan.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -15,9 +15,9 @@ use crate::velocity::{Pose2, Velocity};
 pub(super) struct OccupancyMap {
     /// Square cells around the robot. The index of a cell is its coordinates modulo the width.
     cells: Box<[Cell]>,
-    /// Effect of the last scan that met each cell, see [`Mark`].
+    /// Effect of the last scan that met each cell, see [`CellEffect`].
     effects: Box<[u8]>,
-    /// The cell of the robot, in the middle of those that are kept.
+    /// Cell of the robot, in the middle of the map.
     middle: (i32, i32),
     map_pose: Option<MapPose>,
     scan: u8,
@@ -31,14 +31,14 @@ pub(super) struct OccupancyMap {
 /// A square of the floor.
 #[derive(Clone, Copy, Default)]
 struct Cell {
-    /// Number of scans in which a beam ended here, less the later ones that saw through it.
+    /// Number of scans in which a beam ended in the cell, minus the number of later scans that saw through it.
     hits: u16,
-    /// Number of scans that saw through it, less an eighth of those in which a beam ended here.
+    /// Number of scans that saw through the cell, minus an eighth of the number of scans in which a beam ended in it.
     free: u16,
-    /// Number of times that a beam ended here after others had seen through. Chair legs are thinner than the distance
-    /// of two beams.
+    /// Number of times that a beam ended in the cell after others had seen through. Chair legs are thinner than the
+    /// distance between two beams.
     returns: u8,
-    /// Number of consecutive scans that saw through it.
+    /// Number of consecutive scans that saw through the cell.
     through: u8,
 }
 
@@ -60,10 +60,10 @@ struct MapPose {
 struct CellEffect;
 
 impl CellEffect {
-    /// Number of scans that fit into the byte.
+    /// Number of scans after which the scan's number in the byte wraps.
     const SCANS: u8 = 84;
     const THROUGH: u8 = 0;
-    /// A beam ended next to it.
+    /// A beam ended next to the cell.
     const NEAR: u8 = 1;
     const ENDED: u8 = 2;
 }
@@ -98,7 +98,7 @@ impl OccupancyMap {
         let (angles, unit_m) = ((0.0, 0.0), 0.0);
         let velocity = velocity.of_sensor(pose);
         self.map_pose = is_known.then_some(MapPose { robot, x, y, pose: *pose, velocity, angles, unit_m });
-        // Along a corridor, all positions look alike.
+        // Along a corridor, the variance is large, but all positions look alike, so the map stays valid.
         let variance = f64::from(motion.covariance[0].max(motion.covariance[4]));
         let is_sure = motion.is_degenerate() || variance <= MAX_STEP_SIGMA_M * MAX_STEP_SIGMA_M;
         is_known && motion.has_step() && is_sure
@@ -165,7 +165,7 @@ impl OccupancyMap {
         if is_free { Class::Foreground } else { Class::Unknown }
     }
 
-    /// Moves the map to `middle`, and clears the cells that are new in it.
+    /// Moves the map to `middle`, and clears the cells that enter it.
     fn scroll(&mut self, middle: (i32, i32)) {
         let (dx, dy) = (middle.0 - self.middle.0, middle.1 - self.middle.1);
         if dx.abs() >= MAP_WIDTH || dy.abs() >= MAP_WIDTH {
@@ -185,7 +185,7 @@ impl OccupancyMap {
         self.middle = middle;
     }
 
-    /// Returns whether a cell is in the map, and `around` cells on each side of it.
+    /// Returns whether a cell and the `margin` cells on each side of it are in the map.
     fn is_inside(&self, x: i32, y: i32, margin: i32) -> bool {
         let half = MAP_WIDTH / 2 - margin;
         let is_near = |at: i32, middle: i32| (middle - half..middle + half).contains(&at);
@@ -201,7 +201,7 @@ impl OccupancyMap {
         }
         let (near, ended) = (3 * self.scan + CellEffect::NEAR, 3 * self.scan + CellEffect::ENDED);
         let max_hits = limits.scans.max(MIN_FREE_SCANS);
-        // The ends of all beams are added before the cells that they saw through.
+        // Add the ends of all beams before the cells that they saw through, because an end takes precedence.
         for i in 0..beams {
             let (x, y) = self.ends[i];
             let (x, y) = (x.floor() as i32, y.floor() as i32);
@@ -221,7 +221,7 @@ impl OccupancyMap {
             }
             self.effects[at] = ended;
         }
-        // Relative to the first cell of the map, no coordinate is negative.
+        // Coordinates relative to the first cell of the map are never negative.
         let first = ((self.middle.0 - MAP_WIDTH / 2) as f32, (self.middle.1 - MAP_WIDTH / 2) as f32);
         for i in 0..beams {
             let (start, end) = (self.starts[i], self.ends[i]);
@@ -250,7 +250,7 @@ impl OccupancyMap {
                 return;
             }
             let at = (wrapped(first.0 + column) * MAP_WIDTH + wrapped(first.1 + row)) as usize;
-            // A greater mark is from this scan already.
+            // A greater value was set by a beam of this scan.
             if self.effects[at] < through {
                 self.effects[at] = through;
                 self.cells[at].note_seen_through(max_hits);
@@ -334,14 +334,14 @@ const CELL_M: f64 = 0.05;
 /// Number of cells on each side of the map: 40 m.
 const MAP_WIDTH: i32 = 800;
 const CELL_COUNT: usize = (MAP_WIDTH * MAP_WIDTH) as usize;
-/// Number of cells around the end of a beam in which an object may stand: the uncertainty of a position and of a wall.
+/// Number of cells around the end of a beam in which an object may stand, because positions and walls are uncertain.
 const UNCERTAINTY_CELLS: i32 = 2;
-/// Number of scans that must see through a cell until it is free.
+/// Number of scans that must see through a cell before it is free.
 const MIN_FREE_SCANS: u16 = 5;
-/// Number of beams that must end in a cell that was never seen free, until an object stands there.
+/// Number of scans in which a beam must end in a cell that was never seen free before an object stands there.
 const MIN_HITS: u16 = 3;
-/// Number of returns from which on a thin object stands in a cell, and number of consecutive scans that see through it
-/// after which it does not.
+/// Number of returns from which on a thin object stands in a cell, and number of consecutive scans that must see
+/// through the cell before the object is removed.
 const MIN_RETURNS: u8 = 24;
 const MAX_THROUGH_SCANS: u8 = 60;
 /// Number of cells before the end of a beam that do not count as seen free.

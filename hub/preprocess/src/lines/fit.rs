@@ -1,11 +1,11 @@
-//! Fits a line to some beams: the one that their radial noise makes most likely.
+//! Fit of the line that is most likely for some beams with radial noise.
 //!
 //! A line is the pair (a, b) for which the beam in direction (cos, sin) meets it at the range 1 / (a cos + b sin): the
 //! normal form r = cos (t - alpha) * range with a = cos alpha / r and b = sin alpha / r. Ranges have normal noise along
-//! their beams, so the likeliest line has the minimum sum of squares of (measured range - range of the line). That
-//! difference is not linear in a and b. The expression range^2 (a cos + b sin) - range is linear, and is the same up to
-//! the factor measured / true range. Its sums are updated beam by beam ([`Sums`]). A few Gauss-Newton steps lead from
-//! its line to the likeliest one ([`Line::refined`]).
+//! their beams. The likeliest line therefore has the minimum sum of squares of (measured range - range of the line).
+//! That difference is not linear in a and b. The expression range^2 (a cos + b sin) - range is linear, and is the same
+//! up to the factor measured / true range. Its sums are updated beam by beam ([`Sums`]). A few Gauss-Newton steps lead
+//! from its line to the likeliest one ([`LineEquation::refined`]).
 
 /// A beam that has a range: its direction as a unit vector, and its range in meters.
 #[derive(Clone, Copy, Debug, Default)]
@@ -26,7 +26,7 @@ impl Ray {
     }
 }
 
-/// A line by the inverse ranges at which beams meet it, in 1/m.
+/// Line, as the inverse ranges at which beams meet it, in 1/m.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct LineEquation {
     pub(super) a: f64,
@@ -64,7 +64,7 @@ impl LineEquation {
         }
     }
 
-    /// Returns the line that is likelier for `rays` after at most `steps` steps, and its error.
+    /// Returns the line after at most `steps` steps toward the likeliest line for `rays`, and its error.
     pub(super) fn refined(self, rays: &[Ray], steps: usize) -> (LineEquation, f64) {
         let (mut line, mut error) = (self, self.error(rays));
         if let [first, .., last] = rays {
@@ -182,7 +182,7 @@ impl Sums {
         }
     }
 
-    /// Returns its error in m2.
+    /// Returns the error of that line in m2.
     pub(super) fn error(&self) -> f64 {
         if self.count < 2.5 {
             return 0.0;

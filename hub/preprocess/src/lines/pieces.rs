@@ -1,10 +1,10 @@
-//! Cuts the rays of a scan into pieces that end on one line each.
+//! Partition of the rays of a scan into pieces, each of which ends on one line.
 //!
-//! - Starting with pairs of rays, neighbors are joined: the two that cost least first, until there are few enough and one more
-//!   would cost too much.
+//! - Neighboring pieces are joined, starting with pairs of rays and with the cheapest join, until there are few enough
+//!   pieces and one more join would cost too much.
 //! - The cuts between the pieces are moved to where they cost least.
-//! - A cut is taken from where it helps least to where it helps most.
-//! - Rays at ends that fit worst are dropped.
+//! - Cuts are moved from where they help least to where they help most.
+//! - The rays at the ends of pieces that fit worst are dropped.
 
 use super::fit::{LineEquation, Ray, Sums};
 
@@ -23,7 +23,7 @@ pub(super) struct Bounds {
     pub(super) min_points: usize,
     /// Maximum number of rounds in which cuts are moved.
     pub(super) rounds: usize,
-    /// Whether cuts are also moved to other pieces.
+    /// Whether cuts are also moved from one piece to another.
     pub(super) exchange: bool,
     /// Maximum number of rays at ends of pieces that may be dropped: those that fit worst.
     pub(super) trimmed: usize,
@@ -32,11 +32,11 @@ pub(super) struct Bounds {
 /// Pieces of a scan.
 pub(super) struct Pieces<'a> {
     pub(super) list: &'a [Piece],
-    /// Whether there were more than allowed. The others were joined or dropped.
+    /// Whether there were more pieces than allowed. The others were joined or dropped.
     pub(super) is_full: bool,
 }
 
-/// Memory for cutting.
+/// Buffers for the partition of scans.
 pub(super) struct ScanPartitioner {
     pieces: Box<[Piece]>,
     count: usize,
@@ -83,7 +83,7 @@ impl ScanPartitioner {
         }
     }
 
-    /// Drops pieces that are too small. Their neighbors get the rays that fit.
+    /// Drops pieces that are too small. Their neighbors take over the rays that fit.
     fn drop_small_pieces(&mut self, rays: &[Ray], bounds: &Bounds) {
         let mut kept_count: usize = 0;
         let mut is_apart = true;
@@ -141,8 +141,8 @@ impl Piece {
         Piece { first: self.first, end: next.end, sums, error: sums.error(), is_last: next.is_last }
     }
 
-    /// Returns the cost of joining this piece with the next one, in m2, if ranges have this `variance`. If both pieces vary more,
-    /// as surfaces do that are not quite straight, the cost counts less.
+    /// Returns the cost of joining this piece with the next one, in m2, if ranges have this `variance`. If both pieces
+    /// vary more, as surfaces do that are not quite straight, the cost is reduced.
     fn join_cost(&self, next: &Piece, variance: f64) -> f64 {
         if self.is_last {
             return f64::INFINITY;
@@ -171,7 +171,7 @@ impl Piece {
     }
 }
 
-/// Order of the pieces, and the cost of joining each of them with the next one.
+/// Joiner of neighboring pieces: their order, and the cost of joining each of them with the next one.
 struct Joiner {
     before: Box<[u16]>,
     after: Box<[u16]>,
@@ -198,7 +198,7 @@ impl Joiner {
             if remaining <= bounds.max && is_too_dear {
                 break;
             }
-            // If the number is the only limit, no cost is too high.
+            // Without a penalty, the number of pieces is the only limit, and no cost is too high.
             is_full |= is_too_dear && bounds.penalty > 0.0;
             match self.worst(pieces, bounds.loss, price) {
                 Some(worst) if remaining > bounds.max => self.drop_piece(pieces, worst),
@@ -228,7 +228,7 @@ impl Joiner {
         self.costs.build();
     }
 
-    /// Returns the piece that costs least if its rays belong to no piece, if that is less than `price`.
+    /// Returns the piece that is cheapest to drop, if dropping it costs less than `price`.
     fn worst(&self, pieces: &[Piece], loss: f64, price: f64) -> Option<usize> {
         // A piece has at least two rays.
         if price <= 2.0 * loss {
@@ -275,7 +275,7 @@ impl Joiner {
     }
 }
 
-/// Minimum of numbers that change one at a time: a tournament tree.
+/// Tournament tree: finds the minimum of numbers that change one at a time.
 struct TournamentTree {
     values: Box<[f64]>,
     /// Winner of each match. The root is 1; the numbers themselves follow after the matches.
@@ -310,7 +310,7 @@ impl TournamentTree {
         }
     }
 
-    /// Sets a number.
+    /// Sets number `i`, and updates the tree.
     fn set(&mut self, i: usize, value: f64) {
         self.values[i] = value;
         let mut node = (self.size + i) / 2;
@@ -363,7 +363,7 @@ fn move_cuts_until_stable(pieces: &mut [Piece], rays: &[Ray], rounds: usize) {
     }
 }
 
-/// Moves a cut from where it helps least to where it helps most, while that helps, at most once per piece.
+/// Moves cuts from where they help least to where they help most, while that lowers the cost, at most once per piece.
 fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     let min_points = bounds.min_points.max(2);
     for _ in 0..pieces.len() {
@@ -379,7 +379,7 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
             }
         }
         let (gain, split, cut, sums) = best;
-        // Neighbors that cost least to join, neither of which is the one to be cut.
+        // Find the neighbors that are cheapest to join, without the piece that will be cut.
         let mut cheapest = (f64::INFINITY, 0);
         for i in 1..pieces.len() {
             let price = pieces[i - 1].join_cost(&pieces[i], bounds.variance);
@@ -395,7 +395,7 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
         let left = Piece { end: cut, sums: sums.0, error: sums.0.error(), is_last: false, ..piece };
         let right = Piece { first: cut, sums: sums.1, error: sums.1.error(), ..piece };
         pieces[join] = pieces[join].joined(&pieces[join + 1]);
-        // The slot that joining has freed moves to where the second half belongs.
+        // Joining has freed a slot. Move it to where the second half belongs.
         let at = if join < split {
             pieces[join + 1..split].rotate_left(1);
             split - 1
@@ -408,7 +408,7 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     }
 }
 
-/// Drops rays at the ends of pieces, the most expensive one first, if it costs more than three rays on average.
+/// Drops rays at the ends of pieces, the most expensive one first, while it costs more than three average rays.
 fn trim(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     let count: usize = pieces.iter().map(Piece::len).sum();
     let mut error: f64 = pieces.iter().map(|piece| piece.error).sum();
@@ -434,7 +434,7 @@ fn trim(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     }
 }
 
-/// Returns where to cut a piece in two, with at least `costs` rays each, so that it costs least.
+/// Returns the best place to cut a piece into two halves of at least `min_points` rays each.
 fn halves(rays: &[Ray], piece: &Piece, min_points: usize) -> (usize, (Sums, Sums), f64) {
     let mut best = (piece.first, (Sums::default(), Sums::default()), f64::INFINITY);
     let mut left = Sums::of(&rays[piece.first..piece.first + min_points - 1]);
@@ -449,7 +449,7 @@ fn halves(rays: &[Ray], piece: &Piece, min_points: usize) -> (usize, (Sums, Sums
     best
 }
 
-/// Returns where the cut between two pieces costs less than at its present position.
+/// Returns the best place for the cut between two pieces, if it costs less than the present one.
 fn best_cut(rays: &[Ray], left: &Piece, right: &Piece) -> Option<(usize, (Sums, Sums))> {
     let here = left.error + right.error;
     let mut best = (here * 0.999_999 - 1e-12, None);
@@ -474,5 +474,5 @@ fn best_cut(rays: &[Ray], left: &Piece, right: &Piece) -> Option<(usize, (Sums, 
     best.1
 }
 
-/// More rounds than cuts need to settle.
+/// Maximum number of rounds. Cuts need fewer to settle.
 const MAX_ROUNDS: usize = 8;

@@ -1,11 +1,11 @@
-//! Covariances of positions and steps: symmetric 3 x 3 matrices, and what transforms do with them.
+//! Covariances of positions and steps, and their transforms: symmetric 3 x 3 matrices.
 
 use crate::velocity::Pose2;
 
 /// A matrix as three rows.
 pub(super) type Square = [[f64; 3]; 3];
 
-/// Adds factor v v' to `m`.
+/// Adds `factor` v v' to `m`.
 #[inline]
 pub(super) fn add_outer(m: &mut Square, v: &[f64; 3], factor: f64) {
     for i in 0..3 {
@@ -56,12 +56,12 @@ pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
     ([m[0][0], m[1][1], m[2][2]], vectors)
 }
 
-/// Returns the covariance of `step`, which leads from `before` to another position in the same frame. The errors of both
-/// positions are independent: `of_before` and `own`.
+/// Returns the covariance of `step`, which leads from `start` to another position in the same frame. The errors of the
+/// two positions, with the covariances `reference` and `own`, are independent.
 pub(super) fn of_step(own: &Square, reference: &Square, start: &Pose2, step: &Pose2) -> Square {
     let (x, y) = (start.turned_back((1.0, 0.0)), start.turned_back((0.0, 1.0)));
     let back = rotation(x, y);
-    // Derivatives of the step by the position before it.
+    // Derivatives of the step with respect to its start.
     let by_before = [[-x.0, -y.0, step.y], [-x.1, -y.1, -step.x], [0.0, 0.0, -1.0]];
     sum(&transformed(&back, own), &transformed(&by_before, reference))
 }
@@ -74,7 +74,7 @@ pub(super) fn of_both(of_first: &Square, of_next: &Square, first: &Pose2, next: 
     sum(&transformed(&by_first, of_first), &turned(of_next, first))
 }
 
-/// Returns the covariance `m` of a position in the frame of `place`, in the frame that contains `place`.
+/// Transforms the covariance `m` of a position from the frame of `pose` to the frame that contains `pose`.
 pub(super) fn turned(m: &Square, pose: &Pose2) -> Square {
     transformed(&rotation(pose.turned((1.0, 0.0)), pose.turned((0.0, 1.0))), m)
 }

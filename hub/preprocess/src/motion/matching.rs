@@ -1,7 +1,8 @@
-//! Matches a scan with another one: each of its beams ends on the surface nearest to it, and the position where the
-//! beams are least off is that of the scan.
+//! Match of a scan with a reference scan. Each beam should end on the surface nearest to its end, so the position of
+//! the scan is the one at which the beams are off least.
 //!
-//! A [`PreparedScan`] is one scan as it is compared: its points, the surfaces on which they lie, and its lines.
+//! A [`PreparedScan`] has the data of one scan for the comparison: its points, the surfaces on which they lie, and its
+//! lines.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
@@ -15,7 +16,7 @@ use crate::velocity::{Pose2, is_whole};
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Match {
     pub(super) pose: Pose2,
-    /// Covariance of the position by the noise of the scan, and by that of the kept one.
+    /// Covariance of the position by the noise of the scan, and by that of the reference.
     pub(super) own: Square,
     pub(super) of_reference: Square,
     /// Share of the readings that lie on surfaces.
@@ -31,9 +32,9 @@ pub(super) struct Match {
     pub(super) has_lines: bool,
 }
 
-/// Matches scans.
+/// Matcher of scans. It remembers which readings belong to moving objects.
 pub(super) struct ScanMatcher {
-    /// By reading: 0 for an object that stands, otherwise the number of kept scans for which a moving object is
+    /// For each reading, 0 if its object stands, otherwise the number of reference scans for which its moving object is
     /// ignored.
     ignored_scans: Box<[u8]>,
     runs: Box<[Run]>,
@@ -47,7 +48,7 @@ struct Run {
     all: u16,
     /// Readings in space that was empty before.
     in_free_space: u16,
-    /// Readings on objects that moved before, and the maximum time for which these are ignored.
+    /// Readings on objects that moved before, and the maximum number of reference scans for which these are ignored.
     on_moving_objects: u16,
     ignored_scans: u8,
     /// Readings near a surface.
@@ -67,7 +68,7 @@ struct Sums {
     chance: f64,
     own: Square,
     of_reference: Square,
-    /// Sums of the squared distances of the beams, and of the variances by noise alone.
+    /// Sum of the squared distances of the beams. `expected` is the sum of the variances by noise alone.
     squared_distances: f64,
     expected: f64,
     weights: f64,
@@ -78,9 +79,9 @@ struct Sums {
 struct Observability {
     values: [f64; 3],
     vectors: [[f64; 3]; 3],
-    /// Whether enough beams meet walls across it to be better than a guess.
+    /// For each direction, whether enough beams meet walls across it to be better than a guess.
     is_significant: [bool; 3],
-    /// Whether enough beams meet walls across it.
+    /// For each direction, whether enough beams meet walls across it.
     is_known: [bool; 3],
 }
 
@@ -90,8 +91,9 @@ impl ScanMatcher {
         ScanMatcher { ignored_scans: vec![0; beams].into(), runs: vec![Run::default(); beams].into() }
     }
 
-    /// Returns the position of `now` relative to `kept`, near `begin`; `None` if too few beams match. In directions
-    /// that the surroundings do not define, the position is that of `begin`, with a standard deviation of `unknown_m`.
+    /// Returns the position of the current scan relative to the reference, near `begin`; `None` if too few beams match.
+    /// In directions that the surroundings do not define, the position is that of `begin`, with a standard deviation of
+    /// `unknown_m`.
     pub(super) fn find(
         &mut self,
         reference: &PreparedScan,
@@ -134,8 +136,8 @@ impl ScanMatcher {
         (is_finite && pose.x.is_finite() && pose.y.is_finite() && pose.yaw.is_finite()).then_some(found)
     }
 
-    /// Returns, by reading of the last scan, 0 for an object that stands, otherwise the number of kept scans for which
-    /// a moving object is ignored.
+    /// Returns for each reading of the last scan 0 if its object stands, otherwise the number of reference scans for
+    /// which its moving object is ignored.
     pub(super) fn ignored_scans(&self) -> &[u8] {
         &self.ignored_scans
     }
@@ -145,8 +147,8 @@ impl ScanMatcher {
         self.ignored_scans.fill(0);
     }
 
-    /// Marks readings of moving objects, and returns whether other readings than before are marked. A run of
-    /// neighboring readings is marked if one of these is true:
+    /// Marks readings of moving objects. Returns whether the marked readings have changed. A run of neighboring
+    /// readings is marked if one of these is true:
     ///
     /// - Together, they are farther from surfaces than their noise.
     /// - Most of them lie in space that was empty before.
@@ -201,7 +203,7 @@ impl ScanMatcher {
     }
 }
 
-/// Two scans that are matched.
+/// Reference scan and current scan that are matched.
 struct Pair<'a> {
     reference: &'a PreparedScan,
     current: &'a PreparedScan,
@@ -218,7 +220,8 @@ struct SurfaceResidual {
     distance: f64,
     /// Whether the surface belongs to a moving object.
     is_moving: bool,
-    /// Variance of `off` by the noise of the scan, and by that of the kept one.
+    /// Variance of the residual by the noise of the current scan. `reference_variance` is that by the noise of the
+    /// reference.
     current_variance: f64,
     reference_variance: f64,
 }
@@ -230,7 +233,8 @@ impl SurfaceResidual {
 }
 
 impl Pair<'_> {
-    /// Returns the position of `now`, starting at `place` with beams that are at most `width` away from surfaces.
+    /// Improves the position of the current scan, starting at `pose` with beams that are at most `width` away from
+    /// surfaces.
     fn converge(&self, mut pose: Pose2, width: f64, ignored_scans: &[u8]) -> Pose2 {
         let mut width = width.max(self.finest);
         let coarse = self.current.points().len().div_ceil(COARSE_BEAMS);
@@ -255,10 +259,10 @@ impl Pair<'_> {
         (0..beams).filter(|&i| self.residual(i, pose, self.finest).is_some()).count() as f64 / beams as f64
     }
 
-    /// Returns reading `i` if it is less than `width` away from a surface.
+    /// Returns the residual of reading `i`, if it is less than `width` away from a surface.
     fn residual(&self, i: usize, pose: &Pose2, width: f64) -> Option<SurfaceResidual> {
         let (reading, point) = (&self.current.readings()[i], pose.point(self.current.points()[i]));
-        // The beam nearest to the point may end as far from it as neighboring beams are apart.
+        // The nearest beam may end as far from the point as neighboring beams are apart.
         let nearest = &self.reference.readings()[self.reference.nearest(point, width + MAX_SPACING_M)?];
         let surface = nearest.surface?;
         let distance = surface.distance(point);
@@ -281,8 +285,8 @@ impl Pair<'_> {
         })
     }
 
-    /// Returns the sums over every `stride`th beam at `place` that is less than `width` away from a surface and not on
-    /// a moving object.
+    /// Returns the sums over every `stride`th beam at `pose` that is less than `width` away from a surface and not on a
+    /// moving object.
     fn sums(&self, pose: &Pose2, width: f64, stride: usize, ignored_scans: &[u8]) -> Sums {
         let mut sums = Sums::default();
         for i in (0..self.current.points().len()).step_by(stride.max(1)).filter(|&i| ignored_scans[i] == 0) {
@@ -308,8 +312,8 @@ impl Pair<'_> {
     }
 }
 
-/// Returns the root mean square distance of the points of `now`, so that a turn by its inverse moves them by about one
-/// meter. `None` if there are no points.
+/// Returns the root mean square distance of the points of `now` in meters. A turn by its inverse in radians moves the
+/// points by about one meter. `None` if there are no points.
 fn scale(now: &PreparedScan) -> Option<f64> {
     let square: f64 = now.points().iter().map(|point| point.0 * point.0 + point.1 * point.1).sum();
     let scale = (square / now.points().len().max(1) as f64).sqrt();
@@ -317,7 +321,8 @@ fn scale(now: &PreparedScan) -> Option<f64> {
 }
 
 impl Observability {
-    /// A direction is known if enough beams meet walls across it, not counting the part that chance adds.
+    /// Computes the observability from `sums`. A direction is known if enough beams meet walls across it, without the
+    /// part that chance adds.
     fn of(sums: &Sums, stride: usize) -> Observability {
         let (values, vectors) = eigen(sums.weight);
         let min_beams = (MIN_BEAMS as f64 / stride as f64).max(MIN_BEAM_SHARE * sums.weights);
@@ -331,7 +336,7 @@ impl Observability {
         }
     }
 
-    /// Returns the step against `slope`, along directions with enough beams.
+    /// Returns the step against `slope` in the directions that have enough beams.
     fn solve(&self, slope: &[f64; 3]) -> [f64; 3] {
         let mut step = [0.0; 3];
         for ((value, vector), is_significant) in
@@ -345,8 +350,8 @@ impl Observability {
         step
     }
 
-    /// Returns the covariance of the position by the noise of the scan, and by that of the kept one, in meters and
-    /// radians.
+    /// Returns the covariances of the position by the noise of the current scan and by that of the reference, in meters
+    /// and radians.
     fn covariances(&self, sums: &Sums, scale: f64, unknown_m: f64) -> (Square, Square) {
         // If beams are off by more than their noise, the position is less certain.
         let factor = (sums.squared_distances / sums.expected).max(1.0);
@@ -376,7 +381,7 @@ impl Observability {
     }
 }
 
-/// Returns whether a corner of `now` at `place` is one of `kept`.
+/// Returns whether a corner of the current scan at `pose` is also a corner of the reference.
 fn same_corners(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) -> bool {
     let near = MATCH_DEVIATIONS * reference.noise.hypot(current.noise) + MATCH_MARGIN_M;
     let is_same = |corner: &Corner| {
@@ -387,7 +392,8 @@ fn same_corners(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) 
     current.lines.corners().iter().any(is_same)
 }
 
-/// Returns whether a line of `now` at `place` is one of `kept`: both of its ends lie on that line, and the two overlap.
+/// Returns whether a line of the current scan at `pose` is also a line of the reference: both of its ends lie on that
+/// line, and the two overlap.
 fn same_lines(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) -> bool {
     let near = MATCH_DEVIATIONS * reference.noise.hypot(current.noise) + MATCH_MARGIN_M;
     let is_same = |line: &Line| {
@@ -435,7 +441,7 @@ pub(super) struct Reading {
     /// Range in meters.
     pub(super) range: f64,
     pub(super) surface: Option<Surface>,
-    /// Number of kept scans for which its object is ignored, because it was seen to move; 0 if it stands.
+    /// Number of reference scans for which its object is ignored, because it was seen to move; 0 if it stands.
     pub(super) ignored_scans: u8,
 }
 
@@ -449,7 +455,7 @@ pub(super) struct Surface {
 }
 
 impl PreparedScan {
-    /// Allocates a view of at most `beams` beams.
+    /// Allocates a prepared scan of at most `beams` beams.
     pub(super) fn new(beams: usize) -> PreparedScan {
         PreparedScan {
             pose: Pose::default(),
@@ -561,14 +567,14 @@ impl PreparedScan {
         &self.points[..self.count]
     }
 
-    /// Stores for each reading for how long its object is ignored.
+    /// Stores for each reading the number of reference scans for which its object is ignored.
     pub(super) fn set_ignored_scans(&mut self, ignored_scans: &[u8]) {
         for (reading, scans) in self.readings[..self.count].iter_mut().zip(ignored_scans) {
             reading.ignored_scans = *scans;
         }
     }
 
-    /// Returns whether `point` is in empty space: the beams to both sides of it end more than `margin` after it.
+    /// Returns whether `point` is in empty space: the beams on both sides end more than `margin` meters beyond it.
     pub(super) fn sees_through(&self, point: (f64, f64), margin: f64) -> bool {
         let Some((distance, at)) = self.towards(point) else { return false };
         let last = self.grid.2 as f64 - 1.0;
@@ -601,9 +607,9 @@ impl PreparedScan {
         is_whole(self.grid.2, self.grid.1)
     }
 
-    /// Returns the reading whose point is nearest to `point`, if it is nearer than `most`. The sine of the angle
-    /// between a beam and `point` is a lower bound of the distance for all beams farther aside, so only a few are
-    /// compared.
+    /// Returns the index of the reading whose point is nearest to `point`, if it is nearer than `max_distance`. The
+    /// sine of the angle between a beam and `point` limits the distance of all beams farther aside from below, so only
+    /// a few beams are compared.
     pub(super) fn nearest(&self, point: (f64, f64), max_distance: f64) -> Option<usize> {
         let (_, step, beams) = self.grid;
         if self.count == 0 {
@@ -663,26 +669,26 @@ const MIN_STEP_M: f64 = 2e-5;
 const MIN_STEP_RAD: f64 = 1e-5;
 /// Minimum number of beams that define a direction. Fewer may be a leg.
 const MIN_BEAMS: usize = 6;
-/// Number of beams from which on a direction is better than a guess.
+/// Minimum number of beams with which a direction is better than a guess.
 const MIN_SIGNIFICANT_BEAMS: f64 = 1.5;
-/// `MIN_BEAMS` as a share of all beams. In a long corridor, door frames are mistaken for one another.
+/// Minimum share of all beams that define a direction. In a long corridor, door frames can be mistaken for one another.
 const MIN_BEAM_SHARE: f64 = 0.03;
-/// Maximum number of readings that are judged together. A whole wall would count as moving because of one end of it.
+/// Maximum number of readings in a run. In a longer run, one end of a wall could mark the whole wall as moving.
 const MAX_RUN_LEN: usize = 24;
-/// Maximum square that a reading adds, in variances of its noise. A few readings at an edge do not decide about the
-/// others.
+/// Maximum square that a reading adds, in variances of its noise, so that a few readings at an edge do not decide about
+/// the others.
 const MAX_SQUARE: f64 = 9.0;
 /// Number of times that moving objects are searched for.
 const MAX_SEARCHES: usize = 2;
 /// Maximum mean square of the readings of an object that stands, in variances of their noise.
 const MAX_MEAN_SQUARE: f64 = 3.0;
-/// Number of kept scans for which a moving object is ignored.
+/// Number of reference scans for which a moving object is ignored.
 const IGNORED_SCANS: u8 = 3;
 /// Minimum variance across a surface, as a share of the variance of a range.
 const MIN_VARIANCE_SHARE: f64 = 0.05;
 /// Factor of the part of the weight that is expected by chance.
 const CHANCE_FACTOR: f64 = 2.0;
-/// Maximum distance of neighboring points whose surface counts for a point between them.
+/// Maximum distance of neighboring points whose surface is used for a point between them, in meters.
 pub(super) const MAX_SPACING_M: f64 = 0.2;
 /// Maximum distance of equal corners and lines in standard deviations, and in addition to that in meters.
 const MATCH_DEVIATIONS: f64 = 3.0;

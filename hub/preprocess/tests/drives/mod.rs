@@ -1,4 +1,4 @@
-//! Scans of a robot that drives through made-up rooms, with the truth: where it was, and which beams met somebody.
+//! Scans of a robot that drives through random rooms, with the true positions and the beams that met a person.
 #![allow(dead_code)] // each test takes what it needs
 
 use std::collections::HashMap;
@@ -10,15 +10,15 @@ use scanhub_schema::{Code, Scan, ScanHead};
 
 type Point = (f64, f64);
 
-/// Scans one after the other, and what is true of them.
+/// Consecutive scans, with the truth about them.
 pub(crate) struct Drive {
     pub(crate) scans: Vec<Box<Scan>>,
-    /// Where the robot was.
+    /// Position of the robot at the end of each scan.
     pub(crate) poses: Vec<Pose2>,
-    /// Which beams met a person.
+    /// For each scan, whether each beam met a person.
     pub(crate) people: Vec<Vec<bool>>,
     walls: Vec<(Point, Point)>,
-    /// Middles and radii of round legs and pillars.
+    /// Centers and radii of round legs and pillars, in meters.
     pub(crate) legs: Vec<(Point, f64)>,
     walkers: Vec<Walker>,
     head: ScanHead,
@@ -26,7 +26,7 @@ pub(crate) struct Drive {
     random: Rng,
 }
 
-/// Which squares of 0.1 m were seen free in how many scans, by the true places.
+/// Squares of 0.1 m that were seen free, with the number of scans. They are computed from the true positions.
 #[derive(Default)]
 pub(crate) struct ObservedSquares {
     squares: HashMap<(i32, i32), (u32, u32)>,
@@ -34,7 +34,7 @@ pub(crate) struct ObservedSquares {
 }
 
 impl ObservedSquares {
-    /// Takes what the scan with number `at` sees.
+    /// Counts the squares that the scan with index `at` saw free.
     pub(crate) fn observe(&mut self, drive: &Drive, at: usize) {
         self.scans += 1;
         let scan = &drive.scans[at];
@@ -50,14 +50,14 @@ impl ObservedSquares {
         }
     }
 
-    /// Returns whether a beam of the scan with number `at` ends where at least five scans saw through.
+    /// Returns whether a beam of the scan with index `at` ends in a square that at least five scans saw free.
     pub(crate) fn is_free(&self, drive: &Drive, at: usize, beam: usize) -> bool {
         let end = drive.scans[at].distance_m(beam).map(|range| square(drive, at, beam, range));
         end.and_then(|at| self.squares.get(&at)).is_some_and(|(free, _)| *free >= 5)
     }
 }
 
-/// The square in which a beam of the scan with number `at` is at this range.
+/// Returns the square in which a beam of the scan with index `at` is at this range.
 fn square(drive: &Drive, at: usize, beam: usize, range: f64) -> (i32, i32) {
     let (scan, before) = (&drive.scans[at], &drive.poses[at.saturating_sub(1)]);
     let (pose, angle) = (relative_pose(before, &drive.poses[at], scan, beam), scan.angle(beam));
@@ -65,7 +65,7 @@ fn square(drive: &Drive, at: usize, beam: usize, range: f64) -> (i32, i32) {
     ((10.0 * x).floor() as i32, (10.0 * y).floor() as i32)
 }
 
-/// The robot's place at the time of a beam of `scan`, during which it moves from `before` to `place`.
+/// Returns the robot's position at the time of a beam of `scan`, during which it moves from `before` to `pose`.
 fn relative_pose(before: &Pose2, pose: &Pose2, scan: &Scan, beam: usize) -> Pose2 {
     let part = 1.0 + 1e-9 * scan.beam_ns(beam) as f64 / SCAN_PERIOD_S;
     let step = before.inverse().then(pose);
@@ -85,7 +85,7 @@ struct Walker {
     by_scan: Point,
 }
 
-/// The head of a scan of so many beams, in mm.
+/// Returns the head of a scan of `count` beams, with ranges in mm.
 pub(crate) fn beams_at(count: usize, first_angle: f64, step: f64) -> ScanHead {
     let no_return = Code::NoReturn.value();
     ScanHead {
@@ -101,7 +101,7 @@ pub(crate) fn beams_at(count: usize, first_angle: f64, step: f64) -> ScanHead {
     }
 }
 
-/// A scan of these ranges in metres; none is no return.
+/// Returns a scan whose ranges `range` returns in meters for each angle. `None` becomes the code of no return.
 pub(crate) fn scan(head: ScanHead, mut range: impl FnMut(f64) -> Option<f64>) -> Box<Scan> {
     let unit = |i: u16| {
         let range = range(head.first_angle + f64::from(i) * head.step);
@@ -112,7 +112,7 @@ pub(crate) fn scan(head: ScanHead, mut range: impl FnMut(f64) -> Option<f64>) ->
     Scan::of(head, &(0..head.count).map(unit).collect::<Vec<_>>())
 }
 
-/// By Box and Muller.
+/// Returns a normally distributed number with deviation 1, by the method of Box and Muller.
 pub(crate) fn normal(random: &mut Rng) -> f64 {
     (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
 }
@@ -140,14 +140,14 @@ fn distance_to_disc(from: Point, along: Point, center: Point, radius: f64) -> Op
 }
 
 impl Drive {
-    /// `count` scans of `beams` beams over half a turn in a room of `seed` with boxes in it.
+    /// Returns `count` scans of `beams` beams over 180 degrees in a room of `seed` with boxes in it.
     pub(crate) fn through_a_room(seed: u64, beams: usize, count: usize, noise_m: f64) -> Drive {
         let mut drive = Drive::new_room(seed, beams, noise_m);
         drive.drive_on(count, 0.02);
         drive
     }
 
-    /// The same, with so many `people` around the robot.
+    /// Returns scans as [`through_a_room`](Self::through_a_room), with this number of `people` around the robot.
     pub(crate) fn among_people(seed: u64, beams: usize, count: usize, people: usize) -> Drive {
         let mut drive = Drive::new_room(seed, beams, 0.01);
         for _ in 0..people {
@@ -157,7 +157,8 @@ impl Drive {
         drive
     }
 
-    /// A robot that drives by `speed` metres a scan, or stands, among so many `people` who walk.
+    /// Returns scans of a robot that drives by `speed` meters per scan, or stands if it is 0, among this number of
+    /// `people` who walk.
     pub(crate) fn with_walkers(seed: u64, beams: usize, count: usize, people: usize, speed: f64) -> Drive {
         let mut drive = Drive::new_room(seed, beams, 0.01);
         for _ in 0..people {
@@ -171,8 +172,9 @@ impl Drive {
         drive
     }
 
-    /// Returns scans of an LMS at half degrees, on a robot that drives by `speed` meters a scan through a furnished room among
-    /// `people`: tables and chairs with thin legs, cupboards, and pillars. The robot moves while a scan is measured.
+    /// Returns scans of an LMS at half degrees, on a robot that drives by `speed` meters per scan through a furnished
+    /// room among `people`: tables and chairs with thin legs, cupboards, and pillars. The robot moves while a scan is
+    /// measured.
     pub(crate) fn through_furniture(seed: u64, count: usize, people: usize, speed: f64) -> Drive {
         let mut drive = Drive::new_room(seed, 361, 0.01);
         drive.furnish();
@@ -183,8 +185,8 @@ impl Drive {
         drive
     }
 
-    /// Returns scans of an LMS at half degrees, on a robot that turns on the spot in a room, by `deg_per_s` from the first scan on. In
-    /// the end it stands for 20 scans.
+    /// Returns scans of an LMS at half degrees, on a robot that turns on the spot in a room, by `deg_per_s` from the
+    /// first scan on. At the end, it stands for 20 scans.
     pub(crate) fn on_the_spot(seed: u64, count: usize, deg_per_s: f64) -> Drive {
         let mut drive = Drive::turning(seed, count + 1, deg_per_s);
         drive.stand_still(19);
@@ -235,7 +237,7 @@ impl Drive {
         });
     }
 
-    /// Between two endless walls.
+    /// Returns scans of a robot that drives between two endless walls.
     pub(crate) fn along_a_corridor(seed: u64, beams: usize, count: usize) -> Drive {
         let mut drive = Drive::new_room(seed, beams, 0.01);
         drive.walls = vec![((-500.0, 1.2), (500.0, 1.2)), ((-500.0, -1.0), (500.0, -1.0))];
@@ -265,7 +267,7 @@ impl Drive {
             legs: Vec::new(),
             walkers: Vec::new(),
             head: match beams {
-                // As many scans a second as an LMS has.
+                // The same scan rate as an LMS.
                 361 => ScanHead::lms(361, -90_000, 500, 1, 15),
                 _ => beams_at(beams, -PI / 2.0, PI / (beams - 1) as f64),
             },
@@ -274,7 +276,7 @@ impl Drive {
         }
     }
 
-    /// So many scans more, while the robot drives around.
+    /// Adds `count` scans, while the robot drives around by `speed` meters per scan.
     pub(crate) fn drive_on(&mut self, count: usize, speed: f64) {
         let mut yaw_sum = 0.0;
         let yaw = TAU * self.random.f64();
@@ -297,7 +299,7 @@ impl Drive {
         }
     }
 
-    /// Adds a scan. The robot has moved by `by` since the scan before, and turns by `deg_per_s` during this one.
+    /// Adds a scan. The robot has moved by `by` since the previous scan, and turns by `deg_per_s` during this one.
     pub(crate) fn move_by(&mut self, by: Pose2, deg_per_s: f64) {
         let before = self.poses.last().copied().unwrap_or_default().then(&by);
         self.scan_between(
@@ -306,24 +308,24 @@ impl Drive {
         );
     }
 
-    /// So many scans more from where the robot is.
+    /// Adds `count` scans, while the robot stands.
     pub(crate) fn stand_still(&mut self, count: usize) {
         let pose = self.poses.last().copied().unwrap_or_default();
         (0..count).for_each(|_| self.scan_from(pose));
     }
 
-    /// One scan more, which ends at `place`. The robot moves there from its last place while the scan is measured.
+    /// Adds a scan that ends at `pose`. The robot moves there from its last position during the scan.
     fn scan_from(&mut self, pose: Pose2) {
         self.scan_between(self.poses.last().copied().unwrap_or(pose), pose);
     }
 
-    /// One scan more, during which the robot moves from `before` to `place`.
+    /// Adds a scan, during which the robot moves from `before` to `pose`.
     fn scan_between(&mut self, before: Pose2, pose: Pose2) {
         let Drive { walls, legs, walkers, head, noise_m, random, .. } = self;
         let times = Scan::of(*head, &[]);
         for walker in walkers.iter_mut() {
             walker.at = (walker.at.0 + walker.by_scan.0, walker.at.1 + walker.by_scan.1);
-            // Nobody walks into the robot, and nobody goes far.
+            // Walkers turn back near the robot and far away from it.
             let (dx, dy) = (walker.at.0 - pose.x, walker.at.1 - pose.y);
             let far = dx.hypot(dy);
             let outwards = dx * walker.by_scan.0 + dy * walker.by_scan.1;

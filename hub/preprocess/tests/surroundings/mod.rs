@@ -1,5 +1,5 @@
-//! Scans of made-up surroundings for the tests: beams with one to three surfaces between which they flip, something
-//! that comes and goes, codes, zeroes, noise with outliers. As unkind as a room can be, and more; not a simulation.
+//! Scans of random surroundings: beams that flip between one to three surfaces, a moving object, codes, zeroes, and
+//! noise with outliers. They are harder than real rooms, and not a simulation.
 #![allow(dead_code)] // each test takes what it needs
 
 use std::fmt;
@@ -7,7 +7,7 @@ use std::fmt;
 use scanhub_preprocess::background::{BackgroundModel, Class};
 use scanhub_schema::{Background, BackgroundHead, Foreground, ForegroundHead, Scan, ScanHead};
 
-/// The most beams of a scan.
+/// Maximum number of beams of a scan.
 pub(crate) const MAX_TEST_BEAMS: usize = 401;
 
 /// Angles, unit and bits of a scan.
@@ -21,7 +21,7 @@ pub(crate) struct Shape {
 }
 
 impl Shape {
-    /// One of those that the sensors have.
+    /// Returns a random shape that a sensor has.
     pub(crate) fn any(random: &mut fastrand::Rng) -> Shape {
         let (count, first_angle_mdeg, step_mdeg) = [
             (181, -90_000, 1000),
@@ -35,13 +35,13 @@ impl Shape {
     }
 }
 
-/// Surroundings that are looked at scan by scan.
+/// Source of scans of random surroundings.
 pub(crate) struct RandomSurroundings {
     pub(crate) shape: Shape,
     random: fastrand::Rng,
     /// Ranges in mm of the surfaces of each beam.
     beams: Vec<Vec<f64>>,
-    /// Something before them: its first beam, its beams, its range in mm.
+    /// Object in front of the surfaces: its first beam, its number of beams, and its range in mm.
     moving_object: (f64, usize, f64),
 }
 
@@ -59,7 +59,7 @@ impl RandomSurroundings {
         RandomSurroundings { shape, random, beams, moving_object: (0.0, 6, 1_500.0) }
     }
 
-    /// The next scan.
+    /// Returns the next scan.
     pub(crate) fn next(&mut self) -> Box<Scan> {
         let RandomSurroundings { shape, random, beams, moving_object } = self;
         let &mut Shape { count, first_angle_mdeg, step_mdeg, unit_mm, range_bits } = shape;
@@ -82,7 +82,7 @@ impl RandomSurroundings {
                 0..10 => max - random.u16(..9),
                 10..16 => 0,
                 16..40 => (range_mm / f64::from(shape.unit_mm)) as u16 + random.u16(..90),
-                // Such beams look through a window.
+                // These beams go through a window.
                 _ if i % 40 < 3 => max - 8 * u16::from(i % 3 == 0),
                 _ => ((range_mm + noise_mm) / f64::from(shape.unit_mm)).max(0.0) as u16,
             };
@@ -91,7 +91,7 @@ impl RandomSurroundings {
     }
 }
 
-/// What a scan says of a beam: its range in mm, that nothing is near (infinite), or nothing.
+/// Returns the reading of beam `i`: a range in mm, infinity if nothing is in range, or `None` without a reading.
 pub(crate) fn reading_mm(scan: &Scan, i: usize, no_return_is_far: bool) -> Option<f64> {
     let max = f64::from(scan.no_return);
     let value = f64::from(scan.ranges()[i]);
@@ -104,7 +104,7 @@ pub(crate) fn reading_mm(scan: &Scan, i: usize, no_return_is_far: bool) -> Optio
     }
 }
 
-/// A model as somebody might have saved it.
+/// Returns a random background, as a user might have saved it.
 pub(crate) fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Box<Background> {
     let head = BackgroundHead { unit_um: 1000 * u32::from(shape.unit_mm), ..BackgroundHead::default() };
     let mut model = Background::of(head, &vec![0; shape.count.into()]);
@@ -118,7 +118,7 @@ pub(crate) fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Box<Backgro
     model
 }
 
-/// The ranges of `model` in mm: 0 where it knows none, infinite where they are far.
+/// Returns the ranges of `model` in mm: 0 if unknown, infinity if far.
 pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
     let mm = |&range: &u16| match range {
         Background::FAR => f64::INFINITY,
@@ -127,8 +127,8 @@ pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
     model.ranges().iter().map(mm).collect()
 }
 
-/// Lets `model` look at `scan` and compares all that it says with `classes` and `generation`, in a payload that is full of
-/// `dirt` before. `place` is named where it differs.
+/// Passes `scan` to `model`, and compares the whole result with `classes` and `generation`. The payload is filled with
+/// `dirt` before. A failure prints `description`.
 pub(crate) fn check_scan(
     model: &mut BackgroundModel,
     scan: &Scan,
@@ -144,7 +144,7 @@ pub(crate) fn check_scan(
     assert_eq!(out, foreground(scan, classes, generation, dirty()), "{description}");
 }
 
-/// The foreground that belongs to `classes`, but for its segments, which stay as they are in `expected`.
+/// Returns the foreground for `classes`. Its segments stay as they are in `expected`.
 fn foreground(
     scan: &Scan,
     classes: &[Class],
@@ -168,12 +168,13 @@ fn foreground(
     expected
 }
 
-/// Millimetres per device unit.
+/// Returns the millimeters per device unit.
 pub(crate) fn unit_mm(unit_um: u32) -> f64 {
     f64::from(unit_um) / 1000.0
 }
 
-/// How far apart readings of one surface may be: as it is set, else by the unit, and never less than the unit.
+/// Returns the maximum difference of readings of one surface in mm: the set value, or the default for the unit, and at
+/// least one unit.
 pub(crate) fn max_difference_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
     let default_mm = match scan.unit_um {
         1_000 => 30,
@@ -183,7 +184,7 @@ pub(crate) fn max_difference_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
     f64::from(set_mm.unwrap_or(default_mm)).max(unit_mm(scan.unit_um))
 }
 
-/// Yes, no, or whatever is the default.
+/// Returns a random choice: true, false, or the default.
 pub(crate) fn any_choice(random: &mut fastrand::Rng) -> Option<bool> {
     [None, Some(false), Some(true)][random.usize(..3)]
 }
