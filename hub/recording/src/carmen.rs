@@ -1,9 +1,9 @@
-//! CARMEN logs: text files in which lines that start with `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in
+//! CARMEN logs: text files in which the lines `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in
 //! meters.
 //!
-//! [`LogReader`] reads the scans, [`RangeStats`] chooses the unit and the bits in which their ranges are whole values, and
-//! [`LogScan::frame`] turns a scan into the telegram that an LMS 2xx would have sent. In the other direction, [`scan_line`] writes a
-//! telegram as a line. Poses and all other lines are not read, but counted ([`UnreadLines`]).
+//! [`LogReader`] reads the scans, [`RangeStats`] chooses the unit and the bits in which their ranges are whole values,
+//! and [`LogScan::frame`] turns a scan into the telegram that an LMS 2xx would have sent. In the other direction,
+//! [`scan_line`] writes a telegram as a line. Poses and all other lines are only counted ([`UnreadLines`]).
 
 use std::fmt;
 use std::io::{self, BufRead, Read};
@@ -29,7 +29,7 @@ pub(crate) struct LogScan {
     pub(crate) form: LineForm,
     /// Ranges in meters, from right to left.
     pub(crate) ranges_m: Vec<f64>,
-    /// Nanoseconds since 1970 (or since the log's start), where the line has all its fields after the ranges.
+    /// Nanoseconds since 1970 (or since the log's start); `None` if the line lacks a field after the ranges.
     pub(crate) time_ns: Option<u64>,
     /// Whether the line has a pose other than 0.
     pub(crate) has_pose: bool,
@@ -37,20 +37,20 @@ pub(crate) struct LogScan {
     pub(crate) has_remissions: bool,
 }
 
-/// Data of a log that no other format holds, so that a conversion loses it.
+/// Counts of data in a log that no other format holds, so that a conversion loses it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UnreadLines {
-    /// Scans with a pose other than 0.
+    /// Number of scans with a pose other than 0.
     pub poses: u64,
-    /// Lines of odometry.
+    /// Number of lines of odometry.
     pub odometry: u64,
-    /// Scans with remissions.
+    /// Number of scans with remissions.
     pub remissions: u64,
-    /// Other lines, except comments and empty ones.
+    /// Number of other lines, except comments and empty ones.
     pub lines: u64,
 }
 
-/// Kind of line that a scan is written in. A log may have each scan in two of them.
+/// Kind of line that contains a scan. A log may have each scan in two kinds of lines.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LineForm {
     /// `FLASER`: ranges, two poses, time.
@@ -99,7 +99,8 @@ impl LogScan {
     pub(crate) fn parse(line: &str) -> Result<Option<LogScan>, String> {
         let mut fields = line.split_ascii_whitespace();
         let Some(form) = fields.next().and_then(LineForm::of) else { return Ok(None) };
-        // Type, start angle, field of view in radians, resolution, maximum range, accuracy, remission mode.
+        // The fields are type, start angle, field of view in radians, resolution, maximum range, accuracy, and
+        // remission mode.
         let view = match form {
             LineForm::Flaser => None,
             LineForm::RobotLaser | LineForm::RawLaser => {
@@ -123,7 +124,7 @@ impl LogScan {
                 field.parse().map_err(|_| format!("range {field:?} is not a number"))
             })
             .collect::<Result<Vec<f64>, String>>()?;
-        // Before the time: two poses; remissions, two poses and five numbers; remissions.
+        // These fields are before the time: two poses; or remissions, two poses and five numbers; or remissions.
         let (remissions, numbers) = match form {
             LineForm::Flaser => (Some(0), 6),
             LineForm::RobotLaser => (remissions(fields.next()), 11),
@@ -144,9 +145,10 @@ impl LogScan {
         variant(self.ranges_m.len())
     }
 
-    /// Returns the value words in `encoding`, for a log whose ranges are encoded as `own`: its codes stay the same codes. A
-    /// range that does not fit into `encoding` is rounded, or becomes the code of a range beyond it. NaN, infinite and negative
-    /// ranges become "no return". Logs of 180 and 360 beams lack the last beam, which becomes [`MISSING_BEAM_OFFSET`].
+    /// Returns the value words in `encoding`, for a log whose ranges are encoded as `own`. Codes stay the same codes. A
+    /// range that does not fit into `encoding` is rounded, or becomes the code of a range beyond it. NaN, infinite and
+    /// negative ranges become "no return". Logs of 180 and 360 beams lack the last beam, which becomes the code at
+    /// [`MISSING_BEAM_OFFSET`].
     pub(crate) fn words(&self, own: Encoding, encoding: Encoding) -> Vec<u16> {
         let greatest = encoding.mode.max_value();
         let word = |&range_m: &f64| {
@@ -171,8 +173,8 @@ impl LogScan {
     }
 }
 
-/// Returns the nanoseconds in `text`, a number of seconds; `None` if it is not positive. A double has only a quarter of a
-/// microsecond at today's times, so the decimals are read as they are.
+/// Returns the nanoseconds in `text`, a number of seconds; `None` if it is not positive. At today's times, a double
+/// resolves only a quarter of a microsecond, so the decimals are parsed as integers.
 fn nanoseconds(text: &str) -> Option<u64> {
     let (integer, fraction) = text.split_once('.').unwrap_or((text, ""));
     let is_digits = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
@@ -182,13 +184,13 @@ fn nanoseconds(text: &str) -> Option<u64> {
         let seconds: u64 = integer.parse().ok()?;
         seconds.checked_mul(1_000_000_000)?.checked_add(decimals + u64::from(rounded_up))?
     } else {
-        // Such as 1.07e9.
+        // The text has another form, such as 1.07e9.
         text.parse().ok().map(|seconds: f64| (seconds * 1e9).round() as u64)?
     };
     (ns > 0).then_some(ns)
 }
 
-/// Returns whether `telegram` is the [`configuration`] reply that stands for the encoding of a log, and that no scanner sent.
+/// Returns whether `telegram` is the [`configuration`] reply that represents the encoding of a log. No scanner sent it.
 #[cfg(feature = "mcap")]
 pub(crate) fn is_synthetic(telegram: &[u8]) -> bool {
     let reply = Telegram::check(telegram).and_then(Reply::decode);
@@ -202,12 +204,12 @@ pub(crate) fn configuration(encoding: Encoding) -> Vec<u8> {
     reply::configuration_reply(0, encoding.mode, encoding.unit, HEALTHY_STATUS).bytes().to_vec()
 }
 
-/// Returns a range in units, rounded.
+/// Returns a range in whole units.
 fn units(range_m: f64, unit: Unit) -> f64 {
     (range_m * 1000.0 / f64::from(unit.mm())).round()
 }
 
-/// Returns the distance of a range from the maximum value, if it is small enough for a code.
+/// Returns the offset of a range from the maximum value, if it is small enough for a code.
 fn code(range_m: f64, encoding: Encoding) -> Option<u16> {
     let below = f64::from(encoding.mode.max_value()) - units(range_m, encoding.unit);
     (0.0..=f64::from(BEYOND_RANGE_OFFSET)).contains(&below).then_some(below as u16)
@@ -224,7 +226,7 @@ fn remissions(field: Option<&str>) -> Option<usize> {
 }
 
 fn variant(beams: usize) -> Option<Variant> {
-    // 180 and 360: the last beam is missing.
+    // Logs with 180 or 360 beams lack the last beam.
     let beam_count = if matches!(beams, 180 | 360) { beams + 1 } else { beams };
     Variant::of_beams(beam_count)
 }
@@ -233,13 +235,13 @@ fn variant(beams: usize) -> Option<Variant> {
 /// used.
 pub(crate) struct LogReader<R> {
     reader: R,
-    /// Number of the last line, from 1.
+    /// Number of the last line that was read, from 1.
     pub(crate) line: u64,
     /// Kind of line of the first scan.
     form: Option<LineForm>,
-    /// Encoding that the log names itself.
+    /// Encoding that the log states itself.
     pub(crate) stated_encoding: Option<Encoding>,
-    /// Data of the lines so far that the scans do not contain.
+    /// Counts of the data so far that the scans do not contain.
     pub(crate) unread: UnreadLines,
 }
 
@@ -257,7 +259,8 @@ impl<R: BufRead> LogReader<R> {
         LogReader { reader, line: 0, form: None, stated_encoding: None, unread: UnreadLines::default() }
     }
 
-    /// Returns the next scan. A last line without its end that is not a scan is where the recording broke off, not a mistake.
+    /// Returns the next scan; `None` at the end. A last line that has no line feed and is not a valid scan is not an
+    /// error, because the recording broke off there.
     pub(crate) fn next(&mut self) -> Result<Option<LogScan>, LogError> {
         let mut bytes = Vec::new();
         loop {
@@ -298,7 +301,8 @@ impl<R: BufRead> LogReader<R> {
         }
     }
 
-    /// Returns the next scan of a log that was read before: wrong lines are skipped, and it ends where the file cannot be read.
+    /// Returns the next scan of a log that was read before. Skips invalid lines, and returns `None` where the file
+    /// cannot be read.
     pub(crate) fn next_valid(&mut self) -> Option<LogScan> {
         loop {
             match self.next() {
@@ -310,7 +314,7 @@ impl<R: BufRead> LogReader<R> {
     }
 }
 
-/// Returns the line in which a log names the encoding of its ranges. Other programs ignore it.
+/// Returns the line in which a log states the encoding of its ranges. Other programs ignore it.
 #[cfg(feature = "mcap")]
 pub(crate) fn encoding_line(encoding: Encoding) -> String {
     format!("{ENCODING_PREFIX} {} mm, {} bits\n", encoding.unit.mm(), encoding.mode.range_bits())
@@ -324,11 +328,11 @@ fn parse_encoding_line(line: &str) -> Option<Encoding> {
     Some(Encoding { unit, mode })
 }
 
-/// Reads the log at `path`, and returns its contents.
+/// Reads the log at `path` to its end, and returns its contents.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if it cannot be read, or if none of its lines is a valid scan.
+/// Returns [`Kind::Input`] if the file cannot be read, or if none of its lines is a valid scan.
 pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
     let mut contents = Contents { form: Form::Carmen, ..Contents::default() };
     let (mut log, mut stats, mut refusal) = (LogReader::new(reader), RangeStats::default(), None);
@@ -357,7 +361,7 @@ pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Fail
     let (encoding, unencodable) = stats.encoding(log.stated_encoding);
     (contents.unit, contents.mode, contents.unencodable) =
         (Some(encoding.unit), Some(encoding.mode), unencodable);
-    // If no line is right, the format is wrong, not the file.
+    // If no line is a valid scan, the file has another format.
     match refusal.filter(|_| contents.scans == 0) {
         Some(refusal) => Err(refusal),
         None => Ok(contents),
@@ -406,9 +410,9 @@ impl RangeStats {
         }
     }
 
-    /// Chooses the encoding, and counts the ranges that do not fit into it. The encoding is the one that the log names itself
-    /// (`told`) if all ranges fit into it. Otherwise it is centimeters if all ranges are whole centimeters, or millimeters, with
-    /// as few bits as the longest range needs.
+    /// Chooses the encoding, and counts the ranges that do not fit into it. The encoding is the one that the log states
+    /// itself (`stated`) if all ranges fit into it. Otherwise it is centimeters if all ranges are whole centimeters, or
+    /// millimeters, with as few bits as the longest range needs.
     pub(crate) fn encoding(&self, stated: Option<Encoding>) -> (Encoding, UnencodableRanges) {
         let order = if self.inexact[0] == 0 { [Unit::Cm, Unit::Mm] } else { [Unit::Mm, Unit::Cm] };
         let of_unit = |unit: Unit| MODES.map(|mode| Encoding { unit, mode });
@@ -428,14 +432,14 @@ impl RangeStats {
         match unit {
             Unit::Cm => self.inexact[0] == 0,
             Unit::Mm => self.inexact[1] == 0,
-            // Not counted: only a log that names decimeters itself has them.
+            // Only a log that states decimeters itself has them, so they are not counted.
             Unit::Dm => true,
         }
     }
 }
 
 impl UnencodableRanges {
-    /// Returns whether all ranges fit.
+    /// Returns whether all ranges can be encoded.
     pub fn is_none(&self) -> bool {
         *self == UnencodableRanges::default()
     }
@@ -454,9 +458,9 @@ impl fmt::Display for UnencodableRanges {
 }
 
 #[cfg(feature = "mcap")]
-/// Returns the line of a scan at `at_ns` since 1970, in a log that begins at `first_ns`; `None` if `telegram` is not a whole
-/// scan. A code is written as the range that its value would be, as in logs of the scanner. A line cannot hold reflector levels,
-/// field bits, address and status: they are lost.
+/// Returns the line of a scan at `at_ns` since 1970, in a log that begins at `first_ns`; `None` if `telegram` is not a
+/// whole scan. A code is written as the range that its value would be, as in logs of the scanner. Reflector levels,
+/// field bits, address and status are lost.
 pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Option<String> {
     let measured = MeasuredValues::decode(Telegram::check(telegram)?)?;
     if measured.partial().is_some() || Variant::of_beams(measured.count()).is_none() {
@@ -470,7 +474,7 @@ pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) 
     };
     let ranges: Vec<u16> = measured.words().map(|word| word & greatest).collect();
     let ranges = match &ranges[..] {
-        // A scan from a log without a last beam has none in a new log either.
+        // A scan of a log without the last beam has no last beam in the new log either.
         [ranges @ .., last]
             if *last == greatest - MISSING_BEAM_OFFSET && matches!(ranges.len(), 180 | 360) =>
         {
@@ -501,13 +505,14 @@ const MAX_LINE_LEN: u64 = 1 << 20;
 const MODES: [Mode; 3] = [Mode(0x00), Mode(0x04), Mode(0x06)];
 /// Encoding with the longest maximum range.
 const COARSEST_ENCODING: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0x06) };
-/// Tolerance for a whole number of units. The text has the exact value; the error of a double is smaller.
+/// Tolerance for a whole number of units. The text has the exact value, and the error of a double is smaller than this.
 const UNIT_TOLERANCE: f64 = 1e-6;
 /// Number of fields of two poses.
 const POSE_FIELDS: usize = 6;
-/// Distance from the maximum value of the code for a range beyond the mode's (Telegram listing 10.8).
+/// Offset from the maximum value of the code for a range beyond that of the mode (Telegram listing 10.8).
 pub const BEYOND_RANGE_OFFSET: u16 = 8;
-/// Distance of the code for a last beam that the log lacks. The code has no meaning, and no scanner sends it.
+/// Offset from the maximum value of the code for a last beam that the log lacks. The code has no meaning, and no
+/// scanner sends it.
 pub(crate) const MISSING_BEAM_OFFSET: u16 = 7;
 /// Tolerance of the field of view, in degrees: logs round it to a step more or less.
 const VIEW_TOLERANCE_DEG: f64 = 1.5;
@@ -544,7 +549,7 @@ mod tests {
 
     #[test]
     fn rounds_ranges_and_encodes_too_far_ones_as_codes() {
-        // Of a log that can say all of them.
+        // The encoding of the log holds all of these ranges.
         let word = |range: &str, unit, mode| {
             let log_scan = LogScan::parse(&line(361, range)).unwrap().unwrap();
             log_scan.words(encoding(Unit::Cm, 6), encoding(unit, mode))[0]
@@ -700,7 +705,7 @@ mod tests {
         let line = scan_line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_789, 1_071_078_720_000_000_000)
             .unwrap();
         assert!(line.ends_with(" 12.34 0 0 0 0 0 0 1071078720.123457 scanhub 0.123457\n"), "{line}");
-        // As with the rounded times of a log: 123 457 - 100 000.
+        // The log has rounded times: 123 457 - 100 000.
         let first = 1_071_078_720_000_000_000 + 100_000_400;
         let again = scan_line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_500, first).unwrap();
         assert!(again.ends_with(" scanhub 0.023457\n"), "{again}");

@@ -1,5 +1,5 @@
-//! Writes a recording in the same format or another. A damaged file becomes an intact one with everything that can be read
-//! from it.
+//! Conversion of a recording to the same format or another one. A damaged file becomes an intact one with everything
+//! that can be read from it.
 
 mod scans;
 mod writers;
@@ -22,13 +22,13 @@ use writers::{Csv, Ros2};
 /// Options of a conversion.
 #[derive(Clone, Debug, Default)]
 pub struct ConvertOptions {
-    /// The recording, of any form.
+    /// Path of the recording, which may have any format.
     pub input: PathBuf,
     /// Family of a stream file; `None` if it is recognized by the bytes.
     pub family: Option<Family>,
     /// Path of the output, whose ending selects the format; `-` is a telegram stream on stdout.
     pub output: PathBuf,
-    /// Sensor of the recording; for a stream or a log its name in an MCAP file.
+    /// Name of the sensor to convert; for a stream or a log, the name that the sensor gets in an MCAP file.
     pub sensor: Option<String>,
     /// Whether to overwrite an existing file.
     pub force: bool,
@@ -36,9 +36,9 @@ pub struct ConvertOptions {
     pub ros2: bool,
     /// Whether ROS 2 output has each scan also as a PointCloud2.
     pub points: bool,
-    /// For scans: the measuring mode of a recording that does not contain it.
+    /// Measuring mode for scans of a recording that does not contain it.
     pub mode: Option<Mode>,
-    /// For CSV: `SENSOR/scan` or `SENSOR/marks`.
+    /// Topic to write as CSV: `SENSOR/scan` or `SENSOR/marks`.
     pub topic: Option<String>,
     /// Whether CSV output has ranges in meters.
     pub meters: bool,
@@ -53,23 +53,23 @@ pub struct ConvertOptions {
 pub struct ConversionResult {
     /// Formats of the input and of the output.
     pub forms: (Form, Target),
-    /// How the ranges of a log are encoded as values; `None` for other formats.
+    /// Encoding of the ranges of a log as values; `None` for other formats.
     pub encoding: Option<Encoding>,
-    /// Sensors of the recording; if it names none, the name in an MCAP file.
+    /// Names of the recording's sensors; if it names none, the name in an MCAP file.
     pub sensors: Vec<String>,
-    /// Telegrams that were written.
+    /// Number of telegrams that were written.
     pub telegrams: u64,
-    /// Scans that were written; for marks, scans whose marks were written.
+    /// Number of scans that were written; for marks, of scans whose marks were written.
     pub scans: u64,
-    /// Marks that were written; `None` if they were not requested.
+    /// Number of marks that were written; `None` if they were not requested.
     pub marks: Option<u64>,
-    /// Telegrams that the format cannot hold: in a CARMEN log all but whole scans, for ROS 2 and CSV all but scans. The reply that
-    /// contains the encoding of a log does not count.
+    /// Number of telegrams that the format cannot hold: in a CARMEN log all except complete scans, for ROS 2 and CSV
+    /// all except scans. The reply that contains the encoding of a log does not count.
     pub dropped: u64,
     /// Data of a log that no telegram holds.
     pub unread: UnreadLines,
-    /// Time from the first telegram to the last one in ns, by the stamps of the recording or by generated ones; `None` if there
-    /// are neither.
+    /// Time from the first telegram to the last one in ns, by the stamps of the recording or by generated ones; `None`
+    /// without stamps.
     pub duration_ns: Option<u64>,
     /// Data that could not be read.
     pub damage: Damage,
@@ -80,7 +80,7 @@ pub struct ConversionResult {
 /// Format that a recording is converted to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Target {
-    /// A recording again, of this form.
+    /// Recording of this format.
     Recording(Form),
     /// An MCAP file with only messages of ROS 2.
     Ros2,
@@ -101,12 +101,12 @@ impl Target {
     }
 }
 
-/// Converts according to `options` until `stop` is set; calls `progress` with the telegrams written and their total. A
-/// closed stdout is not an error. After an error, no output remains.
+/// Converts according to `options` until `stop` is set. Calls `progress` with the number of telegrams so far and their
+/// total. A closed stdout is not an error. After an error, no output remains.
 ///
 /// # Errors
 ///
-/// - [`Kind::Input`] if the recording cannot be read, or not be converted without loss.
+/// - [`Kind::Input`] if the recording cannot be read, or cannot be converted without loss.
 /// - [`Kind::NoTopic`] if it has no such sensor.
 /// - [`Kind::Usage`] if the output format is unknown, or options contradict each other.
 /// - [`Kind::Output`] if the output exists or cannot be written.
@@ -128,14 +128,14 @@ pub fn convert(
         None => whole,
     };
     let contents = recording.contents();
-    // Marks are copied, whatever the encoding of the scans.
+    // Marks are copied as they are, so the encoding does not matter.
     let encoding = match target {
         Target::MarksCsv => Encoding { unit: Unit::Cm, mode: Mode(0) },
         _ => encoding(&recording, target)?,
     };
     let is_of_all = matches!(target, Target::Recording(Form::Mcap) | Target::Ros2);
     if !(contents.form == Form::Mcap && is_of_all) {
-        // Fails before anything is written if the file has several sensors and none was chosen.
+        // Fail before anything is written if the file has several sensors and none was chosen.
         drop(recording.telegrams(encoding)?);
     }
     let mut conversion = Conversion {
@@ -194,7 +194,7 @@ impl From<Failure> for ConversionError {
     }
 }
 
-/// A conversion that runs: its input, its progress and its result so far.
+/// Running conversion: its input, its progress and its result so far.
 struct Conversion<'a> {
     recording: &'a Recording,
     options: &'a ConvertOptions,
@@ -203,7 +203,7 @@ struct Conversion<'a> {
     encoding: Encoding,
     stop: &'a AtomicBool,
     progress: &'a mut dyn FnMut(u64, u64),
-    /// Telegrams so far, written or not.
+    /// Number of telegrams so far, written or not.
     telegram_count: u64,
     /// Time of the first telegram.
     first_ns: Option<u64>,
@@ -265,7 +265,7 @@ impl Conversion<'_> {
     }
 }
 
-/// Form in which a telegram was written.
+/// Result of a telegram in the output.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum WrittenItem {
     Scan,
@@ -282,7 +282,8 @@ impl WrittenItem {
         if is_scan { WrittenItem::Scan } else { WrittenItem::Other }
     }
 
-    /// Returns how `frame` was written, number `number` of those that [`writers::frames`] returns for a recording of `form`.
+    /// Returns the result of `frame`, which has the index `number` among those that [`writers::frames`] returns for a
+    /// recording of `form`.
     fn of_frame(form: Form, number: usize, frame: &Frame) -> WrittenItem {
         if form == Form::Carmen && number == 0 {
             WrittenItem::Added
@@ -459,7 +460,7 @@ enum Output {
 }
 
 impl Output {
-    /// Creates the output at `path`, which may replace another file than `input` if `force` is set. `-` is stdout.
+    /// Creates the output at `path`. With `force`, it may replace a file, but not `input`. `-` is stdout.
     ///
     /// # Errors
     ///
@@ -511,7 +512,7 @@ impl Write for Output {
     }
 }
 
-/// Output that is compressed by gzip if the name of the file ends with `.gz`.
+/// Encoder of the output, which compresses with gzip if the name of the file ends with `.gz`.
 enum OutputEncoder<W: Write> {
     Plain(W),
     Gzip(GzEncoder<W>),

@@ -1,9 +1,9 @@
-//! Reads recordings: MCAP files of the hub (feature `mcap`), streams of telegrams as they arrived on a line, and CARMEN
-//! logs, each plain or gzipped.
+//! Reader and converter of recordings: MCAP files of the hub (feature `mcap`), streams of telegrams as they arrived on
+//! a line, and CARMEN logs, each plain or gzipped.
 //!
-//! All of them yield whole telegrams as [`Frame`]s, so that the simulator can send them and a hub can read them. [`Contents`]
-//! describes the sensors and the meaning of the values, as far as the file contains that. Nothing here reads a clock or opens a
-//! port.
+//! All of them yield complete telegrams as [`Frame`]s, which the simulator can send and a hub can read. [`Contents`]
+//! describes the sensors and the encoding of the values, if the file contains them. This crate reads no clock and opens
+//! no port.
 
 mod carmen;
 #[cfg(feature = "mcap")]
@@ -25,25 +25,25 @@ pub use carmen::{BEYOND_RANGE_OFFSET, UnencodableRanges, UnreadLines};
 pub use open::Recording;
 pub use stream::VirtualTime;
 
-/// A telegram of a recording, or the packets that arrived together.
+/// Telegram of a recording, or packets that arrived together.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Frame {
-    /// The whole telegram, STX to checksum; for other families than LMS whole packets. Those of a stream file have every bit as
-    /// it was received.
+    /// Complete telegram, from STX to checksum; for families other than LMS, complete packets. Those of a stream file
+    /// have every bit as it was received.
     pub telegram: Vec<u8>,
-    /// Number of its [`Family`].
+    /// Number of the scanner's [`Family`].
     pub family: u8,
     /// Time of the measurement, in nanoseconds since 1970, if the recording contains it.
     pub wall_ns: Option<u64>,
     /// Time of the measurement by the scanner's clock, in nanoseconds since the first frame, if the recording has no other time.
     pub scanner_ns: Option<u64>,
-    /// Reasons why it is suspect, bits of [`scanhub_drivers::line::suspect`].
+    /// Reasons why the telegram is suspect, as bits of [`scanhub_drivers::line::suspect`].
     pub reasons: u8,
-    /// Header that the hub published. Streams and logs have none.
+    /// Header that the hub published. Streams and logs have no headers.
     pub header: Option<scanhub_schema::Header>,
 }
 
-/// Record of a file that matters for the angles of a mount.
+/// Record of a file that is needed to replay the angles of a mount.
 #[derive(Clone, Copy, Debug)]
 pub enum MountRecord {
     /// Angle of the mount.
@@ -53,12 +53,12 @@ pub enum MountRecord {
 }
 
 impl Frame {
-    /// Returns whether it is a telegram of measured values (B0h), which an LMS streams.
+    /// Returns whether the frame is a telegram of measured values (B0h), which an LMS streams.
     pub fn is_scan(&self) -> bool {
         is_scan(self.family, &self.telegram)
     }
 
-    /// Returns whether it reports the measuring mode, or that the mode is no longer known.
+    /// Returns whether the frame reports the measuring mode, or shows that the mode is no longer known.
     pub fn has_mode(&self) -> bool {
         let reply = Telegram::check(&self.telegram).and_then(Reply::decode);
         reply.is_some_and(|reply| reply.mode().is_some())
@@ -69,7 +69,7 @@ pub(crate) fn is_scan(family: u8, telegram: &[u8]) -> bool {
     family == Family::Lms as u8 && telegram.get(4) == Some(&MEASURED)
 }
 
-/// Encoding of ranges as value words. The ranges of a log are in meters, so they have none of their own.
+/// Encoding of ranges as value words. The ranges of a log are in meters, so a log has no encoding of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Encoding {
     /// Unit of the ranges.
@@ -138,10 +138,10 @@ pub struct Contents {
     pub variant: Option<Variant>,
     /// Unit of the first scan; for a log the unit in which its ranges are whole values.
     pub unit: Option<Unit>,
-    /// Measuring mode, if a configuration reply (F4h) or a status contains it; for a log, a mode whose values reach as far as
+    /// Measuring mode, if a configuration reply (F4h) or a status contains it; for a log, a mode whose values can hold
     /// its ranges.
     pub mode: Option<Mode>,
-    /// Bits that are set in any value of the scans; none for a log.
+    /// Bits that are set in any value of the scans; 0 for a log.
     pub bits: u16,
     /// Ranges of a log that its unit and mode cannot encode.
     pub unencodable: UnencodableRanges,
@@ -152,15 +152,15 @@ pub struct Contents {
 }
 
 impl Contents {
-    /// Returns the measuring mode for reading the values: the one in the recording, or else the mode of 13 bits if no value has a
-    /// higher bit, because then the modes agree. Returns `None` if the values could be split in several ways.
+    /// Returns the measuring mode for reading the values: the one in the recording, or the mode of 13 bits if no value
+    /// has a higher bit set, because then all modes agree. Returns `None` if the values have several possible meanings.
     pub fn readable_mode(&self) -> Option<Mode> {
         let plain = Mode(0x00);
         self.mode.or((self.bits <= plain.max_value()).then_some(plain))
     }
 
-    /// Returns the number of the measuring mode for reading the values: the one in the recording, or else `configured`, or else
-    /// the [readable](Self::readable_mode) one.
+    /// Returns the number of the measuring mode for reading the values: the one in the recording, otherwise
+    /// `configured`, otherwise the [readable](Self::readable_mode) one.
     pub fn mode_or(&self, configured: Option<u8>) -> Option<u8> {
         self.mode.map(|mode| mode.0).or(configured).or(self.readable_mode().map(|mode| mode.0))
     }
@@ -171,8 +171,8 @@ impl Contents {
         Encoding { unit: self.unit.unwrap_or(default.unit), mode: mode.map_or(default.mode, Mode) }
     }
 
-    /// Returns the time from a scan of `beams` to the next one, for a recording without stamps. Another number of beams than those of
-    /// the listing has the period of the other scans.
+    /// Returns the time from a scan of `beams` beams to the next one, for a recording without stamps. A number of beams
+    /// that is not in the listing has the period of the first scan.
     pub fn period(&self, beams: usize) -> Nanos {
         let variant = Variant::of_beams(beams).or(self.variant).unwrap_or(Variant::HALF);
         nominal_period(variant.beams(), Baud::B500000.rate())
@@ -183,7 +183,7 @@ impl Contents {
         self.family == Family::Lms as u8
     }
 
-    /// Counts a telegram of a sensor of `family`, and stores its description of the sensor.
+    /// Counts a telegram of a sensor of `family`, and stores what it reports about the sensor.
     pub(crate) fn note(&mut self, family: u8, telegram: &[u8], wall_ns: Option<u64>) {
         if self.telegrams == 0 {
             self.family = family;
@@ -223,19 +223,20 @@ impl Contents {
     }
 }
 
-/// Parts of a recording that could not be read; all zero if the file is intact.
+/// Counts of data that could not be read; all zero if the file is intact.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Damage {
-    /// Telegrams whose numbers are missing between others. Either the file or the recorder lost them.
+    /// Number of telegrams whose sequence numbers are missing between others. Either the file or the recorder lost
+    /// them.
     pub telegrams: u64,
-    /// Bytes that were not read: those of damaged chunks and records, those after a place where the structure of the file is
-    /// lost, and those outside the telegrams of a stream.
+    /// Number of bytes that were not read: those of damaged chunks and records, those after a position at which the
+    /// structure of the file is lost, and those outside the telegrams of a stream.
     pub bytes: u64,
-    /// Chunks that were skipped because they are damaged.
+    /// Number of chunks that were skipped because they are damaged.
     pub chunks: u64,
-    /// Chunks that were skipped because the file contains them twice.
+    /// Number of chunks that were skipped because the file contains them twice.
     pub repeats: u64,
-    /// Whether the file ends without its index, as after a kill.
+    /// Whether the file ends without its index, for example because the recorder was killed.
     pub is_truncated: bool,
     /// Whether the file was changed after it was written: a checksum or a length is wrong.
     pub is_damaged: bool,
@@ -249,7 +250,7 @@ impl Damage {
 }
 
 impl fmt::Display for Damage {
-    /// Writes one line, `nothing` if nothing is missing.
+    /// Writes the counts as one line, or `nothing` if they are all 0.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let counted = |count: u64, one: &str, more: &str| match count {
             0 => None,

@@ -1,5 +1,5 @@
-//! MCAP files that the hub recorded. [`Reader`] yields each sensor's telegrams and all other records, [`Catalog`] has the
-//! channels, and [`Survey`] has the contents of the whole file, which is read once before anything uses it.
+//! MCAP files that the hub recorded. [`Reader`] yields the telegrams of all sensors and all other records, [`Catalog`]
+//! has the channels, and [`Survey`] has the contents of the whole file, which is read once before it is used.
 
 mod records;
 
@@ -20,7 +20,7 @@ use crate::{Contents, Damage, Frame, MountRecord};
 use records::Records;
 pub(crate) use records::{Record, has_record_boundary};
 
-/// A part of a file.
+/// Item of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Item {
     /// A telegram of a sensor.
@@ -29,7 +29,7 @@ pub(crate) enum Item {
     Record(Record),
 }
 
-/// A message of topic `telegram`.
+/// Message of topic `telegram`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Sample {
     pub(crate) sensor: String,
@@ -37,16 +37,16 @@ pub(crate) struct Sample {
     pub(crate) telegram: Vec<u8>,
 }
 
-/// Reads a file from its beginning to its end.
+/// Reader of a file, from its beginning to its end.
 pub(crate) struct Reader<R> {
     records: Records<R>,
     catalog: Catalog,
-    /// Whether messages were read whose channel was not known yet.
+    /// Whether a message was read whose channel was unknown.
     has_unknown: bool,
 }
 
 impl<R: Read> Reader<R> {
-    /// Reads `input`, about which `catalog` is known already.
+    /// Creates a reader of `input`, whose channels in `catalog` are already known.
     fn new(input: R, catalog: Catalog) -> Self {
         Reader { records: Records::new(input), catalog, has_unknown: false }
     }
@@ -72,8 +72,8 @@ impl<R: Read> Reader<R> {
         }
     }
 
-    /// Returns whether a record that no checksum of a chunk covers contradicts itself: a message of the hub whose header does
-    /// not fit to it, or a telegram of an LMS with a wrong CRC.
+    /// Returns whether a record outside chunks, which no checksum covers, contradicts itself: a message of the hub with
+    /// a header that does not fit, or a telegram of an LMS with a wrong CRC.
     fn is_damaged(&self, record: &Record, sample: Option<&Sample>) -> bool {
         if let Some(Sample { header, telegram, .. }) = sample {
             return header.family == Family::Lms as u8 && Telegram::check(telegram).is_none();
@@ -92,7 +92,7 @@ impl<R: Read> Reader<R> {
                     channel_topic.filter(|channel_topic| channel_topic.topic == Topic::Telegram)?;
                 (channel_topic.sensor.clone(), split_sample(&message, data)?)
             }
-            // The channel's record is lost. A telegram of an LMS shows by itself that it is one.
+            // The channel's record is lost. A telegram of an LMS can still be recognized by its CRC.
             None => {
                 self.has_unknown = true;
                 let sample = split_sample(&message, data)?;
@@ -112,9 +112,9 @@ pub(crate) struct Survey {
     catalog: Catalog,
     /// Header of each sensor's last telegram.
     last: BTreeMap<String, Header>,
-    /// Number of the first telegram that the hub processed further, by sensor and run of the hub.
+    /// Sequence number of the first telegram that the hub processed further, by sensor and run of the hub.
     first_understood: BTreeMap<String, BTreeMap<u64, u64>>,
-    /// Number of pairs of sensor and run in it.
+    /// Number of pairs of sensor and run in `first_understood`.
     runs: usize,
 }
 
@@ -228,8 +228,8 @@ impl Survey {
         &self.catalog
     }
 
-    /// Returns the number of the first telegram of `sensor` that the hub with this `boot` processed further; `None` if the
-    /// file does not contain it, or is damaged.
+    /// Returns the sequence number of the first telegram of `sensor` that the hub with this `boot` processed further;
+    /// `None` if the file does not contain it, or is damaged.
     pub(crate) fn first_understood(&self, sensor: &str, boot: u64) -> Option<u64> {
         self.first_understood.get(sensor)?.get(&boot).copied().filter(|_| !self.whole.damage.is_damaged)
     }
@@ -257,12 +257,12 @@ impl Survey {
         }
     }
 
-    /// Takes over what statuses say about the scanner, and which telegrams the hub processed further.
+    /// Stores what a status reports about the scanner, and which telegrams the hub processed further.
     fn note_record(&mut self, catalog: &Catalog, record: &Record) {
         let Some((channel_topic, header, payload)) = catalog.message(record) else { return };
         let is_of_scan = channel_topic.topic.spec().publish_rate == PublishRate::Scan
             && channel_topic.topic != Topic::Telegram;
-        // A sample without a hub time was not caused by a telegram.
+        // A sample without a hub time was not computed from a telegram.
         if is_of_scan && header.hub_time_ns().is_some() {
             let runs = match self.first_understood.get_mut(&channel_topic.sensor) {
                 Some(runs) => runs,
@@ -304,7 +304,8 @@ impl Survey {
     }
 }
 
-/// Returns the number of beams of the scan that `payload` is, or that it was computed from. `None` for another topic.
+/// Returns the number of beams of the scan in `payload`, or of the scan from which `payload` was computed. `None` for
+/// other topics.
 fn beams_of(channel_topic: &ChannelTopic, payload: &[u8]) -> Option<u16> {
     match channel_topic.topic {
         _ if channel_topic.is_old => None,
@@ -322,8 +323,8 @@ fn beams_of(channel_topic: &ChannelTopic, payload: &[u8]) -> Option<u16> {
     .filter(|beams| *beams > 0)
 }
 
-/// Returns the model and the scan mode that `status` names, if the scanner is a rotating one. Each is `None` if this version
-/// does not know it.
+/// Returns the model and the scan mode that `status` names, if the scanner is a rotating one. Each is `None` if this
+/// version does not support it.
 fn rotating(status: &Status) -> Option<(Option<&'static str>, Option<&'static str>)> {
     let features = features(Family::of_number(status.family)?);
     let name = status.model().filter(|_| !features.has_whole_telegrams)?;
@@ -341,7 +342,7 @@ fn machine(sensor: &str) -> Option<&str> {
     sensor.split_once('.').map(|(machine, _)| machine)
 }
 
-/// Topic of a sensor that a channel has.
+/// Topic of a sensor to which a channel belongs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct ChannelTopic {
     pub(crate) sensor: String,
@@ -351,7 +352,8 @@ pub(crate) struct ChannelTopic {
 }
 
 impl ChannelTopic {
-    /// Returns the topic of `channel`; `None` if another program made the channel, or if it names no valid sensor.
+    /// Returns the topic of `channel`; `None` if the channel belongs to another program, or does not name a valid
+    /// sensor.
     fn of(channel: &Channel) -> Option<ChannelTopic> {
         let (sensor, topic) = channel.topic.rsplit_once('/')?;
         let is_old = channel.message_encoding == ENCODING_V1;
@@ -361,7 +363,7 @@ impl ChannelTopic {
         Some(ChannelTopic { sensor: sensor.to_owned(), topic, is_old })
     }
 
-    /// Returns whether its messages are scans in today's format.
+    /// Returns whether the messages are scans in the current format.
     pub(crate) fn has_scans(&self) -> bool {
         self.topic == Topic::Scan && !self.is_old
     }
@@ -385,11 +387,12 @@ pub(crate) struct Catalog {
 }
 
 impl Catalog {
-    /// Takes over what `record` says. The first schema or channel with a number counts.
+    /// Stores the schema, the channel or the metadata in `record`. The first schema or channel with an ID counts.
     ///
     /// # Errors
     ///
-    /// Returns [`io::ErrorKind::FileTooLarge`] if the file has more channels, schemas or sensors than are kept in memory.
+    /// Returns [`io::ErrorKind::FileTooLarge`] if the file has more channels, schemas or sensors than are kept in
+    /// memory.
     pub(crate) fn note(&mut self, record: &Record) -> io::Result<()> {
         if !matches!(record.opcode, op::HEADER | op::METADATA | op::SCHEMA | op::CHANNEL) {
             return Ok(());
@@ -421,14 +424,14 @@ impl Catalog {
         Err(io::Error::new(io::ErrorKind::FileTooLarge, what))
     }
 
-    /// Returns the channel with this number, and its schema.
+    /// Returns the channel with this ID, and its schema.
     pub(crate) fn channel(&self, id: u16) -> Option<(&Channel, Option<&Schema>)> {
         let (channel, _) = self.channels.get(&id)?;
         Some((channel, self.schemas.get(&channel.schema_id)))
     }
 
-    /// Returns the topic of the channel with this number: `Some(None)` if another program made it, `None` if the channel is
-    /// unknown.
+    /// Returns the topic of the channel with this ID: `Some(None)` if it belongs to another program, `None` if the
+    /// channel is unknown.
     pub(crate) fn channel_topic(&self, id: u16) -> Option<Option<&ChannelTopic>> {
         self.channels.get(&id).map(|(_, channel_topic)| channel_topic.as_ref())
     }
@@ -441,7 +444,7 @@ impl Catalog {
         Some((channel_topic, header, payload))
     }
 
-    /// Returns the sensors that channels name, in the order of the channels' numbers.
+    /// Returns the sensors that channels name, in the order of the channels' IDs.
     pub(crate) fn sensors(&self) -> Vec<String> {
         let mut known = HashSet::new();
         let channel_topics = self.channels.values().filter_map(|(_, channel_topic)| channel_topic.as_ref());
@@ -452,14 +455,14 @@ impl Catalog {
             .collect()
     }
 
-    /// Returns the mounts whose angles have a channel, in the order of the channels' numbers.
+    /// Returns the mounts whose angles have a channel, in the order of the channels' IDs.
     pub(crate) fn mounts(&self) -> Vec<String> {
         let mut known = HashSet::new();
         let names = self.channels.values().filter_map(|(channel, _)| mount_of(channel));
         names.filter(|name| known.insert(*name)).map(str::to_owned).collect()
     }
 
-    /// Returns the angle of `mount` that `record` contains. `None` if it contains anything else.
+    /// Returns the angle of `mount` in `record`; `None` for any other record.
     pub(crate) fn angle(&self, record: &Record, mount: &str) -> Option<(Header, Tilt)> {
         let (message, data) = record.message()?;
         let (channel, _) = self.channels.get(&message.channel_id)?;
@@ -493,9 +496,9 @@ pub(crate) fn split_sample<'a>(message: &MessageHeader, data: &'a [u8]) -> Optio
     is_same.then_some((header, payload))
 }
 
-/// Maximum number of runs of a hub that are remembered: one per minute for a month.
+/// Maximum number of stored runs of a hub: one per minute for a month.
 const MAX_RUNS: usize = 50_000;
-/// Maximum number of sensors: those of sixteen hubs, each with as many as one can have.
+/// Maximum number of sensors: those of sixteen hubs, each with the maximum that a hub can have.
 const MAX_SENSORS: usize = 4096;
 /// Maximum memory of channels and schemas. Files of many sensors have some hundred channels, and a megabyte of schemas.
 const MAX_CATALOG_BYTES: usize = 20 << 20;

@@ -1,5 +1,5 @@
-//! Opens a recording, whose form is detected by its content and not by its name. The file is read to its end once, so that its
-//! contents and its damage are known before anything uses it. No telegram is kept in memory.
+//! An open recording, whose format is detected by its content and not by its name. The file is read to its end once, so
+//! that its contents and its damage are known before it is used. No telegram is kept in memory.
 
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -17,26 +17,27 @@ use crate::mcap::{Catalog, Reader};
 use crate::stream::{self, StreamReader};
 use crate::{Contents, Encoding, Form, Frame, MountRecord, VirtualTime};
 
-/// A recording that could be read to its end.
+/// Recording that could be read to its end.
 #[derive(Clone, Debug)]
 pub struct Recording {
     path: PathBuf,
     contents: Contents,
-    /// Contents of an MCAP file by sensor.
+    /// Contents of an MCAP file, by sensor.
     #[cfg(feature = "mcap")]
     survey: std::sync::Arc<crate::mcap::Survey>,
-    /// The sensor that [`of`](Self::of) selected.
+    /// Sensor that [`of`](Self::of) selected.
     sensor: Option<String>,
 }
 
 impl Recording {
-    /// Opens the file at `path`, and reads it to its end. The family of a stream file is recognized by its bytes. A damaged
-    /// file is opened: see [`Contents::damage`].
+    /// Opens the file at `path`, and reads it to its end. The family of a stream file is recognized by its bytes. For a
+    /// damaged file, see [`Contents::damage`].
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Input`] if the file is neither an MCAP file nor a CARMEN log, and has no telegram. The same holds for a
-    /// stream file if no family takes at least half of the [first bytes](scanhub_drivers::recognize::EXAMINED_BYTES).
+    /// Returns [`Kind::Input`] if the file is neither an MCAP file nor a CARMEN log, and has no telegram. The same
+    /// holds for a stream file if no family takes at least half of the [first
+    /// bytes](scanhub_drivers::recognize::EXAMINED_BYTES).
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         Recording::open_as(path, None)
     }
@@ -55,8 +56,8 @@ impl Recording {
         Ok(recording)
     }
 
-    /// Opens a file like [`open_as`](Self::open_as). A stream file of a named `family` may have no telegram: a line with only
-    /// noise.
+    /// Opens a file like [`open_as`](Self::open_as). A stream file of a named `family` may also be without telegrams,
+    /// such as the bytes of a line with only noise.
     ///
     /// # Errors
     ///
@@ -115,12 +116,12 @@ impl Recording {
         head.starts_with(MCAP_MAGIC) || head.starts_with(GZIP_MAGIC)
     }
 
-    /// Returns the part of the recording that belongs to `sensor`.
+    /// Returns the recording restricted to `sensor`.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NoTopic`] with the existing sensors if there is no such sensor, and [`Kind::Usage`] if the recording names no
-    /// sensor.
+    /// Returns [`Kind::NoTopic`] with the existing sensors if there is no such sensor, and [`Kind::Usage`] if the
+    /// recording names no sensor.
     pub fn of(&self, sensor: &str) -> Result<Recording, Failure> {
         let path = self.path.display();
         if self.contents.sensors.is_empty() {
@@ -140,8 +141,9 @@ impl Recording {
         Ok(chosen)
     }
 
-    /// Returns the number of the first telegram of the only sensor that the hub with this `boot` processed further. From there on,
-    /// the hub knew the meaning of the values. Returns `None` if the recording does not contain it; only MCAP does.
+    /// Returns the sequence number of the first telegram of the only sensor that the hub with this `boot` processed
+    /// further. From there on, the hub knew the meaning of the values. Returns `None` if the recording does not contain
+    /// it; only MCAP files do.
     pub fn first_understood(&self, boot: u64) -> Option<u64> {
         #[cfg(feature = "mcap")]
         return self.survey.first_understood(self.contents.sensors.first()?, boot);
@@ -157,12 +159,12 @@ impl Recording {
         Family::of_number(self.contents.family)
     }
 
-    /// Returns the model of a rotating scanner, as a status or the first packets report it.
+    /// Returns the model of a rotating scanner, from a status or the first packets.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`telegrams`](Self::telegrams), and [`Kind::Input`] if nothing in the recording defines how its
-    /// packets must be read.
+    /// Returns the errors of [`telegrams`](Self::telegrams), and [`Kind::Input`] if nothing in the recording defines
+    /// how its packets must be read.
     pub fn model(&self) -> Result<Option<Model>, Failure> {
         let Some(family) = self.family().filter(|family| !features(*family).models.is_empty()) else {
             return Ok(None);
@@ -193,7 +195,7 @@ impl Recording {
         Ok(model)
     }
 
-    /// Returns the number of beams in the scans of a rotating scanner, as the scans or a status report it.
+    /// Returns the number of beams in the scans of a rotating scanner, from the scans or a status.
     pub fn beams(&self) -> Option<usize> {
         let scans = self.contents.beams.map(usize::from);
         scans.or_else(|| {
@@ -207,7 +209,7 @@ impl Recording {
         })
     }
 
-    /// Returns the settings of a session that reads its packets: model, mode and number of beams, as far as they are known.
+    /// Returns the settings of a session that reads the packets: model, mode and number of beams, if they are known.
     ///
     /// # Errors
     ///
@@ -223,12 +225,12 @@ impl Recording {
         &self.path
     }
 
-    /// Returns the contents: after [`of`](Self::of), those of that sensor.
+    /// Returns the contents; after [`of`](Self::of), those of that sensor.
     pub fn contents(&self) -> &Contents {
         &self.contents
     }
 
-    /// Returns the unpacked bytes of the file. Those of a stream file are what a hub would have read from the line.
+    /// Returns the unpacked bytes of the file. A hub would read those of a stream file from the line.
     ///
     /// # Errors
     ///
@@ -243,13 +245,13 @@ impl Recording {
         Some(Encoding { unit: self.contents.unit?, mode: self.contents.mode? })
     }
 
-    /// Returns the telegrams in order, including replies. The scans of a log are encoded as `encoding`, which loses nothing if it is
-    /// the log's own. If the file becomes unreadable in the meantime, the telegrams end there.
+    /// Returns the telegrams in order, including replies. The scans of a log are encoded as `encoding`, without loss if
+    /// it is the log's own. If the file becomes unreadable in the meantime, the telegrams end there.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Usage`] if there are several sensors and [`of`](Self::of) selected none, and [`Kind::Input`] if the file
-    /// cannot be opened.
+    /// Returns [`Kind::Usage`] if there are several sensors and [`of`](Self::of) selected none, and [`Kind::Input`] if
+    /// the file cannot be opened.
     pub fn telegrams(&self, encoding: Encoding) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         let reader = reader(&self.path)?;
         Ok(match self.contents.form {
@@ -288,17 +290,17 @@ impl Recording {
         &self,
         _: Box<dyn BufRead + Send>,
     ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
-        // A build without the feature opens no MCAP file.
+        // A build without the feature never opens an MCAP file.
         Ok(Box::new(std::iter::empty()))
     }
 
-    /// Reads all records of an MCAP file, and returns its channels.
+    /// Returns a reader of all records of an MCAP file, and its channels.
     #[cfg(feature = "mcap")]
     pub(crate) fn reader(&self) -> Result<(Reader<impl Read + use<>>, &Catalog), Failure> {
         Ok((self.survey.reader(reader(&self.path)?), self.survey.catalog()))
     }
 
-    /// Returns the names of the mounts whose angles are in it.
+    /// Returns the names of the mounts whose angles are in the recording.
     pub fn mounts(&self) -> Vec<String> {
         #[cfg(feature = "mcap")]
         return self.survey.catalog().mounts();
@@ -317,7 +319,7 @@ impl Recording {
         Ok(Box::new(self.survey.angles(reader(&self.path)?, mount.to_owned())))
     }
 
-    /// Returns no angles: only MCAP contains them.
+    /// Returns no angles, because only MCAP files contain them.
     #[cfg(not(feature = "mcap"))]
     pub fn angles(&self, _: &str) -> Result<Box<dyn Iterator<Item = MountRecord> + Send>, Failure> {
         Ok(Box::new(std::iter::empty()))
@@ -427,7 +429,8 @@ fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
     Ok(Box::new(file))
 }
 
-/// Returns which piece of an MCAP file the file at `path` is, if it is one. Its telegrams would otherwise look like a stream.
+/// Returns a description of the piece of an MCAP file that the file at `path` is; `None` if it is something else. Its
+/// telegrams would otherwise look like a stream.
 fn mcap_fragment(path: &Path) -> io::Result<Option<&'static str>> {
     let mut file = regular_file::open(path)?;
     let end = file.metadata()?.len().saturating_sub(MCAP_MAGIC.len() as u64);
@@ -463,8 +466,8 @@ fn unusable(path: &Path, what: &str) -> Failure {
     Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS_REMEDY)
 }
 
-/// Reader of a gzip file, with a limit. A kilobyte can unpack to a megabyte of the same byte, so a file that cannot be a recording
-/// is rejected early.
+/// Reader of a gzip file with a limit. A kilobyte can unpack to a megabyte of equal bytes, so a file that cannot be a
+/// recording is rejected early.
 struct GzipReader<R> {
     decoder: MultiGzDecoder<CountingReader<R>>,
     /// Number of unpacked bytes.
@@ -484,7 +487,8 @@ impl<R: BufRead> GzipReader<R> {
 }
 
 impl<R: BufRead> Read for GzipReader<R> {
-    /// Returns [`ErrorKind::FileTooLarge`] if the file unpacks to more than [`MAX_RATIO`] times its length.
+    /// Reads unpacked bytes. Returns [`ErrorKind::FileTooLarge`] if the file unpacks to more than [`MAX_RATIO`] times
+    /// its length.
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let len = self.decoder.read(buffer)?;
         self.unpacked += len as u64;
@@ -525,14 +529,14 @@ const FORMS_REMEDY: &str =
 const GZIP_MAGIC: &[u8] = &[0x1F, 0x8B];
 /// First bytes of an MCAP file.
 const MCAP_MAGIC: &[u8] = b"\x89MCAP0\r\n";
-/// Bytes at the beginning of a file in which records of MCAP are searched for: several samples of any topic.
+/// Number of bytes at the beginning of a file that are searched for records of MCAP: several samples of any topic.
 #[cfg(feature = "mcap")]
 const SEARCH_LEN: usize = 256 * 1024;
 /// Size of a read buffer in bytes. A CARMEN log is detected by the lines in the first one.
 const BUFFER_LEN: usize = 64 * 1024;
-/// Number of frames after which the packets of every model have shown it.
+/// Number of frames after which the model is known from the packets.
 const MODEL_FRAMES: usize = 500;
-/// Maximum ratio of unpacked to packed bytes. A stream of equal telegrams has 100; the format allows 1,000.
+/// Maximum ratio of unpacked to packed bytes. A stream of equal telegrams has a ratio of 100; the format allows 1,000.
 const MAX_RATIO: u64 = 400;
 /// Number of unpacked bytes up to which there is no limit.
 const MIN_LIMITED_LEN: u64 = 32 << 20;
@@ -573,7 +577,7 @@ mod tests {
         assert_eq!(unpacked(&packed(|_| 0, max)), (max, Ok(())), "short enough for any ratio");
         let (len, end) = unpacked(&packed(|_| 0, 3 * max));
         assert!(len <= max && end == Err(ErrorKind::FileTooLarge), "{len} {end:?}");
-        // Equal telegrams, as from an empty room.
+        // The telegrams are equal, as from an empty room.
         let telegram = |at: usize| (at % 732) as u8 ^ ((at % 732) >> 8) as u8;
         assert_eq!(unpacked(&packed(telegram, 2 * max)), (2 * max, Ok(())));
     }

@@ -1,5 +1,5 @@
-//! Sessions and framers that read recorded bytes. [`StreamReader`] reads a stream file: bytes as they arrived on a line, without
-//! stamps. [`VirtualTime`] reads telegrams at the times at which the hub received them.
+//! Sessions and framers that read recorded bytes. [`StreamReader`] reads a stream file: bytes as they arrived on a
+//! line, without stamps. [`VirtualTime`] passes telegrams to a session at the times at which the hub received them.
 
 use std::io::{self, Read};
 use std::path::Path;
@@ -13,13 +13,14 @@ use scanhub_schema::{Failure, Family, MILLIS, Nanos, line_time};
 use crate::open::{is_truncation, reader, unreadable};
 use crate::{Contents, Form, Frame};
 
-/// Reads the telegrams of an LMS or the packets of a rotating scanner from a stream, and counts the bytes outside them.
+/// Reader of the telegrams of an LMS or the packets of a rotating scanner from a stream. It counts the bytes outside
+/// them.
 pub(crate) struct StreamReader<R> {
     reader: R,
     framing: Framing,
     /// Number of bytes that were read.
     read_len: u64,
-    /// Whether the reader is at its end.
+    /// Whether the end of the stream was reached.
     is_ended: bool,
 }
 
@@ -31,14 +32,15 @@ enum Framing {
 struct PacketReader {
     session: Session,
     family: Family,
-    /// The scanner's clock at the last packets.
+    /// Scanner's clock at the last packets.
     last: Option<Nanos>,
     /// Time since the first packets.
     elapsed: Nanos,
 }
 
 impl<R: Read> StreamReader<R> {
-    /// Creates a reader of a stream of `family`. The first bytes of the stream, `head`, show in which mode its packets are framed.
+    /// Creates a reader of a stream of `family`. `head` has the first bytes of the stream, from which the framing mode
+    /// of its packets is detected.
     pub(crate) fn new(family: Family, head: &[u8], reader: R) -> StreamReader<R> {
         let framing = if features(family).has_whole_telegrams {
             Framing::Telegrams(Box::default())
@@ -128,7 +130,8 @@ impl PacketReader {
         Some(Frame { telegram, family: self.family as u8, scanner_ns, reasons, ..Frame::default() })
     }
 
-    /// Returns the time of the last packets, which took this long on the line, since the first ones. It never goes back.
+    /// Returns the time of the last packets since the first ones. `duration` is their time on the line. The result
+    /// never decreases.
     fn advance_clock(&mut self, duration: Nanos) -> Nanos {
         let Some(at) = self.session.scanner_time() else {
             self.elapsed += duration;
@@ -136,7 +139,7 @@ impl PacketReader {
         };
         self.elapsed += match self.last {
             None => 0,
-            // A clock that went back belongs to a scanner that restarted.
+            // The clock goes back if the scanner has restarted.
             Some(last) => at.checked_sub(last).unwrap_or(duration),
         };
         self.last = Some(at);
@@ -144,7 +147,7 @@ impl PacketReader {
     }
 }
 
-/// Reads the stream at `path` as one of `family`. Its first bytes are `head`.
+/// Reads the stream of `family` at `path` to its end, and returns its contents. `head` has its first bytes.
 ///
 /// # Errors
 ///
@@ -171,8 +174,8 @@ pub(crate) fn survey(path: &Path, family: Family, head: &[u8]) -> Result<Content
     Ok(contents)
 }
 
-/// A session in the time of a recording. It receives each packet at the time at which the hub that recorded it received it, and
-/// its timers expire in between. It therefore produces from the packets what they produced then.
+/// Session in the time of a recording. It receives each packet at the time at which the recording hub received it, and
+/// its timers expire in between. The packets therefore have the same results as in that hub.
 pub struct VirtualTime<S> {
     session: S,
     now: Nanos,
@@ -181,7 +184,7 @@ pub struct VirtualTime<S> {
 }
 
 impl<S: Protocol> VirtualTime<S> {
-    /// Creates the time of `session`, which began at `now`.
+    /// Creates the virtual time of `session`, which started at `now`.
     pub fn new(session: S, now: Nanos) -> VirtualTime<S> {
         VirtualTime { session, now, until: now }
     }
@@ -196,11 +199,11 @@ impl<S: Protocol> VirtualTime<S> {
         &mut self.session
     }
 
-    /// Advances the time to `now`, and then passes `bytes` to the session. `handle` receives the events. Time never goes
-    /// back: an earlier `now` counts as the last one. A longer silence than an hour counts as an hour.
+    /// Advances the time to `now`, and then passes `bytes` to the session. `handle` receives the events. Time never
+    /// goes back: an earlier `now` counts as the last one. A silence of more than an hour counts as an hour.
     pub fn take(&mut self, now: Nanos, bytes: &[u8], mut handle: impl FnMut(Event<'_>)) {
         let now = now.max(self.now);
-        // A wrong stamp in a file may be centuries later.
+        // A wrong stamp in a file may be centuries ahead.
         self.until = self.until.max(now.saturating_sub(MAX_SILENCE));
         while self.until < now {
             self.now = self.until.max(self.now);
@@ -234,7 +237,7 @@ impl<S: Protocol> VirtualTime<S> {
                 Action::SetRate(_) | Action::SetDtr(_) => false,
                 Action::SleepUntil(until) | Action::Wait { until, .. } => break until,
             };
-            // A recording does not reply.
+            // A recording does not reply to a request, so report it as sent.
             if is_sent {
                 self.session.handle_transmitted(self.now);
             }
@@ -242,7 +245,7 @@ impl<S: Protocol> VirtualTime<S> {
     }
 }
 
-/// Longest silence in which the timers of a session expire. It has nothing new to do after that.
+/// Maximum silence in which the timers of a session run. Afterwards, the session has nothing new to do.
 const MAX_SILENCE: Nanos = 3_600_000 * MILLIS;
 /// Time after which a session no longer holds packets back.
 const IDLE_TIME: Nanos = 100 * MILLIS;

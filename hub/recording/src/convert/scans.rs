@@ -1,11 +1,11 @@
-//! Scans of a recording for other programs, and the poses of their sensors.
+//! Decoded scans of a recording, and the poses of their sensors.
 //!
-//! The scans of an LMS are decoded from its telegrams, as in the hub. If its telegrams were not recorded, its published scans are
-//! used. For a rotating scanner, published scans are preferred, and otherwise its packets are turned into scans by the session
-//! that the hub uses.
+//! The scans of an LMS are decoded from its telegrams, as in the hub. If its telegrams were not recorded, its published
+//! scans are used. For a rotating scanner, published scans are preferred. Otherwise, the session that the hub uses
+//! builds scans from its packets.
 //!
 //! A recording may begin after a rotating scanner has sent the responses that define how to read its packets.
-//! [`stream_heads`] finds the places at which a stream file needs them.
+//! [`stream_heads`] returns them, with the positions at which a stream file needs them.
 
 use std::collections::BTreeMap;
 
@@ -38,21 +38,21 @@ pub(super) enum DecodedItem<'a> {
 /// State of a sensor.
 struct Sensor {
     mode: Option<Mode>,
-    /// Whether its scans are decoded from telegrams.
+    /// Whether the sensor's scans are decoded from its telegrams.
     is_decoded: bool,
-    /// Revolutions the packets of a rotating scanner into scans.
+    /// Builder of scans from packets; `None` for an LMS.
     revolutions: Option<Revolutions>,
-    /// Whether none of its telegrams has been read.
+    /// Whether none of the sensor's telegrams has been read.
     is_first: bool,
 }
 
-/// Calls `take_item` for each item of `recording`, in its order. A recording that does not name its sensor belongs to `name`; `mode`
-/// is used if the recording does not contain the measuring mode.
+/// Calls `take_item` for each item of `recording`, in the order of the file. If the recording does not name its sensor,
+/// the items belong to `name`. `mode` is used if the recording does not contain the measuring mode.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Configuration`] if the measuring mode is unknown, without which values are not ranges. Otherwise returns the
-/// error of `take_item`.
+/// Returns [`Kind::Configuration`] if the measuring mode is unknown, because values cannot be decoded without it.
+/// Otherwise returns the error of `take_item`.
 pub(super) fn for_each_item(
     recording: &Recording,
     name: &str,
@@ -148,7 +148,7 @@ fn for_each_mcap_item(
 }
 
 impl Sensor {
-    /// Checks that values can become ranges.
+    /// Checks that values can be decoded to ranges.
     fn check(&self, recording: &Recording, name: &str) -> Result<(), Failure> {
         if self.mode.is_some() || !self.is_decoded {
             return Ok(());
@@ -158,7 +158,7 @@ impl Sensor {
         Err(Failure::new(Kind::Configuration, message, hint))
     }
 
-    /// Decodes a telegram into `scan`; `false` if it is not a scan, or if its measuring mode is unknown.
+    /// Decodes a telegram into `scan`. Returns `false` if it is not a scan, or if its measuring mode is unknown.
     fn decode(&mut self, telegram: &[u8], scan: &mut Box<Scan>) -> bool {
         let Some(telegram) = Telegram::check(telegram) else { return false };
         if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
@@ -176,7 +176,7 @@ impl Sensor {
     }
 }
 
-/// Revolutions the packets of a rotating scanner into scans, as the hub does.
+/// Builder of scans from the packets of a rotating scanner, as in the hub.
 pub(super) struct Revolutions {
     family: Family,
     settings: Settings,
@@ -186,7 +186,7 @@ pub(super) struct Revolutions {
 }
 
 impl Revolutions {
-    /// Starts with the only sensor of `recording`; `None` if it is not a rotating scanner.
+    /// Creates the builder for the only sensor of `recording`; `None` if it is not a rotating scanner.
     pub(super) fn of(recording: &Recording) -> Result<Option<Revolutions>, Failure> {
         let Some(family) = recording.family().filter(|family| !features(*family).has_whole_telegrams) else {
             return Ok(None);
@@ -195,7 +195,8 @@ impl Revolutions {
         Ok(Some(Revolutions { family, settings, session: None, scan: Box::default() }))
     }
 
-    /// Takes the packets of a sample with this `header`, and calls `take_item` for each scan that they complete, with its header.
+    /// Handles the packets of a sample with this `header`. Calls `take_item` for each scan that they complete, with its
+    /// header.
     pub(super) fn for_each_revolution(
         &mut self,
         header: &Header,
@@ -236,8 +237,8 @@ impl Revolutions {
     }
 }
 
-/// Generates stamps for telegrams that have none. They are one scan period apart, and the last telegram ends at the time at which
-/// the file was last written.
+/// Generator of stamps for telegrams that have none. The stamps are one scan period apart, and the last telegram ends
+/// when the file was last written.
 pub(super) struct SyntheticClock {
     wall_ns: u64,
     begin_ns: u64,
@@ -246,7 +247,7 @@ pub(super) struct SyntheticClock {
 }
 
 impl SyntheticClock {
-    /// Starts at the beginning of `recording`.
+    /// Creates the generator at the beginning of `recording`.
     pub(super) fn of(recording: &Recording) -> SyntheticClock {
         let contents = recording.contents();
         let variant = contents.variant.unwrap_or(Variant::HALF);
@@ -255,12 +256,12 @@ impl SyntheticClock {
             Some((first_ns, _)) => first_ns,
             None => recording.modified_ns().saturating_sub(took_ns),
         };
-        // Any number that differs between recordings.
+        // The run's ID can be any number that differs between recordings.
         let boot = begin_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
         SyntheticClock { wall_ns: begin_ns, begin_ns, boot, variant }
     }
 
-    /// Returns the time at which `frame`, the next one, was measured.
+    /// Returns the time at which the next frame, `frame`, was measured.
     pub(super) fn wall_ns(&mut self, frame: &Frame) -> u64 {
         let of_scanner = frame.scanner_ns.map(|ns| self.begin_ns.saturating_add(ns));
         let at_ns = frame.wall_ns.or(of_scanner).unwrap_or(self.wall_ns);
@@ -269,8 +270,8 @@ impl SyntheticClock {
         at_ns
     }
 
-    /// Returns the header that a hub might have published with `frame`, the next one, which has this `number`. The period lasts
-    /// until the frame at `next_ns`, because logs leave scans out, and nothing newer can be known until then.
+    /// Returns the header that a hub might have published with the next frame, `frame`, which has this `number`. The
+    /// period ends with the frame at `next_ns`, because logs omit scans, and no newer scan exists until then.
     pub(super) fn header(&mut self, frame: &Frame, number: u64, next_ns: Option<u64>) -> Header {
         let wall_ns = self.wall_ns(frame);
         let first_ns = wall_ns.saturating_add(START_NS).saturating_sub(self.begin_ns);
@@ -287,7 +288,7 @@ impl SyntheticClock {
             family: frame.family,
             quality: u8::from(frame.reasons != 0),
             reasons: frame.reasons,
-            // Packets are not scans.
+            // Packets have no scan period.
             period_us: if frame.scanner_ns.is_some() { 0 } else { (period_ns / 1000) as u32 },
             ..Header::default()
         }
@@ -303,15 +304,15 @@ fn line_ns(frame: &Frame) -> u64 {
     scanhub_schema::line_time(frame.telegram.len(), Baud::B500000.rate())
 }
 
-/// Returns the missing responses, each with the number of the frame before which they belong.
+/// Returns the missing responses, each with the index of the frame before which it belongs.
 ///
 /// # Errors
 ///
-/// Returns the errors of [`Recording::telegrams`], and [`Kind::Input`] if nothing in the recording defines how its packets must
-/// be read.
+/// Returns the errors of [`Recording::telegrams`], and [`Kind::Input`] if nothing in the recording defines how its
+/// packets must be read.
 pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)>, Failure> {
     let contents = recording.contents();
-    // A stream file has no times, without which the time per point cannot be measured.
+    // A stream file has no stamps, so the time per point cannot be measured.
     let family = recording.family().filter(|_| contents.form == Form::Mcap);
     let Some(family) = family.filter(|family| !features(*family).has_whole_telegrams) else {
         return Ok(Vec::new());
@@ -358,19 +359,19 @@ fn without_status(recording: &Recording) -> Failure {
 
 /// A stream of packets, and the responses before it.
 struct Stream {
-    /// Run of the hub.
+    /// ID of the hub's run.
     boot: u64,
-    /// Number of the frame before which missing responses belong: the last response before the packets, or the first frame if
-    /// there is none.
+    /// Index of the frame before which missing responses belong: the last response before the packets, or the first
+    /// frame without such a response.
     at: usize,
-    /// Stamp of its first packets. `None` before they have arrived.
+    /// Stamp of the first packets. `None` before they have arrived.
     packets_since: Option<Nanos>,
     session: VirtualTime<Session>,
 }
 
 impl Stream {
-    /// Creates the stream that begins with the frame `number`, which has this `header`. The mode in `settings` is that of the
-    /// recording's first status. It is not used for a scanner that reports its modes.
+    /// Creates the stream that begins with frame `number`, which has this `header`. The mode in `settings` is that of
+    /// the recording's first status. A scanner that reports its modes does not use it.
     fn begin(family: Family, settings: Settings, number: usize, header: &Header, is_reply: bool) -> Stream {
         let (start, mode) = (header.stamp_first_ns, settings.mode.filter(|_| !is_reply));
         let session = Session::begin(family, &Settings { mode, ..settings }, start);
@@ -382,13 +383,13 @@ impl Stream {
         }
     }
 
-    /// Returns whether the frame with this `header` belongs to it. A frame of another run of the hub does not, and neither does a
-    /// response after packets.
+    /// Returns whether the frame with this `header` belongs to the stream. A frame of another run of the hub and a
+    /// response after packets do not.
     fn continues_with(&self, header: &Header, is_reply: bool) -> bool {
         header.boot == self.boot && !(is_reply && self.packets_since.is_some())
     }
 
-    /// Handles the telegram of the frame `number`.
+    /// Handles the telegram of frame `number`.
     fn take(&mut self, number: usize, header: &Header, telegram: &[u8], is_reply: bool) {
         if is_reply {
             self.at = number;
@@ -398,7 +399,7 @@ impl Stream {
                 return;
             }
         }
-        // As on a line, an error of the line concerns the packets alone.
+        // As in the hub, an error of the line affects only the packets.
         self.session.session_mut().mark_suspect(header.reasons & !suspect::LINE_ERROR);
         self.session.take(header.stamp_last_ns, telegram, |_| {});
     }

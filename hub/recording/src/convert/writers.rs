@@ -1,4 +1,4 @@
-//! Writers of the formats that a recording is converted to: a stream of telegrams, a CARMEN log, MCAP, messages of ROS 2, and CSV
+//! Writers of the output formats of a conversion: a stream of telegrams, a CARMEN log, MCAP, messages of ROS 2, and CSV
 //! of scans or marks.
 
 use std::collections::BTreeMap;
@@ -47,7 +47,7 @@ pub(super) fn write_log(
     let mut first_ns = None;
     for (number, frame) in recording.telegrams(encoding)?.enumerate() {
         let at_ns = clock.wall_ns(&frame);
-        // The first line has the encoding.
+        // The first line of the log already has the encoding.
         if number == 0 && is_synthetic(&frame.telegram, frame.header.as_ref()) {
             continue;
         }
@@ -104,14 +104,14 @@ fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Ite
     Ok(first.into_iter().chain(recording.telegrams(encoding)?))
 }
 
-/// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] adds to a log. No scanner sent it, so
-/// nothing is lost without it.
+/// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] adds to a log. No scanner sent
+/// it, so it is not lost if it is omitted.
 pub(super) fn is_synthetic(telegram: &[u8], header: Option<&Header>) -> bool {
     let is_estimated = header.is_none_or(|header| header.flags & Flags::STAMP_ESTIMATED != 0);
     is_estimated && carmen::is_synthetic(telegram)
 }
 
-/// Copies an MCAP file: every message that can be read, of all channels including those of other programs, and a new index.
+/// Copies an MCAP file: every readable message of all channels, including those of other programs, with a new index.
 pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), ConversionError> {
     let recording = conversion.recording;
     let (mut reader, catalog) = recording.reader()?;
@@ -148,11 +148,11 @@ pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result
 struct Copy<'a, W: Write> {
     writer: Writer<W>,
     catalog: &'a Catalog,
-    /// Channel numbers in the new file, by those in the old file.
+    /// IDs of channels in the new file, by those in the old file.
     channels: BTreeMap<u16, u16>,
-    /// Whether the facts of the old file were read. The new file begins with them.
+    /// Whether the metadata of the old file was read. The new file begins with it.
     has_metadata: bool,
-    /// Bytes in the open chunk.
+    /// Number of bytes in the open chunk.
     bytes: usize,
 }
 
@@ -201,9 +201,9 @@ impl<W: Write> Copy<'_, W> {
     }
 }
 
-/// A writer of a format that holds decoded scans.
+/// Writer of a format that holds decoded scans.
 pub(super) trait ScanSink {
-    /// Writes `item`, and returns how. Returns `None` if it was not a telegram.
+    /// Writes `item`, and returns its result. Returns `None` if it is not a telegram.
     fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<WrittenItem>>;
 
     /// Returns whether intensities were requested, and no scan had any.
@@ -211,7 +211,7 @@ pub(super) trait ScanSink {
         false
     }
 
-    /// Writes the end.
+    /// Writes the end of the file.
     fn finish(self) -> io::Result<()>;
 }
 
@@ -243,13 +243,13 @@ pub(super) fn write_scans(
     Ok(())
 }
 
-/// An MCAP file with only messages of ROS 2.
+/// Writer of an MCAP file with only messages of ROS 2.
 pub(super) struct Ros2<W: Write> {
     writer: Writer<W>,
     bag: BagWriter,
     /// Whether each scan is also written as points.
     has_points: bool,
-    /// Bytes of scans in the open chunk, approximately.
+    /// Approximate number of bytes of scans in the open chunk.
     chunk_len: usize,
 }
 
@@ -293,7 +293,8 @@ impl<W: Write> ScanSink for Ros2<W> {
     }
 }
 
-/// A row for each scan, after the names of the columns. The names are repeated if the number of beams changes.
+/// Writer of CSV with a row for each scan, after the names of the columns. The names are repeated if the number of
+/// beams changes.
 pub(super) struct Csv<W: Write> {
     out: OutputEncoder<W>,
     columns: ScanColumns,
@@ -383,5 +384,5 @@ pub(super) fn write_marks(
     Ok(())
 }
 
-/// Bytes of telegrams after which a chunk ends.
+/// Length in bytes after which a chunk ends.
 const CHUNK_LEN: usize = 256 * 1024;

@@ -1,13 +1,13 @@
-//! The records of an MCAP file in the order of the file, including those in chunks.
+//! Reader of the records of an MCAP file in the order of the file, including those in chunks.
 //!
-//! A damaged file is read as far as its structure can be trusted:
+//! Rules for a damaged file:
 //!
-//! - A chunk is used whole or not at all, because one CRC-32 covers all of its records. A chunk with a wrong checksum or
-//!   opcode is skipped, and so is a record whose fields do not fit into it.
+//! - A chunk is used completely or not at all, because one CRC-32 covers all of its records. A chunk with a wrong
+//!   checksum or opcode is skipped, and so is a record whose fields do not fit into it.
 //! - A chunk that the file contains twice is read once.
-//! - After a record whose length or opcode is impossible, reading continues at the next chunk whose lengths agree. In a file
-//!   with messages outside chunks, it continues at the next message of the hub.
-//! - A file that was cut anywhere is read to its last whole record.
+//! - After a record whose length or opcode is impossible, reading continues at the next chunk whose lengths agree. In a
+//!   file with messages outside chunks, it continues at the next message of the hub.
+//! - A truncated file is read to its last complete record.
 //!
 //! [`Damage`] counts all bytes that were not used. The format is described at <https://mcap.dev/spec>.
 
@@ -26,7 +26,7 @@ use super::split_sample;
 use crate::Damage;
 use crate::open::is_truncation;
 
-/// A record: its kind ([`mcap::records::op`]), and its bytes after opcode and length.
+/// Record: its opcode ([`mcap::records::op`]), and its bytes after opcode and length.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Record {
     pub(crate) opcode: u8,
@@ -57,7 +57,7 @@ impl Record {
     }
 }
 
-/// Reads records; ends with the file, or where its structure is lost.
+/// Reader of records, up to the end of the file or the position at which its structure is lost.
 pub(crate) struct Records<R> {
     input: R,
     /// The open chunk, whose records are returned next.
@@ -66,13 +66,13 @@ pub(crate) struct Records<R> {
     chunks: HashSet<u64>,
     /// Bytes to read again before those of `input`.
     unread: Cursor<Vec<u8>>,
-    /// Number of places at which the structure was lost.
+    /// Number of positions at which the structure was lost.
     resyncs: u32,
     /// Whether a message was read outside chunks.
     has_messages: bool,
-    /// Checksum of the section that is being read: the data section, then the summary.
+    /// Checksum of the current section: the data section, then the summary.
     section: Crc,
-    /// The last bytes that were read, at most as many as the magic bytes.
+    /// Last bytes that were read, at most as many as the magic bytes.
     tail: Vec<u8>,
     damage: Damage,
     is_begun: bool,
@@ -96,7 +96,7 @@ impl<R: Read> Records<R> {
         }
     }
 
-    /// Returns what was not used so far; complete after the last record.
+    /// Returns the counts of data that was not used so far. They are complete after the last record.
     pub(crate) fn damage(&self) -> Damage {
         self.damage
     }
@@ -123,7 +123,7 @@ impl<R: Read> Records<R> {
                     self.end_here(magic.len())?;
                     continue;
                 }
-                // Those at the end are the same.
+                // The magic bytes at the end of the file are equal, and must not be mistaken for these.
                 self.tail.clear();
             }
             if let Some(record) = self.read_record()? {
@@ -153,7 +153,7 @@ impl<R: Read> Records<R> {
         if (body.len() as u64) < length {
             return self.end_or_resynchronize(head, body);
         }
-        // The opcode of another record became that of a footer or data end, or one that the format reserves.
+        // Damage has changed the opcode to that of a footer or data end, or to a reserved one.
         let is_no_footer = opcode == op::FOOTER && length != FOOTER_LEN;
         let is_no_end = opcode == op::DATA_END && length != DATA_END_LEN;
         let is_chunk = is_chunk(&body, length);
@@ -212,7 +212,8 @@ impl<R: Read> Records<R> {
         }
         self.section.update(&head);
         self.section.update(&body);
-        // The time of the first message; 0 if there is none. Messages without times may be equal.
+        // The chunk starts with the time of its first message; 0 if there is none. Chunks whose messages have no times
+        // may be equal.
         let is_dated = body.iter().take(8).any(|byte| *byte != 0);
         let mut hasher = DefaultHasher::new();
         hasher.write(&body);
@@ -235,8 +236,8 @@ impl<R: Read> Records<R> {
         Ok(None)
     }
 
-    /// Returns whether no chunk with this hash was read before. Two chunks of a recorder are never equal, because the times and
-    /// numbers of their messages differ.
+    /// Returns whether no chunk with this hash was read before. Two chunks of a recorder are never equal, because their
+    /// messages have different times and sequence numbers.
     fn is_new(&mut self, hash: u64) -> bool {
         if self.chunks.len() < MAX_CHUNKS { self.chunks.insert(hash) } else { !self.chunks.contains(&hash) }
     }
@@ -246,7 +247,7 @@ impl<R: Read> Records<R> {
         self.skip((HEAD_LEN + record.body.len()) as u64);
     }
 
-    /// Passes over a record that is too long to be held in memory.
+    /// Skips a record that is too long to be held in memory.
     fn skip_long(&mut self, head: &[u8], length: u64) -> io::Result<()> {
         self.damage.bytes += head.len() as u64;
         self.section.update(head);
@@ -295,9 +296,9 @@ impl<R: Read> Records<R> {
         Ok(None)
     }
 
-    /// Handles a record whose end is missing: the file was cut there, or its length is wrong.
+    /// Handles a record whose end is missing, because the file was truncated or the record's length is wrong.
     fn end_or_resynchronize(&mut self, head: Vec<u8>, body: Vec<u8>) -> io::Result<Option<Record>> {
-        // A file that was cut does not end with the magic bytes.
+        // A truncated file does not end with the magic bytes.
         if self.tail == MAGIC {
             return self.resynchronize([head, body].concat());
         }
@@ -321,11 +322,11 @@ impl<R: Read> Records<R> {
         Ok(())
     }
 
-    /// Ends reading at an incomplete record that has `len` bytes.
+    /// Ends reading at an incomplete record of `len` bytes.
     fn end_in_record(&mut self, len: u64) {
         self.is_ended = true;
         self.damage.bytes += len;
-        // A whole file in which a wrong length leads beyond the end was not cut.
+        // If the file ends with the magic bytes, it is not truncated, and the length is wrong.
         let is_whole = self.tail == MAGIC;
         self.damage.is_truncated |= !is_whole;
         self.damage.is_damaged |= is_whole;
@@ -363,9 +364,9 @@ impl<R: Read> Records<R> {
         }
     }
 
-    /// Reads `len` bytes; fewer only at the end of the file. A gzip file ends where it is cut or damaged.
+    /// Reads `len` bytes; fewer only at the end of the file. A gzip file ends where it is truncated or damaged.
     fn read(&mut self, len: usize) -> io::Result<Vec<u8>> {
-        // A length may be wrong: memory is allocated for bytes that exist.
+        // The length may be wrong, so allocate memory only for bytes that exist.
         let mut bytes = Vec::with_capacity(len.min(READ_LEN as usize));
         let begin = self.unread.by_ref().take(len as u64).read_to_end(&mut bytes)?;
         match self.input.by_ref().take((len - begin) as u64).read_to_end(&mut bytes) {
@@ -398,7 +399,7 @@ impl Chunk {
             return Err(McapError::UnexpectedEoc);
         };
         if header.uncompressed_size > MAX_RECORD_LEN {
-            // Its length may be damaged. Only an intact chunk shows that the file has longer chunks than can be read.
+            // The length may be damaged. Only an intact chunk proves that the file has chunks that are too long.
             return Err(match unpacked_length(&body, header.uncompressed_size) {
                 Ok(len) if len == header.uncompressed_size => McapError::ChunkTooLarge(len),
                 Ok(_) => McapError::UnexpectedEoc,
@@ -409,7 +410,7 @@ impl Chunk {
             let mut crc = Crc::new();
             crc.update(&data);
             let (saved, calculated) = (header.uncompressed_crc, crc.sum());
-            // 0: the writer did not compute it.
+            // 0 means that the writer did not compute the checksum.
             if saved != 0 && saved != calculated {
                 return Err(McapError::BadChunkCrc { saved, calculated });
             }
@@ -456,8 +457,8 @@ fn unpack(body: &[u8]) -> Result<Vec<u8>, McapError> {
     Ok(records)
 }
 
-/// Returns the length of the records of a compressed chunk that may be too long to be held in memory. Stops when it is
-/// longer than `most`, or than any chunk that a recorder writes.
+/// Returns the length of the records of a compressed chunk that may be too long to be held in memory. Stops when the
+/// length exceeds `max_len`, or that of any chunk that a recorder writes.
 fn unpacked_length(body: &[u8], max_len: u64) -> Result<u64, McapError> {
     let (mut len, most) = (0, max_len.min(MAX_CHUNK_LEN));
     for_each_record(body, LinearReaderOptions::default().with_validate_chunk_crcs(true), |_, data| {
@@ -505,8 +506,8 @@ fn too_long(len: u64) -> io::Error {
     io::Error::new(io::ErrorKind::FileTooLarge, what)
 }
 
-/// Returns whether `bytes` start with a chunk whose lengths agree, or with a message of the hub, if `messages` count. Neither
-/// occurs by chance: both have lengths or times twice.
+/// Returns whether `bytes` start with a chunk whose lengths agree, or, if `messages` is set, with a message of the hub.
+/// Neither occurs by chance, because both contain lengths or times twice.
 fn is_record_boundary(bytes: &[u8], messages: bool) -> bool {
     let Some((opcode, length)) = split_head(bytes) else { return false };
     match opcode {
@@ -517,8 +518,8 @@ fn is_record_boundary(bytes: &[u8], messages: bool) -> bool {
     }
 }
 
-/// Returns whether a chunk with messages or a message of the hub starts anywhere in `bytes`. Packets of a scanner that sees
-/// nothing are zeros, and with the range before them they may look like an empty chunk.
+/// Returns whether a chunk with messages or a message of the hub starts anywhere in `bytes`. An empty chunk does not
+/// count: the packets of a scanner without readings are zeros, and may look like one.
 pub(crate) fn has_record_boundary(bytes: &[u8]) -> bool {
     let is_dated = |bytes: &[u8]| match split_head(bytes) {
         Some((op::CHUNK, _)) => bytes[HEAD_LEN..].iter().take(8).any(|byte| *byte != 0),
@@ -527,7 +528,7 @@ pub(crate) fn has_record_boundary(bytes: &[u8]) -> bool {
     (0..bytes.len()).any(|at| is_record_boundary(&bytes[at..], true) && is_dated(&bytes[at..]))
 }
 
-/// Returns whether `bytes` start with a message of the hub, whole or not.
+/// Returns whether `bytes` start with a message of the hub, complete or not.
 fn is_message_of_hub(bytes: &[u8]) -> bool {
     let Some((op::MESSAGE, length)) = split_head(bytes) else { return false };
     let end = bytes.len().min(HEAD_LEN.saturating_add(length as usize)).min(HEAD_LEN + MESSAGE_HEAD_LEN);
@@ -589,7 +590,7 @@ fn chunk_length(body: &[u8]) -> Option<u64> {
 /// Returns whether the lengths inside an attachment add up to its length.
 fn is_attachment(body: &[u8]) -> bool {
     let fits = || {
-        // Times of the log and of the creation, then name and media type.
+        // The fields are the times of the log and of the creation, then name and media type.
         let mut rest = body.get(8 + 8..)?;
         for _ in 0..2 {
             let (len, text) = rest.split_first_chunk()?;
@@ -601,12 +602,12 @@ fn is_attachment(body: &[u8]) -> bool {
     fits() == Some(true)
 }
 
-/// Returns whether records of this kind are used by their fields, so that they must be well formed.
+/// Returns whether the fields of records of this kind are used, so that they must be valid.
 fn is_interpreted(opcode: u8) -> bool {
     matches!(opcode, op::HEADER | op::SCHEMA | op::CHANNEL | op::MESSAGE | op::METADATA | op::ATTACHMENT)
 }
 
-/// Maximum length of a record that is held in memory. Records of texts take many times their length when they are parsed.
+/// Returns the maximum length of a record that is held in memory. Parsed records of texts take many times their length.
 fn max_len(opcode: u8) -> u64 {
     match opcode {
         op::HEADER | op::CHANNEL | op::METADATA => 1 << 20,
@@ -614,14 +615,15 @@ fn max_len(opcode: u8) -> u64 {
     }
 }
 
-/// Bytes of opcode and length, with which every record begins.
+/// Length of opcode and length, with which every record begins.
 const HEAD_LEN: usize = 1 + 8;
-/// Bytes of a chunk that include the length of its records, whatever the name of its compression.
+/// Number of bytes of a chunk that surely include the length of its records, despite the variable name of its
+/// compression.
 const CHUNK_HEAD_LEN: usize = 1024;
 /// Position of the name of a chunk's compression: after the times of the first and the last message, the uncompressed size,
 /// and the CRC.
 const COMPRESSION_OFFSET: usize = 8 + 8 + 8 + 4;
-/// Bytes of a message that include the header of a sample of the hub.
+/// Number of bytes of a message that include the header of a sample of the hub.
 const MESSAGE_HEAD_LEN: usize = 2 + 4 + 8 + 8 + size_of::<scanhub_schema::Header>();
 /// Length of a data end.
 const DATA_END_LEN: u64 = 4;
@@ -631,15 +633,17 @@ const FOOTER_CRC_OFFSET: usize = 8 + 8;
 const FOOTER_LEN: u64 = FOOTER_CRC_OFFSET as u64 + 4;
 /// Opcodes that no version of the format uses yet. Those from 80h are free for any program.
 const RESERVED_OPCODES: RangeInclusive<u8> = 0x10..=0x7F;
-/// Maximum length of all other records. A few times this is held in memory; recorders write chunks of less than half of it.
+/// Maximum length of all other records. The reader holds a few times this length in memory. Recorders write chunks of
+/// less than half of it.
 const MAX_RECORD_LEN: u64 = 8 << 20;
-/// No file is longer.
+/// Length that no file exceeds.
 const MAX_FILE_LEN: u64 = 1 << 40;
-/// Longest chunk that is unpacked to find out whether it is intact.
+/// Maximum length of a chunk that is unpacked to check whether it is intact.
 const MAX_CHUNK_LEN: u64 = 1 << 30;
 /// Maximum number of chunks that are compared with later ones: 14 hours of a recording of the hub.
 const MAX_CHUNKS: usize = 1 << 19;
-/// Maximum number of places at which the structure of a file is found again. Each one may read the longest record twice.
+/// Maximum number of positions at which the structure of a file is found again. Each one may read the longest record
+/// twice.
 const MAX_RESYNCS: u32 = 256;
-/// Bytes that are read at a time.
+/// Number of bytes that are read at a time.
 const READ_LEN: u64 = 64 * 1024;

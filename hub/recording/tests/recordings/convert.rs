@@ -1,5 +1,5 @@
-//! Recordings written anew: what a form can hold is the same afterwards, a damaged file is whole, and what fails leaves
-//! nothing behind.
+//! Tests of conversions: data that a format can hold stays the same, a damaged file becomes intact, and a failed
+//! conversion leaves no file.
 
 use std::fs;
 use std::path::Path;
@@ -20,7 +20,7 @@ use scanhub_schema::{Family, Flags, Header, Mark, Marks, Topic};
 
 const CM_ENCODING: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
 
-/// Names of all files in `folder`.
+/// Returns the names of all files in `folder`.
 fn names(folder: &TempDir) -> Vec<String> {
     let mut names: Vec<_> = fs::read_dir(folder.path())
         .unwrap()
@@ -38,7 +38,7 @@ fn telegrams(path: &Path) -> Vec<Vec<u8>> {
     frames(path, CM_ENCODING).into_iter().map(|frame| frame.telegram).collect()
 }
 
-/// Channel, sequence, times and data of all messages, as the library of the format reads them.
+/// Returns channel, sequence number, times and data of all messages, as read by the `mcap` library.
 fn messages(bytes: &[u8]) -> Vec<(String, u32, u64, u64, Vec<u8>)> {
     let all = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
     all.map(|m| (m.channel.topic.clone(), m.sequence, m.log_time, m.publish_time, m.data.to_vec())).collect()
@@ -86,7 +86,7 @@ fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
         assert!(damage.bytes == 0 && !damage.is_truncated && !damage.is_damaged, "{damage}");
         let kept = messages(&fs::read(&whole).unwrap());
         assert!(kept.len() > all.len() / 2 && kept.iter().all(|message| all.contains(message)), "{name}");
-        // Channels of others come along.
+        // Channels of other programs are copied too.
         assert!(kept.iter().any(|(topic, ..)| topic == "/imu"), "{name}");
     }
 }
@@ -105,7 +105,7 @@ fn stream_gains_times_and_loses_no_telegrams() {
         (folder.path().join("a.mcap"), folder.path().join("b.bin.gz"), folder.path().join("a.log.gz"));
     let result = convert_file(&stream, &mcap, Some("left")).unwrap();
     assert_eq!((result.forms, result.telegrams), ((Form::Telegrams, Target::Recording(Form::Mcap)), 31));
-    // As the stamps say that it gets: a reply takes its time on the line.
+    // The duration is that of the generated stamps. The reply takes less time on the line than a scan period.
     assert!(
         result.duration_ns.is_some_and(|ns| (29 * 26_640_000..30 * 26_640_000).contains(&ns)),
         "{result:?}"
@@ -140,7 +140,7 @@ fn rows(options: &ConvertOptions) -> (ConversionResult, Vec<String>) {
 #[test]
 fn rows_have_intensities_and_meters_on_request() {
     let folder = TempDir::new().unwrap();
-    // Three reflector bits above the range.
+    // The values have three reflector bits above the range.
     let words: Vec<u16> = (0..181).map(|i| (1234 + i) | ((i % 8) << 13)).collect();
     let scan = measured::encode(0, Unit::Mm, &words, 0x10);
     let configuration = reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10);
@@ -193,7 +193,7 @@ fn raw_bytes_of_two_families_are_refused() {
     let one = recorded(&[Family::Ld, Family::Ld]);
     assert_eq!(convert_file(&one, &bytes, None).unwrap().telegrams, 2);
     fs::remove_file(&bytes).unwrap();
-    // The scanner was replaced while the hub searched for any.
+    // The scanner was replaced by one of another family while the hub searched for any family.
     let two = recorded(&[Family::Ld, Family::Rplidar, Family::Ld]);
     let failure = convert_file(&two, &bytes, Some("front")).unwrap_err();
     assert_eq!(failure.kind.exit_code(), 66);

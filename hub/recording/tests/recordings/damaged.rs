@@ -1,5 +1,5 @@
-//! Damaged MCAP files: of a file that was cut or changed anywhere, the intact chunks are read, and nothing that was never in
-//! the file.
+//! Tests of damaged MCAP files. If a file was truncated or changed anywhere, its intact chunks are read, and no data
+//! that was never in the file.
 
 use std::io::Write as _;
 use std::ops::Range;
@@ -14,13 +14,13 @@ use tempfile::TempDir;
 use crate::folder::file;
 use crate::written::{self, SENSOR_NAMES, WrittenRecording, WrittenTelegram};
 
-/// A recording, and where its records are.
+/// Recording, with the positions of its records.
 struct IntactRecording {
     bytes: Vec<u8>,
     telegrams: Vec<WrittenTelegram>,
-    /// Bytes of each chunk, each of which has [`MESSAGES_PER_CHUNK`] telegrams.
+    /// Position of each chunk, which has [`MESSAGES_PER_CHUNK`] telegrams.
     chunks: Vec<Range<usize>>,
-    /// Ends of all records outside chunks, after the end of the magic bytes.
+    /// End of the magic bytes, and ends of all records outside chunks.
     ends: Vec<usize>,
 }
 
@@ -40,7 +40,7 @@ impl IntactRecording {
         IntactRecording { bytes, telegrams, chunks, ends }
     }
 
-    /// The telegrams of the chunks that `is_left` accepts, one sensor after the other.
+    /// Returns the telegrams of the chunks that `is_kept` accepts, one sensor after the other.
     fn telegrams(&self, is_kept: impl Fn(usize) -> bool) -> Vec<WrittenTelegram> {
         let chunks = self.telegrams.chunks(MESSAGES_PER_CHUNK).enumerate();
         let left: Vec<_> =
@@ -50,7 +50,8 @@ impl IntactRecording {
         SENSOR_NAMES.into_iter().flat_map(of).collect()
     }
 
-    /// Positions in chunk `number` at which a change is found by the checksum: the checksum itself, and its records.
+    /// Returns the positions in chunk `number` at which the checksum detects a change: the checksum itself, and the
+    /// records.
     fn content(&self, number: usize) -> Vec<usize> {
         let chunk = self.chunks[number].clone();
         let compression = chunk.start + RECORD_HEAD_LEN + 8 + 8 + 8 + 4;
@@ -111,7 +112,7 @@ fn flipped_byte_costs_one_chunk() {
                 let name = format!("{compression:?}, byte {at} of chunk {number}");
                 let (telegrams, damage) = read(&folder, &bytes);
                 assert!(telegrams == whole.telegrams(|other| other != number), "{name}: {damage}");
-                // The numbers show a gap only between telegrams.
+                // Sequence numbers show a gap only between telegrams.
                 let is_inside = (1..whole.chunks.len() - 1).contains(&number);
                 let expected = Damage {
                     telegrams: if is_inside { MESSAGES_PER_CHUNK as u64 } else { 0 },
@@ -130,7 +131,7 @@ fn flipped_byte_costs_one_chunk() {
 fn chunk_with_another_opcode_costs_one_chunk() {
     let folder = TempDir::new().unwrap();
     let whole = IntactRecording::new(20, Compression::Zstd);
-    // A footer, and an opcode that the format reserves.
+    // Opcodes of a footer, and one that the format reserves.
     for opcode in [0x02, 0x16] {
         for (number, chunk) in whole.chunks.iter().enumerate() {
             let mut bytes = whole.bytes.clone();
@@ -196,7 +197,7 @@ fn chunk_that_the_file_has_twice_is_read_once() {
     let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Zstd] {
         let whole = IntactRecording::new(20, compression);
-        // One chunk again at another place, and a block of three chunks with all records between them.
+        // Repeat one chunk at another position, and a block of three chunks with all records between them.
         let (first, block) = (whole.chunks[0].clone(), whole.chunks[1].start..whole.chunks[3].end);
         for (copied, at, repeats) in [(first, whole.chunks[2].end, 1), (block, whole.chunks[3].end, 3)] {
             let mut bytes = whole.bytes.clone();
@@ -220,7 +221,7 @@ fn unchunked_telegram_is_checked_by_own_checksum() {
     let folder = TempDir::new().unwrap();
     let whole = IntactRecording::new(8, Compression::None);
     let telegrams = whole.telegrams(|_| true);
-    // The records of the chunks, without the chunks, and checksums of sections that were not computed.
+    // Write the records of the chunks without chunks, and section checksums of 0.
     let (mut bytes, mut at) = (whole.bytes[..MAGIC_LEN].to_vec(), MAGIC_LEN);
     let mut messages = Vec::new();
     for end in &whole.ends[1..] {
@@ -252,7 +253,7 @@ fn unchunked_telegram_is_checked_by_own_checksum() {
     for known in &telegrams {
         let is_in = |range: &&Range<usize>| bytes[(*range).clone()].ends_with(&known.telegram);
         let hits: Vec<_> = messages.iter().filter(is_in).cloned().collect();
-        // A reply is sent again and again. Only the header tells which one it is.
+        // Replies are sent repeatedly. Only the headers differ.
         for hit in &hits {
             for at in [hit.end - 1, hit.end - known.telegram.len() / 2, hit.end - known.telegram.len()] {
                 let mut changed = bytes.clone();
@@ -275,7 +276,7 @@ fn unchunked_telegram_is_checked_by_own_checksum() {
 #[test]
 fn refuses_too_large_chunk_but_not_a_wrong_length() {
     let folder = TempDir::new().unwrap();
-    // Zeros, so that the chunk is short until it is unpacked.
+    // Zeros compress well, so the chunk is short until it is unpacked.
     let mut writer =
         scanhub_schema::file::Writer::begin_compressed(Vec::new(), "", Compression::Zstd, Default::default())
             .unwrap();
@@ -379,7 +380,7 @@ fn file_without_its_beginning_is_refused() {
         assert!(failure.message.ends_with("is the end of an MCAP file, without its beginning"), "{failure}");
         assert_eq!(failure.kind.exit_code(), 66);
     }
-    // Neither the beginning nor the end: messages, or a chunk of which nothing can be read.
+    // A piece without beginning and end: messages, or a chunk of which nothing can be read.
     let packed = IntactRecording::new(20, Compression::Zstd);
     let middle =
         |whole: &IntactRecording| whole.bytes[whole.chunks[1].start + 40..whole.chunks[3].end].to_vec();
@@ -398,8 +399,8 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// Telegrams in a chunk: four of each sensor.
+/// Number of telegrams in a chunk: four of each sensor.
 const MESSAGES_PER_CHUNK: usize = 8;
 const MAGIC_LEN: usize = mcap::MAGIC.len();
-/// Bytes of opcode and length.
+/// Length of opcode and length of a record.
 const RECORD_HEAD_LEN: usize = 1 + 8;

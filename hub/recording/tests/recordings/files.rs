@@ -1,4 +1,4 @@
-//! Recordings as files: what they are is told by their bytes, and what comes out of them is what went in.
+//! Tests of recordings as files: their format is detected by their bytes, and their data is read back unchanged.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -41,7 +41,7 @@ fn stream_file_has_exact_telegrams_and_settings() {
         [scan(700), reply::configuration_reply(0, Mode(4), Unit::Cm, 0x11).bytes().to_vec(), scan(1700)];
     let mut bytes = b"\x06\x02\x80noise".to_vec();
     bytes.extend_from_slice(&telegrams.concat());
-    // A scan that broke off for a reply, at the very end.
+    // At the very end, a scan broke off, and a reply follows.
     bytes.extend_from_slice(&scan(5)[..40]);
     let last = reply::mode_reply(0, true, 0x10);
     bytes.extend_from_slice(&[&[0x06], last.bytes()].concat());
@@ -67,7 +67,7 @@ fn a_log_becomes_telegrams() {
     for count in [360, 361] {
         log += &format!("FLASER {count} {} 0 0 0 0 0 0 12.25 host 1\n", vec!["1.234"; count].join(" "));
     }
-    // Where the recording broke off.
+    // The recording broke off in this line.
     log += "FLASER 361 1.0 1.0";
     let file = temporary("log.gz", &gzip(log.as_bytes()));
     let recording = Recording::open(file.path()).unwrap();
@@ -108,7 +108,7 @@ fn refuses_a_non_recording_with_place_and_remedy() {
         let file = temporary(name, &bytes);
         let failure = Recording::open(file.path()).unwrap_err();
         assert!(failure.message.contains(message), "{failure}");
-        // A line may bring nothing but noise, if it is known whose it is.
+        // A stream may have only noise, if its family is named.
         let line = |family| Recording::open_stream(file.path(), family);
         let is_noise = message == "no telegram in it";
         let known = line(Some(Family::Lms)).ok();
@@ -128,7 +128,7 @@ fn mostly_unrecognized_stream_needs_the_family() {
     assert!(failure.message.contains("(lms 49 %, ") && failure.hint.contains("family="), "{failure}");
     let named = Recording::open_as(few.path(), Some(Family::Lms)).unwrap();
     assert_eq!((named.contents().telegrams, named.contents().damage.bytes), (8, noise.len() as u64));
-    // A wrong name does not hide whose it is.
+    // If a wrong family is named, the right one is recognized.
     let enough = temporary("enough.bin", &[&telegrams[..], &noise[1..]].concat());
     for family in [None, Some(Family::Lms), Some(Family::Ld)] {
         let recording = Recording::open_as(enough.path(), family).unwrap();
@@ -138,7 +138,8 @@ fn mostly_unrecognized_stream_needs_the_family() {
 
 #[test]
 fn reads_the_intact_start_of_a_truncated_gzip_file() {
-    // So much that what is cut off is not all of it, and different enough not to be packed to nothing.
+    // Enough data that the rest of the file has telegrams, and different enough that it does not compress to almost
+    // nothing.
     let telegrams: Vec<Vec<u8>> = (0..400).map(scan).collect();
     let packed = gzip(&telegrams.concat());
     let file = temporary("cut.bin.gz", &packed[..packed.len() * 2 / 3]);

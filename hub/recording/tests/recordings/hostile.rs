@@ -1,5 +1,5 @@
-//! Records with wrong lengths and contents: whatever attachments, metadata and indices contain, all telegrams of the file
-//! are read and copied, without a panic.
+//! Tests of records with wrong lengths and contents. Whatever attachments, metadata and indices contain, all telegrams
+//! of the file are read and copied, without a panic.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use scanhub_recording::convert::{ConversionResult, ConvertOptions, convert};
 use scanhub_schema::{Failure, Kind};
 use tempfile::TempDir;
 
-/// Converts `bytes` to MCAP, in `folder`.
+/// Converts the file `bytes` to MCAP in `folder`.
 fn convert_again(folder: &TempDir, bytes: &[u8]) -> Result<ConversionResult, Failure> {
     let (input, output) = (folder.path().join("in.mcap"), copy(folder));
     fs::write(&input, bytes).unwrap();
@@ -19,7 +19,7 @@ fn convert_again(folder: &TempDir, bytes: &[u8]) -> Result<ConversionResult, Fai
     convert(&options, &AtomicBool::new(false), |_, _| {})
 }
 
-/// Path of the converted file.
+/// Returns the path of the converted file.
 fn copy(folder: &TempDir) -> PathBuf {
     folder.path().join("out.mcap")
 }
@@ -37,7 +37,7 @@ fn attachment(data: &[u8]) -> Vec<u8> {
     [&[7; 16][..], &text("map.pgm"), &text("image/pgm"), &len, data, &[0; 4]].concat()
 }
 
-/// Bodies of one record of each kind that a file has beside its messages.
+/// Returns opcode and body of records of each kind that a file can have in addition to its messages.
 fn foreign_records() -> Vec<(u8, Vec<u8>)> {
     let pairs = [text("robot"), text("r1"), text("place"), text("hall 3")].concat();
     let map = [&(pairs.len() as u32).to_le_bytes()[..], &pairs].concat();
@@ -55,7 +55,7 @@ fn foreign_records() -> Vec<(u8, Vec<u8>)> {
     ]
 }
 
-/// A recording with this record behind its first records, and checksums that do not say anything.
+/// Returns a recording with `record` before its first chunk, and section checksums of 0.
 fn with_record(recording: &[u8], record: &[u8]) -> Vec<u8> {
     let (mut at, mut file) = (MAGIC_LEN, recording[..MAGIC_LEN].to_vec());
     let mut is_in = false;
@@ -91,7 +91,7 @@ fn reports_and_drops_a_truncated_attachment() {
             .unwrap();
     assert!(sound.damage.is_none() && sound.telegrams == telegrams, "{sound:?}");
     assert_eq!(attachments(&copy(&folder)), 1);
-    // Each length that it may have had before somebody cut it: 1 to 4 bytes less lack a part of its checksum.
+    // Try all shorter lengths. An attachment that is 1 to 4 bytes shorter lacks a part of its checksum.
     for data in [&b""[..], b"abc"] {
         let body = attachment(data);
         for len in 0..body.len() {
@@ -122,7 +122,7 @@ fn malformed_record_never_panics_or_costs_a_telegram() {
             match random.u8(..4) {
                 0 => body.truncate(at),
                 1 => body.insert(at, random.u8(..)),
-                // A length, as a rule.
+                // These bytes are usually a length.
                 2 if at + 4 <= body.len() => {
                     body[at..at + 4].copy_from_slice(&random.u32(..64).to_le_bytes())
                 }

@@ -1,5 +1,5 @@
-//! CARMEN logs written anew: every range and every code of a log comes back from what it was converted to, or it is
-//! refused.
+//! Tests of conversions of CARMEN logs. Every range and every code survives the conversion to another format and back,
+//! or the log is refused.
 
 use std::fs;
 use std::io::Read;
@@ -27,7 +27,7 @@ fn a_log_comes_back_from_an_mcap_file() {
     let log = file(&folder, "a.log", log.as_bytes());
     let (mcap, again) = (folder.path().join("a.mcap"), folder.path().join("b.log"));
     convert_file(&log, &mcap, None).unwrap();
-    // Millimetres up to 8.4 m do not go into 13 bits.
+    // Millimeters up to 8.4 m do not fit into 13 bits.
     let contents = Recording::open(&mcap).unwrap().contents().clone();
     assert_eq!(
         (contents.unit, contents.mode, &contents.sensors[0][..]),
@@ -37,7 +37,7 @@ fn a_log_comes_back_from_an_mcap_file() {
     assert_eq!(sweeps(&again), sweeps(&log));
 }
 
-/// Ranges as they are written, in micrometres, and the time in microseconds, of each scan.
+/// Returns the ranges of each scan as they are written, in micrometers, and its time in microseconds.
 fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
     let mut text = String::new();
     flate2::read::MultiGzDecoder::new(fs::File::open(log).unwrap()).read_to_string(&mut text).unwrap_or_else(
@@ -49,7 +49,7 @@ fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
     let micros = |field: &str| (field.parse::<f64>().unwrap() * 1e6).round() as i64;
     let sweep = |line: &str| {
         let fields: Vec<&str> = line.split(' ').filter(|field| !field.is_empty()).collect();
-        // The ranges of the other lines stand behind seven numbers of the sensor.
+        // In other lines, the ranges follow after seven numbers of the sensor.
         let at = if fields[0] == "FLASER" { 1 } else { 8 };
         let count: usize = fields[at].parse().unwrap();
         (
@@ -60,8 +60,8 @@ fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
     text.lines().filter(|line| line.contains("LASER") && !line.starts_with('#')).map(sweep).collect()
 }
 
-/// Converts `log` to MCAP and back, to a stream and back, and to one by the other: the same ranges everywhere, the same
-/// codes, and the same times where there are any.
+/// Converts `log` to MCAP and back, to a stream and back, and to a stream by way of MCAP. Asserts that ranges and codes
+/// stay the same, and also the times if the format has times.
 fn assert_round_trips(folder: &TempDir, name: &str, log: &Path) {
     let path = |ending: &str| folder.path().join(format!("{name}{ending}"));
     let (mcap, stream, both) = (path(".mcap"), path(".bin.gz"), path("-mcap.bin"));
@@ -80,7 +80,7 @@ fn assert_round_trips(folder: &TempDir, name: &str, log: &Path) {
             assert!(one.0 == other.0, "{}, scan {number}", file_name.display());
             assert!(!has_times || one.1 == 0 || one.1 == other.1, "{}, scan {number}", file_name.display());
         }
-        // And the way there has the words and codes that the log itself is read as.
+        // The intermediate file has the same words and codes as the log itself.
         let recording = Recording::open(file_name).unwrap();
         assert_eq!(recording.encoding(), own.encoding());
         let words = |recording: &Recording| -> Vec<_> {
@@ -91,7 +91,7 @@ fn assert_round_trips(folder: &TempDir, name: &str, log: &Path) {
     }
 }
 
-/// A log of three scans of `count` beams: the ranges in turn, two seconds apart.
+/// Returns a log of three scans of `count` beams, two seconds apart. The beams have `ranges` in turn.
 fn log(count: usize, ranges: &[&str]) -> String {
     let line = |scan: usize| {
         let ranges: Vec<_> = (0..count).map(|beam| ranges[(beam + scan) % ranges.len()]).collect();
@@ -206,7 +206,7 @@ fn reply_with_the_encoding_is_not_counted_as_dropped() {
             assert_eq!((result.telegrams, result.scans, result.dropped), (3, 3, 0), "{file_name}, {output}");
         }
     }
-    // Replies that a scanner sent are.
+    // Replies that a scanner sent count as dropped.
     let recorded = file(&folder, "hub.mcap", &crate::written::recording(20, 14).bytes);
     for output in ["hub.log", "hub.csv"] {
         let result = convert_file(&recorded, &path(output), Some("front")).unwrap();
@@ -217,7 +217,7 @@ fn reply_with_the_encoding_is_not_counted_as_dropped() {
 #[test]
 fn range_of_14_bits_survives_a_log_round_trip() {
     let folder = TempDir::new().unwrap();
-    // 8.185 m in 14 bits; in 13 bits it would be a code.
+    // The range is 8.185 m in 14 bits. In 13 bits, the value would be a code.
     let scan = measured::encode(0, Unit::Mm, &[8185; 181], 0x10);
     let configuration = reply::configuration_reply(0, Mode(4), Unit::Mm, 0x10);
     let stream = file(&folder, "a.bin", &[configuration.bytes(), scan.bytes()].concat());
@@ -244,7 +244,7 @@ fn refuses_to_convert_unencodable_log_with_reason() {
             assert!(all.contains("cannot become telegrams without loss"), "{name}: {all}");
             assert!(all.contains(message), "{name}: {all}");
         }
-        // It can be played all the same.
+        // The recording can be played anyway.
         let recording = Recording::open(&input).unwrap();
         assert_eq!(recording.telegrams(recording.encoding().unwrap()).unwrap().count(), 3);
     }

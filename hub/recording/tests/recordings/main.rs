@@ -1,4 +1,5 @@
-//! Recordings as files: one binary with a module for each thing that is held, so that what they all link is linked once.
+//! Tests of recordings as files. They are one binary with several modules, so that the dependencies are linked only
+//! once.
 
 #[cfg(feature = "mcap")]
 mod folder;

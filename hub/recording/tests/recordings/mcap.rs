@@ -1,4 +1,4 @@
-//! Recordings of the hub: each sensor's telegrams come out as they went in, with what the hub knew of them.
+//! Tests of recordings of the hub: the telegrams of each sensor are read back unchanged, with their headers.
 
 use std::fs;
 
@@ -16,7 +16,7 @@ fn file(bytes: &[u8]) -> NamedTempFile {
     file
 }
 
-/// The telegrams of `sensor` as `recording` gives them.
+/// Returns the telegrams of `sensor` in `recording`.
 fn read(recording: &Recording, sensor: &'static str) -> Vec<WrittenTelegram> {
     let frames = recording.of(sensor).unwrap().telegrams(MM_ENCODING).unwrap();
     frames
@@ -62,7 +62,7 @@ fn a_sensor_has_to_be_chosen_of_several() {
     }
 }
 
-/// A recorder that was killed leaves whole chunks.
+/// A recorder that was killed leaves complete chunks.
 #[test]
 fn reads_a_recording_truncated_by_a_kill() {
     let written = crate::written::recording(20, 3);
@@ -77,7 +77,7 @@ fn reads_a_recording_truncated_by_a_kill() {
 #[test]
 fn telegrams_alone_are_a_stream() {
     let written = crate::written::recording(40, 3);
-    // Also with other bytes before each.
+    // Other bytes may precede each telegram.
     let telegrams = |before: &[u8]| {
         written.telegrams.iter().flat_map(|known| [before, &known.telegram].concat()).collect::<Vec<u8>>()
     };

@@ -1,10 +1,11 @@
-//! Recordings of real sensors, which are no part of the project: where they are, if they are there.
+//! Folder with recordings of real sensors, which are not part of the project.
 
 use std::path::PathBuf;
 
 use crate::skip::skip;
 
-/// Their folder, as SCANHUB_DATA names it; without one the test that asks is skipped, which is said.
+/// Returns the folder that SCANHUB_DATA names, or the default folder. If it does not exist, reports that the calling
+/// test is skipped, and returns `None`.
 pub(crate) fn recordings() -> Option<PathBuf> {
     let data = std::env::var_os("SCANHUB_DATA").map_or_else(
         || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),

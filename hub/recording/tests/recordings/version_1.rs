@@ -1,5 +1,5 @@
-//! Recordings of version 1: telegrams are what they are today, so they are played and converted; scans are not, and nothing
-//! takes them for such.
+//! Tests of recordings of version 1. Their telegrams have the current format and are played and converted. Their scans
+//! have another format and are not read.
 
 use std::fs;
 use std::path::Path;
@@ -19,7 +19,7 @@ use scanhub_schema::{Header, Kind, Scan, ScanHead, Topic};
 
 const MM_ENCODING: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 
-/// The telegrams of all sensors in the file at `path`, with their headers.
+/// Returns the telegrams of all sensors in the file at `path`, with their headers.
 fn telegrams(path: &Path) -> Vec<WrittenTelegram> {
     let recording = Recording::open(path).unwrap();
     let of_sensor = |sensor: &'static str| {
@@ -38,7 +38,7 @@ fn sorted_by_sensor(written: &WrittenRecording) -> Vec<WrittenTelegram> {
     SENSOR_NAMES.into_iter().flat_map(of_sensor).collect()
 }
 
-/// Encoding of the channel and data of all messages.
+/// Returns the topic and the encoding of the channel, and the data, of all messages.
 fn messages(bytes: &[u8]) -> Vec<(String, String, Vec<u8>)> {
     let all = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
     let message =
@@ -57,7 +57,7 @@ fn its_telegrams_are_all_there() {
     assert_eq!((&contents.sensors[..], contents.mode), (&SENSOR_NAMES.map(String::from)[..], Some(Mode(4))));
     assert!(contents.damage.is_none(), "{}", contents.damage);
     assert_eq!(telegrams(&file), sorted_by_sensor(&old));
-    // A copy has all of it as it was; its telegrams are those of any version.
+    // A copy has all messages unchanged, and its telegrams can be read.
     convert_file(&file, &copy, None).unwrap();
     let (kept, all) = (messages(&fs::read(&copy).unwrap()), messages(&old.bytes));
     assert_eq!(kept.len(), all.len());
@@ -109,8 +109,8 @@ fn without_telegrams_there_is_nothing_to_convert() {
     assert!(failure.message.starts_with("there is no scan in "), "{failure}");
 }
 
-/// Telegrams of values that no two people would split alike, beside the published scan: one of today says how to read them,
-/// and is taken; one of version 1 is not asked, and that is refused, not guessed.
+/// The values of the telegrams are ambiguous without the measuring mode. A published scan of the current version is
+/// used instead. A scan of version 1 is not read, so the conversion is refused.
 #[test]
 fn version_1_scan_does_not_define_the_measuring_mode() {
     let folder = TempDir::new().unwrap();

@@ -1,4 +1,4 @@
-//! A recording of two sensors as the hub writes it, with what is in it.
+//! Recording of two sensors as the hub writes it, with its contents.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +13,7 @@ use scanhub_schema::{
     Background, Early, Flags, Foreground, Header, Lines, Marks, Motion, Scan, Status, Topic, Zones,
 };
 
-/// A telegram that was written.
+/// Telegram that was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct WrittenTelegram {
     pub(crate) sensor: &'static str,
@@ -21,26 +21,26 @@ pub(crate) struct WrittenTelegram {
     pub(crate) telegram: Vec<u8>,
 }
 
-/// The file, and its telegrams in order.
+/// Bytes of the file, and its telegrams in order.
 pub(crate) struct WrittenRecording {
     pub(crate) bytes: Vec<u8>,
     pub(crate) telegrams: Vec<WrittenTelegram>,
 }
 
-/// `rounds` telegrams of each sensor with all that the hub makes of them, a chunk for each four, a channel of somebody
-/// else's.
+/// Returns a recording of `rounds` telegrams of each sensor with their results, four per chunk and sensor, and a
+/// channel of another program.
 pub(crate) fn recording(rounds: u64, seed: u64) -> WrittenRecording {
     recording_with(rounds, seed, Compression::None)
 }
 
-/// The same with packed chunks.
+/// Returns the same recording with this compression.
 pub(crate) fn recording_with(rounds: u64, seed: u64, compression: Compression) -> WrittenRecording {
     write_recording(rounds, seed, compression, |writer, sensor, topic, header, payload| {
         writer.write_sample(sensor, topic, header, payload).unwrap();
     })
 }
 
-/// The same as version 1 wrote it, with only some of its topics.
+/// Returns the same recording in the format of version 1, with only these `topics`.
 pub(crate) fn recording_of_version_1(rounds: u64, seed: u64, topics: &[Topic]) -> WrittenRecording {
     write_recording(rounds, seed, Compression::None, |writer, sensor, topic, header, payload| {
         if !topics.contains(&topic) {
@@ -48,7 +48,7 @@ pub(crate) fn recording_of_version_1(rounds: u64, seed: u64, topics: &[Topic]) -
         }
         let payload = match topic {
             Topic::Scan => version_1_scan(),
-            // Generation, counts, unit and flags, all 0.
+            // The fields are generation, counts, unit and flags, all 0.
             Topic::Foreground | Topic::Background => vec![0; 12],
             _ => payload.to_vec(),
         };
@@ -64,7 +64,7 @@ pub(crate) fn recording_of_version_1(rounds: u64, seed: u64, topics: &[Topic]) -
     })
 }
 
-/// A scan of 361 beams as version 1 has it, of ranges that happen to be what a scan of today may be too.
+/// Returns a scan of 361 beams in the format of version 1. Its bytes are also a valid scan in the current format.
 pub(crate) fn version_1_scan() -> Vec<u8> {
     let mut payload = vec![0x69, 0x01, 10, 13];
     payload.extend(0_i32.to_le_bytes());
@@ -74,7 +74,7 @@ pub(crate) fn version_1_scan() -> Vec<u8> {
     payload
 }
 
-/// A recording whose samples `write` writes.
+/// Returns a recording whose samples `write` writes.
 fn write_recording(
     rounds: u64,
     seed: u64,
@@ -96,7 +96,7 @@ fn write_recording(
         for (number, sensor) in SENSOR_NAMES.into_iter().enumerate() {
             let telegram = match round {
                 0 => reply::configuration_reply(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec(),
-                // A reply again and again: bit for bit the same.
+                // The reply is the same, bit for bit, each time.
                 round if round % 16 == 7 => reply::mode_reply(0, true, 0x10).bytes().to_vec(),
                 _ => scan(&mut random),
             };
@@ -141,7 +141,7 @@ fn scan(random: &mut Rng) -> Vec<u8> {
     measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
 }
 
-/// What the hub makes of a telegram, as far as its size matters.
+/// Returns results of a telegram as the hub publishes them. Only their sizes are realistic.
 fn results(telegram: &[u8], random: &mut Rng) -> Vec<(Topic, Vec<u8>)> {
     let packed = |payload: &dyn Fn(&mut [u8]) -> Option<usize>| {
         let mut room = [0; 4096];
@@ -150,7 +150,7 @@ fn results(telegram: &[u8], random: &mut Rng) -> Vec<(Topic, Vec<u8>)> {
     };
     let status = Status { mode: 4, unit_mm: 1, baud: 500_000, since_ns: random.u64(..), ..Status::default() };
     let mut scan = packed(&|room| Scan::zeroed(0).pack(room));
-    // The ranges are there once more, as they came.
+    // The scan also has the ranges as the telegram contains them.
     scan.extend_from_slice(&telegram[5..telegram.len() - 3]);
     vec![
         (Topic::Scan, scan),
