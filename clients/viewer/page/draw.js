@@ -1,4 +1,4 @@
-// Colors and drawing functions, the grid, and what each sensor measures.
+// Drawing functions, and the parts that both views share.
 
 const colors = {};
 let shadeColors = [];
@@ -11,7 +11,7 @@ function readColors() {
     colors[name.slice(2)] = getComputedStyle(probe).color;
   }
   colors.unknown = colors.stop;
-  // The color of the paper shows whether the page is dark.
+  // The background color shows whether the page is dark.
   const [red] = colors.paper.match(/[\d.]+/g).map(Number);
   isDark = red < (colors.paper.includes("srgb") ? 0.5 : 128);
   probe.remove();
@@ -27,20 +27,20 @@ function readColors() {
 
 const STEPS = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
 
-/** Sets the color and the width of the next lines, shapes and texts. */
+/** Sets the color of the following shapes and texts, and the line width in pixels. */
 function ink(color, width) {
   pen.strokeStyle = pen.fillStyle = color;
   pen.lineWidth = width;
 }
 
-/** Sets the font of the next texts, which are centered at their position or above it. */
+/** Sets the font of the following texts. They are centered horizontally, and `baseline` defines their vertical position. */
 function font(size, baseline) {
   pen.font = `${size}px system-ui, sans-serif`;
   pen.textAlign = "center";
   pen.textBaseline = baseline;
 }
 
-/** Starts a path through points of the screen. */
+/** Starts a path through positions on the screen. */
 function path(...points) {
   pen.beginPath();
   for (const point of points) pen.lineTo(...point);
@@ -52,7 +52,7 @@ function stroke(...points) {
   pen.stroke();
 }
 
-/** Clears another canvas, and draws on it with `paint`. */
+/** Clears another canvas, and calls `act` to draw on it. */
 function drawOn(canvas, paint, width = size.width, height = size.height) {
   [canvas.width, canvas.height] = [width * size.ratio, height * size.ratio];
   const before = pen;
@@ -67,7 +67,7 @@ function circle(x, y, radius) {
   pen.arc(x, y, radius, 0, 2 * PI);
 }
 
-/** Writes a text with an outline in the color of the paper, so that lines do not cross it. */
+/** Draws text with an outline in the background color, so that lines do not cross it. */
 function label(text, x, y) {
   pen.save();
   pen.lineWidth = 4;
@@ -78,7 +78,8 @@ function label(text, x, y) {
   pen.fillText(text, x, y);
 }
 
-/** Returns both axes, upright first: where index `n` of a grid line is, and the side on which the axis has its numbers. */
+/** Returns both axes, the vertical one first: a function to the screen from a position along the axis and the other coordinate,
+ * and the side on which the axis has its numbers. */
 function axes() {
   return [
     { center: view.x, at: (n, other) => toScreen(n, other), other: view.y, right: cos, down: sin, sign: 1,
@@ -88,17 +89,17 @@ function axes() {
   ];
 }
 
-/** Distance of grid lines in meters. */
+/** Returns the distance between grid lines in meters. */
 const gridStep = () => STEPS.find((length) => length * view.scale >= 64) ?? 100;
 const gridReach = () => hypot(size.width, size.height) / view.scale / 2 + gridStep();
 
-/** Returns whether a text of this width at a place of the screen is not covered. */
+/** Returns whether a text of this width at a position of the screen is not covered. */
 const isFree = ([x, y], width) => x > width / 2 + 8 && x < middle.width - width / 2 - 8 && abs(y - middle.y) < middle.height / 2 - 8;
 
 function drawGrid() {
   const [step, reach] = [gridStep(), gridReach()];
   const digits = step < 0.1 ? 2 : step < 1 ? 1 : 0;
-  // The label of a zone takes the place of a number.
+  // Omit a number where a zone has its label.
   const hasNumber = (n) => n !== 0 && !(layers.zones && !isSideView() && circles.some(({ radius }) => abs(abs(n * step) - radius) * view.scale < 26));
   const forEachGridLine = (paint) => {
     for (const axis of axes()) for (let n = ceil((axis.center - reach) / step); n * step <= axis.center + reach; n++) paint(n, axis);
@@ -167,10 +168,11 @@ function drawField(sensor) {
   }
 }
 
-// Minimum distance between two dots that are drawn one after the other, in pixels.
+// Distance in pixels within which a point is hidden by the previous one.
 const MIN_DOT_DISTANCE = 0.8;
 
-/** Draws squares of `width` at `points` of a sensor at `pose` with the method of the pen. Returns the number of points that are not NaN. */
+/** Draws squares of `width` pixels at `points` of a sensor at `pose`, with the canvas method `how`. Returns the number of points
+ * that are not NaN. */
 function dots(points, width, pose, method = "fillRect") {
   if (!points || !pose) return 0;
   const [a, b, c, d, e, f] = onScreen(pose);
@@ -181,7 +183,7 @@ function dots(points, width, pose, method = "fillRect") {
     const y = top + b * points[i] + d * points[i + 1];
     if (x !== x) continue;
     count += 1;
-    // A dot that the one before covers would cost as much as a visible one.
+    // Skip points that the previous square hides: they cost as much time as visible ones.
     if (abs(x - px) < MIN_DOT_DISTANCE && abs(y - py) < MIN_DOT_DISTANCE) continue;
     pen[method](x, y, width, width);
     [px, py] = [x, y];
@@ -195,7 +197,7 @@ function drawScan(sensor) {
   const pose = poseOf(sensor);
   const width = scan.points.length > 2000 ? 2.5 : 3.5;
   const shades = layers.intensity && scan.byShade.length ? scan.byShade : [scan.points];
-  // Setting a color is slow: do it once for all points that have it.
+  // Points of one shade are drawn together, so that each color is set only once.
   return shades.reduce((count, points, shade) => {
     pen.fillStyle = shades.length > 1 ? shadeColors[shade] : colors.ink;
     return count + dots(points, width, pose);

@@ -1,4 +1,4 @@
-// Draws the frames of the picture.
+// Frames of the picture.
 
 function drawTopView(now) {
   const visible = shownSensors();
@@ -51,6 +51,7 @@ function draw(now) {
 }
 
 let isDrawRequested = false;
+// Whether data has arrived, or the view has changed.
 let isFitDue = false; // new data arrived, or the view has changed
 
 function requestDraw() {

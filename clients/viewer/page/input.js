@@ -1,4 +1,4 @@
-// Input by mouse, touch and keys; buttons; and the start of the page.
+// Input of the user: buttons, keys, mouse and touch. The page starts at the end.
 
 function selectSensor(space) {
   shownSpace = space === shownSpace ? null : space;
@@ -118,7 +118,7 @@ const scaleTexts = make("small", scaleBox);
 for (let n = 0; n < 3; n++) make("span", scaleTexts);
 document.querySelector("[data-key=i]").after(scaleBox);
 
-// Colors of things that are not in the list of layers, and the view in which they are.
+// Entries of the legend for objects that are not in the list of layers: view, kind and text.
 const LEGEND = [["above", "people", "Person. Numbers count all tracks since the tracker started"],
   ["aside", "unknown", "Background not known yet"], ["aside", "behind", "Behind the background"]];
 for (const [view, kind, text] of LEGEND) {
@@ -153,7 +153,7 @@ addEventListener("keydown", (event) => {
   event.preventDefault();
 });
 
-// Touch and mouse: one pointer pans, two zoom and turn.
+// Pressed pointers, fingers or the mouse: one moves the view, two zoom and turn it.
 const fingers = new Map();
 const pointOf = (event) => [event.clientX, event.clientY];
 
@@ -202,7 +202,7 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   requestDraw();
 });
 
-// Numbers for tests and for the browser's console.
+// Figures for tests and for users of the browser's console.
 
 Object.defineProperty(window, "scanhub", {
   get: () => ({

@@ -1,6 +1,6 @@
-// Texts around the picture.
+// Texts next to the picture.
 
-/** Returns `value` with `digits` decimals, and zero without a sign. */
+/** Formats a number with this number of decimals, and without the sign of a negative zero. */
 const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]*$)/, "");
 
 function beamText({ scan, name }, beam) {
@@ -9,7 +9,7 @@ function beamText({ scan, name }, beam) {
   return `\n${name}: ${fixed(angle, 2)}\u00b0, ${fixed(scan.ranges[beam], 3)} m${intensity}`;
 }
 
-/** Writes what is under the pointer: a point, or only a position. */
+/** Writes the reading of the point under the pointer, or the pointer's position. */
 function showPointer() {
   const box = $("readout");
   if (!pointer || tape) return box.replaceChildren();
@@ -36,7 +36,7 @@ function showPointer() {
 
 const allPeople = () => [...people.values()].flatMap((one) => one.tracks);
 
-/** Returns whether a replay is paused or over: then its data does not become stale. */
+/** Returns whether the picture stays as it is, because the player is paused or at the end. */
 const isPlayerStopped = () => player !== null && (player.paused || player.over);
 const isReceiving = () => isOpen && performance.now() - lastRobotAt < SILENCE_MS;
 const verdict = () => (isReceiving() ? robot.verdict : "unknown");
@@ -67,10 +67,11 @@ function replaceData(one, data) {
   requestDraw();
 }
 
-/** Removes stale data. */
+/** Deletes data that is too old at `now`. */
 function expireData(now) {
   for (const one of allSensors()) if (one.scan && now - one.scan.at > max(STALE_AFTER_MS, 3000 * one.scan.period)) replaceData(one, emptySensor());
   for (const one of allSweeps()) {
+    // The page subscribes to points only in the side view.
     if (!isSideView()) one.points = null; // Clouds have no subscription in this view.
     if (one.sweep && now > one.until) replaceData(one, emptySweep());
   }
@@ -94,7 +95,7 @@ function updateTexts() {
   measureMargins();
 }
 
-/** Returns the number of people in each room, and for numbers that are greater than their count, the reason. */
+/** Returns the people in each room as text. If an ID is greater than the number of people, adds the number of tracks so far. */
 function peopleText() {
   if (!isReceiving() || !robot.people) return "";
   const all = allPeople();
@@ -102,12 +103,12 @@ function peopleText() {
   return latest > all.length ? `${robot.people}  ·  tracks so far: ${latest}` : robot.people;
 }
 
-/** Writes the scale of the intensities, and the colors of the things that are not in the list of layers. */
+/** Updates the scale of the intensities, and the legend of objects that are not in the list of layers. */
 function showLegend() {
   const limits = shownSensors().filter(({ scan }) => scan?.byShade.length).map(({ brightest }) => Math.round(brightest));
   const [limit, ...others] = new Set(limits);
   $("scale").hidden = limit === undefined || isSideView();
-  // Shades follow the root of an intensity.
+  // The shade is proportional to the square root of the intensity.
   const numbers = others.length ? [0, "", "highest of each sensor"] : [0, limit < 4 ? "" : Math.round(limit / 4), limit];
   const [canvas, texts] = $("scale").children;
   [...texts.children].forEach((text, n) => put(text, String(numbers[n])));
@@ -135,7 +136,7 @@ function showPlayer() {
   for (const one of box.querySelectorAll("button")) one.disabled = over || !isOpen;
 }
 
-/** Writes why the picture is empty, and what to do. */
+/** Writes why the picture is empty, and the remedy. */
 function showProblem() {
   const [first] = shownSensors();
   let problem = robot.problem ?? (robot.hub ? null : { what: "No hub", remedy: "scanhub run" });
@@ -217,14 +218,14 @@ function showSensors() {
   });
 }
 
-/** Returns the reason of the losses on a line, or the remedy. */
+/** Returns a text about the losses on a line, with their reason or the remedy. */
 function lossText({ loss, simulated, replayed }) {
   const line = simulated ? "simulated line" : replayed ? "recorded line" : "line";
   const remedy = replayed ? "" : simulated ? ": simulated faults, or this machine is too busy" : ": check cable, ground and rate";
   return `${percent(loss)} of its ${line} is damaged or lost${remedy}`;
 }
 
-/** Text of a sparkline's scale, which ends at `top`. */
+/** Texts of the scales of sparklines, from 0 to `top`. */
 const SCALES = { hz: (top) => `0–${top} Hz`, age: (top) => `p99, 0–${top} ms`, loss: (top) => `0–${fixed(100 * top, 0)} %` };
 
 /** Returns the next round value above `value`. */
@@ -233,7 +234,8 @@ function roundUp(value) {
   return power * [1, 2, 5, 10].find((step) => step * power >= value || step === 10);
 }
 
-/** Draws the last two minutes, from 0 on, because the middle of an empty curve does not mean a problem. Returns the scale as text. */
+/** Draws the values of the last two minutes. The scale starts at 0, so that small variations do not look like a problem. Returns
+ * the scale as text. */
 function sparkline(canvas, history, series) {
   const { clientWidth: width, clientHeight: height } = canvas;
   const now = performance.now();

@@ -1,4 +1,4 @@
-// Zones, marks, lines, people, the tape and the sensors, which are drawn over the points.
+// Figures in the picture other than points.
 
 function drawZones() {
   font("600 12", "bottom");
@@ -49,7 +49,7 @@ function drawLines() {
   return walls.length;
 }
 
-/** Draws people with number and tail, and an ellipse where they may be. Those that are not confirmed are dashed and pale. */
+/** Draws people with ID, tail and uncertainty; those who are not seen are dashed and pale. Returns the number of people. */
 function drawPeople() {
   ink(colors.person, 2);
   font("600 13", "bottom");

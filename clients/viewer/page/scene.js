@@ -47,7 +47,7 @@ function entryFor(all, topic, create) {
   return Object.assign(all.get(space), { session });
 }
 
-/** Data of a sensor, and of a tilted scanner, that sees nothing. */
+/** Returns the empty data of a sensor. `empty` does so for a source of sweeps. */
 const emptySensor = () => ({ scan: null, foreground: null, trail: [] });
 const emptySweep = () => ({ sweep: null, points: null, obstacles: [] });
 

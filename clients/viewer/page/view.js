@@ -1,4 +1,4 @@
-// The part of the world that is visible, and its position on the screen.
+// The visible part of the world, and its position on the screen.
 
 /** Layers of the picture, each with its key and its name. */
 const LAYERS = {
@@ -7,15 +7,19 @@ const LAYERS = {
   obstacles: ["o", "Obstacles"], field: ["v", "Field of view"], grid: ["g", "Grid"],
 };
 const layers = Object.fromEntries(Object.keys(LAYERS).map((name) => [name, name !== "lines"]));
+// Restore the layers chosen earlier in this window. Browsers may refuse access to the storage.
 try { // Layers chosen before in this window. A browser may refuse to store them.
   Object.assign(layers, JSON.parse(sessionStorage.getItem("layers")));
 } catch { /* The choice is valid while the page is open. */ }
 const views = ["above", "aside"].map(() => ({ x: 1, y: 0, scale: 60, turn: 0, fits: true, isFitted: false, goal: null }));
 let view = views[0];
 const isSideView = () => view === views[1];
+// The only sensor that is shown; null for all.
 let shownSpace = null; // the one sensor that is shown
 const isMotionReduced = matchMedia("(prefers-reduced-motion: reduce)");
+// Position of the pointer over the picture, in pixels.
 let pointer = null; // over the picture, in pixels
+// Measured distance: { from, to } in meters.
 let tape = null; // { from, to } in meters
 let isTape = false;
 let size = { width: 1, height: 1, ratio: 1 };
@@ -50,10 +54,10 @@ function toScreen(x, y) {
   return [cx + a * cos - b * sin, cy + a * sin + b * cos];
 }
 
-/** From a sensor's frame to the robot's. */
+/** Transforms a point from a sensor's frame to the robot's. */
 const inFrame = ([xx, xy, yx, yy, x, y], px, py) => [xx * px + xy * py + x, yx * px + yy * py + y];
 
-/** From a sensor's frame to the screen: the six numbers of a canvas's transformation. */
+/** Returns the transform from a sensor's frame to the screen, as the six numbers of a canvas transform. */
 function onScreen([xx, xy, yx, yy, x, y]) {
   const [c, s] = [cos * view.scale, sin * view.scale];
   return [xx * s - yx * c, -xx * c - yx * s, xy * s - yy * c, -xy * c - yy * s, ...toScreen(x, y)];
@@ -69,11 +73,11 @@ let [cos, sin] = [1, 0];
 
 function updateView() {
   middle = freeArea();
-  // From the side it is the robot that turns, and not the picture.
+  // In the side view, the robot turns, and not the picture.
   [cos, sin] = isSideView() ? [1, 0] : [Math.cos(view.turn), Math.sin(view.turn)];
 }
 
-/** Returns the scanner on a mount if it is known which one that is, because this machine has only one. */
+/** Returns the scanner on the mount; null if it is unknown, because this machine has more than one scanner. */
 function tiltedSensor() {
   const local = allSensors().filter(({ status }) => status && !status.remote);
   return allSweeps().some(({ sweep }) => sweep) && local.length === 1 ? local[0] : null;
@@ -82,16 +86,16 @@ function tiltedSensor() {
 const shownSensors = () => allSensors().filter((sensor) => (shownSpace === null ? !sensor.status?.remote || !hasLocalSensor() : sensor.space === shownSpace));
 const hasLocalSensor = () => allSensors().some((sensor) => sensor.status && !sensor.status.remote);
 
-/** Returns the visible points with the pose of their frame and the function that describes one of them. */
+/** Returns all visible points with their frames, and a function that returns the text about a point. */
 const allPoints = () => (isSideView() ? sidePoints() : shownSensors().filter((one) => one.scan && poseOf(one)).map((one) =>
   ({ points: one.scan.points, pose: poseOf(one), text: (beam) => beamText(one, beam) })));
 
 const MARGIN = 1.1;
 
-/** Moves the view to the visible points, without a few outliers. Keeps a view that is about right. */
+/** Fits the visible points into the picture, without a few outliers. Keeps the view if it is about right. */
 function fit() {
   const visible = allPoints();
-  // A few hundred points are enough to find the bounds.
+  // Some hundred points define the edges of the picture as well as thousands.
   const stride = 2 * ceil(visible.reduce((sum, { points }) => sum + points.length, 0) / 1000);
   const [xs, ys] = [[], []];
   for (const { points, pose } of visible) {

@@ -1,6 +1,6 @@
-// Messages of the server, and the WebSocket that receives them.
+// Messages of the server, and the WebSocket.
 
-/** Reads little-endian CDR: values at multiples of their size, after a header of 4 bytes. */
+/** Reader of little-endian CDR: four bytes of header, then values at multiples of their size. */
 class Cdr {
   constructor(buffer, offset) {
     this.view = new DataView(buffer, offset + 4);
@@ -41,7 +41,7 @@ function laserScan(buffer, offset) {
   return { first, last, step, period, farthest, ranges: cdr.floats(), intensities: cdr.floats() };
 }
 
-/** Returns the number of points of a cloud, and functions that read a field of one of them as a float or a byte. */
+/** Returns the number of points of a cloud, and functions that read a field of a point as a float or a byte. */
 function pointCloud(buffer, offset) {
   const cdr = new Cdr(buffer, offset);
   cdr.head();
@@ -69,7 +69,7 @@ function takeScan(topic, buffer, offset) {
   const message = laserScan(buffer, offset);
   const { ranges, intensities, first, step } = message;
   const points = toPoints(ranges, first, step);
-  // The brightest intensity decays over minutes, because colors that change all the time cannot be read.
+  // The highest intensity fades over minutes, because colors that change quickly cannot be read.
   sensor.brightest = intensities.reduce((highest, one) => max(highest, one), max(1, 0.9995 * (sensor.brightest ?? 1)));
   const byShade = Array.from({ length: intensities.length ? SHADES : 0 }, () => []);
   intensities.forEach((one, i) => {
@@ -86,18 +86,18 @@ function takeForeground(topic, buffer, offset) {
   const { count, f32 } = pointCloud(buffer, offset);
   sensor.foreground = Float32Array.from({ length: 2 * count }, (_, n) => f32(n >> 1, n % 2 ? "y" : "x"));
   if (now - sensor.trail.at(-1)?.at < TRAIL_STEP_MS) return;
-  // Expire the trail here, too: a hidden page draws no frames.
+  // Frames drop old steps too, but a hidden page draws no frames.
   sensor.trail = sensor.trail.filter(({ at }) => now - at < TRAIL_MS);
   sensor.trail.push({ at: now, points: sensor.foreground });
 }
 
-/** Takes the background, which arrives in the form of a scan. */
+/** Takes the background, which is sent as a scan. */
 function takeBackground(topic, buffer, offset) {
   const { ranges, first, step } = laserScan(buffer, offset);
   sensorAt(topic).background = toPoints(ranges, first, step);
 }
 
-/** Returns x and y of each range in the frame of the sensor; NaN where there is no range. */
+/** Returns x and y of each range in the sensor's frame; NaN without a reading. */
 function toPoints(ranges, first, step) {
   const xy = new Float32Array(2 * ranges.length);
   for (let i = 0; i < ranges.length; i++) {
@@ -108,8 +108,8 @@ function toPoints(ranges, first, step) {
   return xy;
 }
 
-/** Returns the pose of a sensor as [xx, xy, yx, yy, x, y], mirrored if it is upside down. Null while the pose is unknown: then nothing of
- * the sensor is drawn. */
+/** Returns the pose of a sensor as a transform [xx, xy, yx, yy, x, y], which mirrors if the sensor is upside down. Returns null
+ * while the pose is unknown; the sensor's data is then not drawn. */
 function poseOf({ status }) {
   if (!status?.pose) return null;
   const { x_m, y_m, yaw_rad, upside_down } = status.pose;
@@ -166,18 +166,18 @@ function takeRobot(message) {
   if (hadHub && !message.hub) clearPicture();
 }
 
-/** Handlers of ROS messages and of JSON objects, by the last part of the topic. */
+/** Handlers of ROS messages, and of JSON objects, by the last word of the topic. */
 const rosHandlers = { scan: takeScan, foreground: takeForeground, background: takeBackground, cloud: takeCloud };
 const jsonHandlers = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: takeLines, tracks: takeTracks, obstacles: takeObstacles,
   marks: (update) => { marks = spheres(update); }, replay: (progress) => { player = progress; } };
 
-/** Topics that change the texts and not the picture, and continue while it is frozen. */
+/** Topics that change only the texts next to the picture. */
 const LIVE_TOPICS = ["robot", "status", "replay"];
 // The newest message of each topic, while the picture is frozen.
 let heldMessages = null;
 // Whether the frozen picture is the map of a site.
 let isHeldMap = false;
-// Clear the frozen picture at its release.
+// Whether the frozen picture must be cleared at its release.
 let clearOnRelease = false;
 
 const lastPart = (topic) => topic.slice(topic.lastIndexOf("/") + 1);
@@ -198,21 +198,22 @@ function show(topic, buffer, offset) {
   else jsonHandlers[kind]?.(JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, offset))), topic);
 }
 
-// The socket.
+// The WebSocket.
 
 let socket = null;
 let isOpen = false;
 let retryDelay = 250;
-// By channel ID, which is the ID of its subscription, too.
+// Topics by channel ID, which is also the ID of the subscription.
 const topics = new Map();
 
-/** Lines and clouds cost other programs CPU time: subscribe to them only while they are visible. */
+/** Returns whether the page needs `topic` now. Line features and clouds cost CPU time elsewhere, so the page subscribes to them
+ * only while it shows them. */
 function isNeeded(topic) {
   const kind = lastPart(topic);
   return kind === "lines" ? layers.lines : kind === "cloud" ? isSideView() : !["tilt", "tf_static"].includes(kind);
 }
 
-/** Subscribes to the topics that are needed, and to no others. A repeated subscription changes nothing. */
+/** Subscribes to the needed topics, and unsubscribes from all others. A repeated subscription changes nothing. */
 function subscribe() {
   if (!isOpen) return;
   const ids = [...topics.keys()];

@@ -1,7 +1,8 @@
-//! Draws live pictures of a hub's sensors: `watch` in a terminal, and `web` for browsers and Foxglove.
+//! Live pictures of a hub's sensors: `watch` in a terminal, and `web` for browsers and Foxglove.
 //!
-//! Both verbs follow a hub into a [`scene`], so their pictures cannot disagree. Input of strangers ends in the
-//! [`server`] of `web`, which only has channels of bytes. A test holds that it names neither a hub nor a file.
+//! Both verbs update a [`scene`] from the topics of a hub, so their pictures cannot disagree. Only the [`server`] of
+//! `web` handles untrusted input. It only has channels of bytes, and a test checks that it uses neither a hub nor a
+//! file.
 #![forbid(unsafe_code)]
 
 #[cfg(any(feature = "tui", feature = "web"))]

@@ -1,5 +1,5 @@
-//! The scene of a running hub, as `watch` and `web` follow it: which topics, how samples and notices change the scene,
-//! the join of each scan with its foreground, and the CPU time of the hub.
+//! Scene of a running hub, for `watch` and `web`: the topics to subscribe to, the effect of samples and notices, the
+//! join of each scan with its foreground, and the CPU time of the hub.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
@@ -14,8 +14,8 @@ use scanhub_verbs::names::TopicName;
 
 use crate::scene::Scene;
 
-/// Topics that every picture follows. The status is first, because it has the pose of its sensor. [`Topic::Lines`]
-/// costs the hub CPU time while it has a subscriber, so a picture only wants it while it shows lines.
+/// Topics of every picture. The status is first, because it has the pose of its sensor. [`Topic::Lines`] costs the hub
+/// CPU time while it has a subscriber, so a picture subscribes to it only while it shows lines.
 pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Status,
     Topic::Scan,
@@ -27,9 +27,9 @@ pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Tracks,
 ];
 
-/// Returns the topics in `wanted` of the named `sensors`, and the topics of every sensor. Without names, these are all
-/// sensors of a hub and all programs that publish. If a name belongs to a program, in the first live domain of
-/// `places`, the sensors are followed too.
+/// Returns the topics to follow for the named `sensors`, and those to follow for every sensor. Without names, these are
+/// the topics of all sensors of a hub and of all programs that publish. If a name belongs to a program in the first
+/// live domain of `locations`, all sensors are followed too.
 pub(crate) fn topics_to_follow(
     sensors: &[String],
     requested: &[Topic],
@@ -53,7 +53,7 @@ pub(crate) fn topics_to_follow(
     (names, of_all)
 }
 
-/// The scene of a running hub.
+/// Scene of a running hub.
 #[derive(Default)]
 pub(crate) struct LiveScene {
     pub(crate) scene: Scene,
@@ -69,14 +69,15 @@ type StampedScan = (Header, Box<Scan>);
 pub(crate) type Pair = (StampedScan, Box<Foreground>);
 
 impl LiveScene {
-    /// Adds the sensor of a link's topic that will be followed.
+    /// Adds the sensor of a topic that will be followed, if the topic belongs to a link.
     pub(crate) fn begin(&mut self, name: &TopicName) {
         if name.topic.publisher_kind() == PublisherKind::Link {
             self.scene.sensor(&name.sensor);
         }
     }
 
-    /// Takes a `sample` of `name`. Returns a scan and its foreground if the sample has completed them.
+    /// Updates the scene with a `sample` of `name`. Returns a scan and its foreground if the sample has completed the
+    /// pair.
     pub(crate) fn take(&mut self, name: &TopicName, sample: &Sample) -> Option<Pair> {
         let now_ns = clock::now_ns();
         if let Sample::Tracks(tracks) = sample {
@@ -94,7 +95,7 @@ impl LiveScene {
             Sample::Background(model) => sensor.background = Some(model.boxed()),
             Sample::Lines(lines) => sensor.lines = Some(Box::new(**lines)),
             Sample::Status(status) => sensor.take_status(status),
-            // Not part of any picture.
+            // The other topics are not part of any picture.
             _ => {}
         }
         None
@@ -128,7 +129,7 @@ impl LiveScene {
         pair
     }
 
-    /// Takes a notice about the streams of `names`.
+    /// Updates the scene after a notice about the streams of `names`.
     pub(crate) fn take_notice(&mut self, names: &[Rc<TopicName>], notice: &Notice) {
         match (notice, names) {
             (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
@@ -148,7 +149,7 @@ impl LiveScene {
         self.scene.expire(clock::now_ns())
     }
 
-    /// Drops samples whose partners do not come. Call it when all samples that have arrived were taken.
+    /// Drops samples whose partners do not arrive. Call it after all waiting samples were taken.
     pub(crate) fn expire_joins(&mut self) {
         let now_ns = clock::now_ns();
         self.joins.values_mut().for_each(|join| join.expire(now_ns));
@@ -168,7 +169,7 @@ impl LiveScene {
 #[derive(Debug, Default)]
 struct CpuUsage {
     pid: u32,
-    /// Time of each measurement, and the CPU time until then in ns.
+    /// Time of each measurement, and the total CPU time at that time in ns.
     samples: VecDeque<(Instant, u64)>,
 }
 
@@ -194,10 +195,11 @@ impl CpuUsage {
 /// Returns the CPU time of `pid` in ns, user and system, including threads that have ended. `None` if it is not
 /// accessible.
 ///
-/// The sum over the threads that live would be finer than a tick, but it falls when one of them ends.
+/// The sum over the running threads would have a finer resolution than a tick, but it decreases when a thread ends.
 fn used_ns(pid: u32) -> Option<u64> {
     let text = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // The name before is in parentheses and may contain anything. User and system time are fields 14 and 15 (proc(5)).
+    // The name of the program is in parentheses and may contain anything. User and system time are fields 14 and 15
+    // (proc(5)).
     let (_, fields) = text.rsplit_once(')')?;
     let ticks = fields.split_whitespace().skip(11).take(2).map(|field| field.parse::<u64>().ok());
     Some(ticks.sum::<Option<u64>>()? * TICK_NS)
@@ -247,7 +249,7 @@ mod tests {
         assert_eq!(cpu.measure(me, begin), None, "one measurement has no span");
         let before = used_ns(me).unwrap();
         let mut sum = 0_u64;
-        // The kernel counts in ticks, so work until it has counted one.
+        // The kernel counts in ticks, so use CPU time until it has counted one.
         while used_ns(me).unwrap() == before && begin.elapsed() < Duration::from_secs(20) {
             sum = std::hint::black_box(sum + 1);
         }

@@ -1,6 +1,6 @@
 //! Contents of every picture of the robot: points in its frame, circles with their verdict, people, and the state of
 //! each sensor with rate, age and losses. The terminal and the browser draw the same scene, so they cannot disagree.
-//! Time is an argument.
+//! Callers pass the time.
 
 mod people;
 mod pointer;
@@ -76,8 +76,8 @@ impl Scene {
         self.sensor(name)
     }
 
-    /// Takes people of the tracker `name` that arrived at `now_ns`, and the poses of the tracker's sensors. From then
-    /// on, these sensors are shown in its map, unless another tracker moves them.
+    /// Stores people of the tracker `name` that arrived at `now_ns`, and the poses of the tracker's sensors. From then
+    /// on, these sensors are shown in its map, unless another tracker sends other poses.
     pub fn take_tracks(&mut self, name: &str, tracks: &Tracks, now_ns: u64) {
         let at = self.trackers.iter().position(|(known, _)| known == name).unwrap_or_else(|| {
             self.trackers.push((name.to_owned(), People::default()));
@@ -120,7 +120,7 @@ impl Scene {
         any
     }
 
-    /// Deletes the line features, when no one looks at them any more.
+    /// Deletes the line features, because they are no longer shown.
     pub fn delete_lines(&mut self) {
         self.sensors.iter_mut().for_each(|sensor| sensor.lines = None);
     }

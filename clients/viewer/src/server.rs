@@ -1,6 +1,5 @@
-//! The web server: one page, and one WebSocket with the protocol `foxglove.sdk.v1`, so that the page and other viewers
-//! are clients of the same server. One thread serves all of them. A slow client gets the newest messages, and costs the
-//! others nothing.
+//! Web server with one page and one WebSocket of the protocol `foxglove.sdk.v1`, which the page and other viewers use
+//! alike. One thread serves all clients. A slow client gets only the newest messages, and does not delay the others.
 
 mod channels;
 mod connection;
@@ -48,12 +47,12 @@ const MAX_SLEEP: Duration = Duration::from_secs(1);
 const CONNECTION_ERRORS: [io::ErrorKind; 3] =
     [io::ErrorKind::ConnectionAborted, io::ErrorKind::ConnectionReset, io::ErrorKind::Interrupted];
 
-/// Report of the server.
+/// Event that the server reports.
 #[derive(Debug)]
 pub enum Event {
     /// A viewer connected or disconnected.
     Viewer(ViewerEvent),
-    /// Connections cannot be accepted, because the system is short of something.
+    /// Connections cannot be accepted, because the system lacks a resource.
     ResourceExhausted(io::Error),
 }
 
@@ -70,7 +69,7 @@ pub struct ViewerEvent {
     pub viewers: usize,
 }
 
-/// A server that listens on an address.
+/// Server that listens on an address.
 #[derive(Debug)]
 pub struct Server {
     listener: TcpListener,
@@ -113,7 +112,7 @@ impl Server {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] if the system does not provide random numbers, or cannot wait for sockets any more.
+    /// Returns [`Kind::Failed`] if the system does not provide random numbers, or if waiting for sockets fails.
     pub fn run(
         &self,
         channels: &ChannelStore,
@@ -159,8 +158,8 @@ impl Server {
         Ok(())
     }
 
-    /// Sleeps until something happens. Returns whether a connection can be accepted, and which connections can be read
-    /// or written.
+    /// Sleeps until a socket is ready, the server is woken, or a timeout expires. Returns whether a connection can be
+    /// accepted, and which connections can be read or written.
     fn wait(
         &self,
         channels: &ChannelStore,
@@ -191,7 +190,7 @@ impl Server {
         Ok((is_new, connections.iter().map(is_ready).collect()))
     }
 
-    /// Accepts all waiting connections. An error means that the system is short of something.
+    /// Accepts all waiting connections. An error means that the system lacks a resource.
     fn accept(&self, connections: &mut Vec<Connection>, now: Instant) -> io::Result<()> {
         loop {
             let (stream, address) = match self.listener.accept() {

@@ -1,5 +1,5 @@
-//! `scanhub watch`: the live picture in the terminal. It sleeps until there is new data, limits the frame rate for slow
-//! lines, and restores the terminal however it ends.
+//! `scanhub watch`: the live picture in the terminal. It sleeps until new data arrives, limits the frame rate on slow
+//! lines, and always restores the terminal.
 
 mod draw;
 mod map;
@@ -45,7 +45,7 @@ Examples:
 
 Keys: q quits, ? lists the other keys. NO_COLOR=1 shows signs instead of colours. From another machine: ssh -t robot scanhub watch.";
 
-/// Minimum interval between two frames, so that a scan is on the screen within 50 ms.
+/// Minimum interval between frames, so that a scan is on the screen within 50 ms.
 const FRAME_INTERVAL: Duration = Duration::from_millis(45);
 /// Bytes per second that frames may need. On a slow line there are fewer frames.
 const BYTES_PER_SECOND: f64 = 80_000.0;
@@ -53,7 +53,7 @@ const BYTES_PER_SECOND: f64 = 80_000.0;
 const MESSAGE_TIME: Duration = Duration::from_secs(4);
 
 impl WatchArgs {
-    /// Shows the picture of the sensors on the terminal, until the user quits, the limits are reached or a signal stops
+    /// Shows the picture of the sensors in the terminal, until the user quits, the limits are reached or a signal stops
     /// it.
     ///
     /// # Errors
@@ -61,7 +61,7 @@ impl WatchArgs {
     /// - [`Kind::Usage`] with `--json`, without a terminal, or if a sensor's name is not valid.
     /// - [`Kind::Failed`] if the terminal cannot be used.
     /// - [`Kind::Interrupted`] if Ctrl-C ends a bounded run.
-    /// - [`Kind::NoHub`], [`Kind::NoTopic`] and [`Kind::Timeout`] as for `echo`.
+    /// - [`Kind::NoHub`], [`Kind::NoTopic`] and [`Kind::Timeout`] in the same cases as `scanhub echo`.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         // Every signal that ends the run must restore the terminal.
         let (locations, stop) = (context.domain.locations()?, context.signals.any_stop()?);
@@ -75,11 +75,12 @@ impl WatchArgs {
         self.show("", &locations, &mut context.out, &stop)
     }
 
-    /// Does the same as [`run`](Self::run) with a `note` next to the keys, and without checking for a terminal.
+    /// Shows the picture as [`run`](Self::run) does, with a `note` next to the keys, and without checking for a
+    /// terminal.
     ///
     /// # Errors
     ///
-    /// As for [`run`](Self::run).
+    /// Returns the errors of [`run`](Self::run).
     pub fn show(
         &self,
         note: &str,
@@ -144,7 +145,7 @@ impl Watcher<'_> {
     fn handle_input(&mut self, now: Instant) -> Result<(), ExitReason> {
         while let Some(input) = self.terminal.input()? {
             self.changed = true;
-            // Keys are answered at once, but a mouse sends more than can be drawn.
+            // Respond to keys at once, but not to a mouse, which sends more events than can be drawn.
             if !matches!(input, Input::Key(Key::Point(..))) {
                 self.draw_at = now;
             }
@@ -171,7 +172,8 @@ impl Watcher<'_> {
         Ok(())
     }
 
-    /// Requests `verb` for the background of the shown sensors. If all of them are frozen, a freeze thaws them.
+    /// Sends the request `verb` for the backgrounds of the shown sensors. If all of them are frozen, a freeze becomes a
+    /// thaw.
     fn request(&mut self, verb: Verb, now: Instant) {
         let shown = self.view.shown(&self.live.scene);
         let own: Vec<_> = shown.into_iter().filter(|(_, sensor)| !is_remote(&sensor.name)).collect();
@@ -217,7 +219,7 @@ impl Watcher<'_> {
                         self.show_message(format!("{message}: {hint}"), Instant::now());
                     }
                 }
-                // The topics that are followed already stay.
+                // Keep the topics that are already followed.
                 Event::ResourceExhausted(name, Failure { message, hint, .. }) => {
                     self.show_message(format!("{name} is not shown: {message}; {hint}"), Instant::now());
                 }
@@ -254,8 +256,8 @@ impl Watcher<'_> {
     }
 }
 
-/// A request to the hub to reset, freeze or thaw backgrounds. It runs in its own thread, because a slow hub must not
-/// delay the picture. There is at most one at a time.
+/// Request to the hub to reset, freeze or thaw backgrounds. It runs in its own thread, so that a slow hub does not
+/// delay the picture. At most one runs at a time.
 #[derive(Default)]
 struct BackgroundRequest {
     running: Option<JoinHandle<RequestOutcome>>,
@@ -265,7 +267,7 @@ struct BackgroundRequest {
 struct RequestOutcome {
     /// Text for the user.
     message: String,
-    /// Sensors with their backgrounds afterwards.
+    /// Sensors with their backgrounds after the request.
     models: Vec<(String, Box<Background>)>,
 }
 

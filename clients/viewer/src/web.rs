@@ -1,5 +1,5 @@
-//! `scanhub web`: the live picture for browsers and for viewers of `foxglove.sdk.v1`. This thread follows the hub, and
-//! publishes on channels; another thread serves them.
+//! `scanhub web`: the live picture for browsers and for viewers of `foxglove.sdk.v1`. This thread subscribes to the hub
+//! and publishes on channels; another thread serves them.
 
 mod channels;
 mod feed;
@@ -83,7 +83,7 @@ const MAX_TOKEN_FILE: u64 = 4096;
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 
 impl WebArgs {
-    /// Checks what can be checked before a recording is opened.
+    /// Checks the file with the token, so that its errors are reported before a recording is opened.
     ///
     /// # Errors
     ///
@@ -99,15 +99,17 @@ impl WebArgs {
         }
     }
 
-    /// Serves the sensors of the first live domain of `places`, until the limits are reached or `stop` is set. Prints
-    /// the URLs, and each viewer that connects or disconnects, to `out`. Viewers control the `player`, if there is one.
+    /// Serves the sensors of the first live domain of `locations`, until the limits are reached or `stop` is set.
+    /// Prints the URLs, and each viewer that connects or disconnects, to `out`. Viewers control the `player`, if one is
+    /// given.
     ///
     /// # Errors
     ///
     /// - [`Kind::Input`] or [`Kind::Configuration`] if the token cannot be read from its file.
     /// - [`Kind::Usage`] if a sensor's name is not valid, or if other machines could connect without a token.
     /// - [`Kind::Failed`] if the server cannot listen or wait, or its thread ends.
-    /// - [`Kind::NoHub`], [`Kind::NoTopic`], [`Kind::Timeout`] and [`Kind::Interrupted`] as for `echo`.
+    /// - [`Kind::NoHub`], [`Kind::NoTopic`], [`Kind::Timeout`] and [`Kind::Interrupted`] in the same cases as `scanhub
+    ///   echo`.
     pub fn run(
         &self,
         locations: &[Domain],
@@ -161,8 +163,8 @@ impl WebArgs {
     }
 }
 
-/// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only, as
-/// does `localhost`.
+/// Parses `ADDRESS:PORT`, an address without a port, or a port without an address. A port alone and `localhost` mean
+/// this machine only.
 fn listen_address(text: &str) -> Result<SocketAddr, String> {
     let without_brackets = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(text);
     if let Ok(address) = text.parse() {
@@ -181,7 +183,7 @@ fn listen_address(text: &str) -> Result<SocketAddr, String> {
     Err("use localhost or an IP address, a port, or both, such as 8090, 0.0.0.0 or [::]:8090".to_owned())
 }
 
-/// Parses a token, which is part of a URL as it is.
+/// Parses a token. It must be valid in a URL without escapes.
 fn token(text: &str) -> Result<String, String> {
     let is_plain = |sign: char| sign.is_ascii_alphanumeric() || "-._~".contains(sign);
     match !text.is_empty() && text.chars().all(is_plain) {
@@ -194,7 +196,8 @@ fn token(text: &str) -> Result<String, String> {
 ///
 /// # Errors
 ///
-/// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it contains no token, or if others can use it.
+/// [`Kind::Input`] if the file cannot be read, [`Kind::Configuration`] if it contains no token, or if other users can
+/// access it.
 fn read_token(file: &Path) -> Result<String, Failure> {
     let path_text = file.display().to_string();
     let unreadable = |error: std::io::Error| regular_file::unreadable(&path_text, &error);
@@ -210,8 +213,8 @@ fn read_token(file: &Path) -> Result<String, Failure> {
     })
 }
 
-/// Returns the URLs of the page. If the server listens on all addresses, they have the name of this machine, if it is
-/// known, and then each address in `reachable` of the same version of IP.
+/// Returns the URLs of the page. If the server listens on all addresses, the first URL has the name of this machine, if
+/// it is known, and the others have the addresses in `reachable` that the server accepts.
 fn urls(address: SocketAddr, reachable: &[IpAddr], host: &str, token: Option<&str>) -> Vec<String> {
     let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
     let of = |host: &dyn fmt::Display| format!("http://{host}/{token}");
@@ -227,8 +230,8 @@ fn urls(address: SocketAddr, reachable: &[IpAddr], host: &str, token: Option<&st
     if urls.is_empty() { vec![of(&address)] } else { urls }
 }
 
-/// Returns the addresses by which other machines can reach this one. Empty if the system does not report them.
-/// Link-local IPv6 addresses are left out, because a browser needs the interface too.
+/// Returns the addresses by which other machines can reach this one. Empty if the system does not report them. Omits
+/// link-local IPv6 addresses, because a browser needs the interface too.
 fn reachable_addresses() -> Vec<IpAddr> {
     let up = getifaddrs().into_iter().flatten().filter(|entry| entry.flags.contains(InterfaceFlags::IFF_UP));
     let addresses = up.filter_map(|entry| {
@@ -244,7 +247,7 @@ fn reachable_addresses() -> Vec<IpAddr> {
     addresses.filter(|address| !is_local(address)).collect()
 }
 
-/// Ends the server's thread when it is dropped, even by a panic.
+/// Guard that ends the server's thread when it is dropped, even by a panic.
 struct StopServer<'a> {
     is_over: &'a AtomicBool,
     channels: &'a ChannelStore,
@@ -257,10 +260,10 @@ impl Drop for StopServer<'_> {
     }
 }
 
-/// Prints the lines of `web`.
+/// Printer of the lines of `web`.
 struct Reporter<'a> {
     output: Output<'a>,
-    /// Reports of the server.
+    /// Events of the server.
     events: Receiver<Event>,
     json: bool,
     /// Earliest time of the next report of a topic that is not served.
@@ -268,8 +271,8 @@ struct Reporter<'a> {
 }
 
 impl Reporter<'_> {
-    /// Prints the URLs of the page. As text, prints also what a user should know about access: with a local address the
-    /// flags for other machines, and with `--open` a warning.
+    /// Prints the URLs of the page. As text, also prints notes about access: with a local address the flags for other
+    /// machines, and with `--open` a warning.
     fn ready(&mut self, urls: &[String], args: &WebArgs) -> Result<(), ExitReason> {
         #[derive(Serialize)]
         struct ReadyJson<'a> {
@@ -306,8 +309,7 @@ impl Reporter<'_> {
         self.output.line(|line| write!(line, "for other machines: --listen 0.0.0.0{port} {token}"))
     }
 
-    /// Prints why there is no hub to serve yet, and the command that reaches another one. With JSON, viewers alone get
-    /// the reason.
+    /// Prints why there is no hub yet, and the command that serves another one. With JSON, only viewers get the reason.
     fn no_hub(&mut self, failure: &Failure) -> Result<(), ExitReason> {
         match self.json {
             true => Ok(()),
@@ -319,7 +321,7 @@ impl Reporter<'_> {
     ///
     /// # Errors
     ///
-    /// Returns [`End::ReaderClosed`] if the server has ended. Its thread has the reason.
+    /// Returns [`ExitReason::ReaderClosed`] if the server has ended. Its thread has the reason.
     fn report_events(&mut self) -> Result<(), ExitReason> {
         loop {
             match self.events.try_recv() {
@@ -359,7 +361,7 @@ impl Reporter<'_> {
         }
     }
 
-    /// Prints that a topic is not served, because the system is short of something, unless that was just printed.
+    /// Prints that a topic is not served, because the system lacks a resource, unless that was just printed.
     fn not_served(&mut self, name: &TopicName, failure: &Failure) -> Result<(), ExitReason> {
         let now = Instant::now();
         if self.next_shortage_report.is_some_and(|at| now < at) {
@@ -455,7 +457,7 @@ mod tests {
         assert_eq!(json.lines().count(), 1, "{json}");
     }
 
-    /// A player that panics on any command.
+    /// Player that panics at any command.
     struct BrokenPlayer;
 
     impl Playback for BrokenPlayer {
@@ -468,7 +470,7 @@ mod tests {
         }
     }
 
-    /// Sends each write to a channel.
+    /// Writer that sends each write to a channel.
     struct Lines(mpsc::Sender<String>);
 
     impl Write for Lines {
@@ -504,7 +506,7 @@ mod tests {
             let ready = received.recv_timeout(Duration::from_secs(60)).unwrap_or_default();
             let address = ready.lines().next().unwrap_or_default();
             let sent = send_command(address.trim().trim_start_matches("ready http://").trim_end_matches('/'));
-            // Otherwise the verb would not end.
+            // Stop the verb if the command could not be sent, because it would not end by itself.
             stop.store(sent.is_err(), Ordering::Relaxed);
             (sent, verb.join().unwrap())
         });

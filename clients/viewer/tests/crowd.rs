@@ -1,5 +1,5 @@
-//! A slow viewer and many connections cost the other viewers no message. The next message is published once all readers
-//! have the last one, so the test does not depend on the speed of the machine.
+//! Test that a slow viewer and many connections do not cost other viewers any message. The next message is published
+//! once all readers have the last one, so the test does not depend on the speed of the machine.
 
 use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,7 +14,7 @@ use serde_json::json;
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
 
-/// Far longer than a message takes.
+/// Timeout for a message, far longer than it takes.
 const TIMEOUT: Duration = Duration::from_secs(60);
 /// Number of messages; together they are longer than the buffers of the system.
 const MESSAGE_COUNT: u32 = 400;
@@ -41,7 +41,7 @@ fn connect_viewer(address: SocketAddr) -> WebSocket<TcpStream> {
     tungstenite::client(request, stream).unwrap().0
 }
 
-/// Subscription and body of the next message.
+/// Returns subscription and body of the next message.
 fn next_message(viewer: &mut WebSocket<TcpStream>) -> (u32, Vec<u8>) {
     loop {
         if let Message::Binary(frame) = viewer.read().unwrap() {
@@ -66,13 +66,13 @@ fn publish(channels: &ChannelStore, scans: ChannelPublisher<'_>, number: u32) {
     channels.wake_if_new();
 }
 
-/// The number of a message of subscription 1.
+/// Returns the number in a message of subscription 1.
 fn number((subscription, body): (u32, Vec<u8>)) -> u32 {
     assert_eq!(subscription, 1);
     u32::from_le_bytes(body[..4].try_into().unwrap())
 }
 
-/// Ends the server even if the test fails.
+/// Guard that ends the server even if the test fails.
 struct CloseOnDrop<'a>(&'a AtomicBool, &'a ChannelStore);
 
 impl Drop for CloseOnDrop<'_> {

@@ -1,4 +1,4 @@
-//! People of a tracker: position and its uncertainty, room, and positions of the last seconds. Time is an argument.
+//! People of a tracker: position and its uncertainty, room, and positions of the last seconds. Callers pass the time.
 
 use std::collections::VecDeque;
 
@@ -29,7 +29,7 @@ pub struct Person {
     tail: VecDeque<(u64, (f64, f64))>,
 }
 
-/// An ellipse around a position that contains the true one in 95 of 100 cases.
+/// Ellipse around a position that contains the true position in 95 of 100 cases.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ellipse {
     /// Half of the longer axis, in meters.
@@ -82,7 +82,7 @@ impl Person {
 }
 
 impl People {
-    /// Takes a sample that arrived at `now_ns`.
+    /// Stores the people of a sample that arrived at `now_ns`.
     pub(crate) fn take(&mut self, tracks: &Tracks, now_ns: u64) {
         let mut before = std::mem::take(&mut self.people);
         self.people = tracks
@@ -145,7 +145,7 @@ const STEP_INTERVAL_NS: u64 = 150_000_000;
 const TAIL_NS: u64 = 5_000_000_000;
 /// Maximum age of the last sample of a tracker.
 const MAX_AGE_NS: u64 = 1_000_000_000;
-/// -2 ln 0.05.
+/// 95 % quantile of chi-squared with two degrees of freedom: -2 ln 0.05.
 const CHI_SQUARED_95: f64 = 5.991_464_547_107_979;
 
 #[cfg(test)]
@@ -164,7 +164,7 @@ mod tests {
         let mut people = People::default();
         for n in 0..300 {
             let x_m = n as f32 / 100.0;
-            // The order changes, and the second one leaves.
+            // The order changes, and the second person leaves.
             let places = [(7, x_m), (3, -x_m)];
             let here = if n % 2 == 0 { &places[..] } else { &[places[1], places[0]] };
             people.take(&of(if n < 200 { here } else { &places[..1] }), n * 40_000_000);

@@ -1,12 +1,12 @@
-//! The position under the pointer: its coordinates, and the reading of the nearest point. The text is the same in every
+//! Position under the pointer: its coordinates, and the reading of the nearest point. The text is the same in every
 //! picture.
 
 use super::{Point, Sensor};
 
-/// The position under the pointer.
+/// Position under the pointer.
 #[derive(Clone, Copy, Debug)]
 pub struct PointerPosition<'a> {
-    /// Meters ahead of the robot's center; those of the point if there is a reading.
+    /// Meters ahead of the robot's center; the coordinate of the point if there is a reading.
     pub x_m: f64,
     /// Meters to the left of the robot's center.
     pub y_m: f64,
@@ -61,7 +61,7 @@ impl<'a> PointerPosition<'a> {
     }
 }
 
-/// Formats `value` with this number of decimals, and without the sign of a negative zero.
+/// Formats `value` with `digits` decimals, and without the sign of a negative zero.
 fn fixed(value: f64, digits: usize) -> String {
     let text = format!("{value:.digits$}");
     match text.strip_prefix('-') {

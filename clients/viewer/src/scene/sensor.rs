@@ -1,5 +1,5 @@
-//! One sensor of a scene: its last samples, where it is placed, the trail of its foreground, the rate and age of its
-//! scans, and why it sends none. Time is an argument.
+//! One sensor of a scene: its last samples, its placement, the trail of its foreground, the rate and age of its scans,
+//! and the reason for a silence. Callers pass the time.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -13,9 +13,9 @@ use super::{Point, point_m};
 /// The last samples of one sensor.
 #[derive(Clone, Debug, Default)]
 pub struct Sensor {
-    /// Name; that of a remote sensor begins with its machine's.
+    /// Name of the sensor; that of a remote sensor begins with the name of its machine.
     pub name: String,
-    /// The last status of its link.
+    /// Last status of the sensor's link.
     pub status: Option<Status>,
     /// Position in the picture.
     pub placement: SensorPlacement,
@@ -25,7 +25,7 @@ pub struct Sensor {
     pub foreground: Option<Box<Foreground>>,
     /// Positions of the foreground over the last moments.
     pub trail: Trail,
-    /// Line features of the last scan, while someone looks at them.
+    /// Line features of the last scan, while they are shown.
     pub lines: Option<Box<Lines>>,
     /// Reflectors, if the sensor can detect them.
     pub marks: Option<Marks>,
@@ -37,7 +37,7 @@ pub struct Sensor {
     pub meter: RateMeter,
     /// Number of scans that this program missed.
     pub missed: u64,
-    /// Highest intensity of the last minutes, in the sensor's units.
+    /// Highest intensity of the last minutes, in the sensor's units. It decreases slowly.
     brightest: f64,
     /// Time from which on the last scan is too old to be shown, in ns of CLOCK_MONOTONIC.
     old_at_ns: u64,
@@ -60,7 +60,7 @@ impl Sensor {
         self.flags & Flags::REPLAYED != 0
     }
 
-    /// Takes a scan that arrived at `now_ns`.
+    /// Stores a scan that arrived at `now_ns`.
     pub fn take_scan(&mut self, header: &Header, scan: &Scan, now_ns: u64) {
         self.scan = Some(scan.boxed());
         self.meter.scan(header, now_ns);
@@ -71,12 +71,12 @@ impl Sensor {
         self.flags = header.flags;
     }
 
-    /// Takes a foreground. It is drawn on the last scan, even if that scan comes from another telegram.
+    /// Stores a foreground. It is drawn on the last scan, even if that scan comes from another telegram.
     pub fn take_foreground(&mut self, foreground: &Foreground) {
         self.foreground = Some(foreground.boxed());
     }
 
-    /// Adds a step to the trail, from a scan and its foreground that are complete since `now_ns`.
+    /// Adds a step to the trail, from a scan and its foreground, both of which had arrived at `now_ns`.
     pub fn take_pair(&mut self, scan: &Scan, foreground: &Foreground, now_ns: u64) {
         let Some(pose) = self.placement.pose() else { return };
         self.trail.take(now_ns, || {
@@ -85,7 +85,7 @@ impl Sensor {
         });
     }
 
-    /// Takes the status of the sensor's link, which has its pose on the robot.
+    /// Stores the status of the sensor's link, which has its pose on the robot.
     pub fn take_status(&mut self, status: &Status) {
         self.status = Some(*status);
         if !self.placement.is_in_map() {
@@ -117,7 +117,7 @@ impl Sensor {
         (f64::from(intensity) / self.brightest).min(1.0).sqrt()
     }
 
-    /// Returns the state of the link for people.
+    /// Returns the state of the link as text for the user.
     pub fn state(&self) -> &'static str {
         match self.status.map(|status| status.state()) {
             None => "no status",
@@ -248,7 +248,7 @@ impl RateMeter {
     /// Counts a scan with `header` that arrived at `now_ns` of CLOCK_MONOTONIC.
     pub fn scan(&mut self, header: &Header, now_ns: u64) {
         if self.scans.back().is_some_and(|(last_ns, _)| *last_ns > header.stamp_first_ns) {
-            // Another recording, or another machine's clock.
+            // The stamps come from another recording, or from another machine's clock.
             self.scans.clear();
         }
         let is_known = header.flags & Flags::STAMP_ESTIMATED == 0;
@@ -277,7 +277,7 @@ impl RateMeter {
     pub fn age_percentiles_ms(&self) -> Option<(f64, f64)> {
         let mut ages: Vec<u64> = self.scans.iter().filter_map(|(_, age)| *age).collect();
         ages.sort_unstable();
-        // By nearest rank.
+        // The percentile is the value at the nearest rank.
         let percentile = |percent: usize| {
             let rank = (ages.len() * percent).div_ceil(100).max(1);
             ages.get(rank - 1).map(|ns| *ns as f64 / 1e6)
@@ -330,7 +330,7 @@ const MAX_SCAN_AGE_NS: u64 = 1_000_000_000;
 const STEP_INTERVAL_NS: u64 = 90_000_000;
 /// Duration of a trail.
 const TRAIL_NS: u64 = 1_600_000_000;
-/// Window of the rate: a number that changes with every scan cannot be read.
+/// Window of the rate. It is long enough that users can read the number.
 const RATE_WINDOW_NS: u64 = 2_000_000_000;
 
 #[cfg(test)]
@@ -390,7 +390,7 @@ mod tests {
         let mut meter = RateMeter::default();
         assert_eq!((meter.hz(), meter.age_ms()), (None, None));
         for n in 0..100 {
-            // Late at first; these scans leave the window.
+            // The first scans are late, and then leave the window.
             let late_ms = if n < 10 { 500 } else { 1 + n % 2 * 2 };
             meter.scan(&header(n * 40, 0), (n * 40 + 10 + late_ms) * 1_000_000);
         }

@@ -1,8 +1,8 @@
 //! Channels that viewers can subscribe to, each with a short queue of its last messages. All viewers share the queues,
 //! so memory does not depend on their number.
 //!
-//! A queue covers 250 ms: a server that was late for less still sends every message. A viewer that falls behind further
-//! skips to the newest message, so that it never shows old data.
+//! A queue covers 250 ms. A server that was delayed by less still sends every message. A viewer that falls further
+//! behind skips to the newest message, so that it never shows old data.
 
 use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -33,7 +33,7 @@ pub struct Channel {
 /// A message in the queue of a channel.
 #[derive(Clone, Debug)]
 pub(crate) struct QueuedMessage {
-    /// Number in the channel, from 1 on.
+    /// Number of the message in its channel, from 1 on.
     pub(crate) number: u64,
     /// Time of the message, in nanoseconds since 1970.
     pub(crate) wall_ns: u64,
@@ -42,7 +42,7 @@ pub(crate) struct QueuedMessage {
     pub(crate) is_kept: bool,
 }
 
-/// All channels, shared by the thread that fills them and the thread that serves the viewers.
+/// Store of all channels, shared by the thread that fills them and the thread that serves the viewers.
 #[derive(Debug)]
 pub struct ChannelStore {
     channels: Mutex<Vec<ChannelQueue>>,
@@ -67,7 +67,7 @@ impl ChannelStore {
     ///
     /// # Errors
     ///
-    /// [`Kind::ResourceExhausted`] if no descriptors are left.
+    /// Returns [`Kind::ResourceExhausted`] if no descriptors are left.
     pub fn new() -> Result<ChannelStore, Failure> {
         let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
         let wake = wake.map_err(|error| {
@@ -102,7 +102,7 @@ impl ChannelStore {
 
     /// Wakes the server.
     pub fn wake(&self) {
-        // Fails if the counter is full, and then it is readable anyway.
+        // The write fails if the counter is full, and then the descriptor is readable anyway.
         let _ = rustix::io::write(&self.wake, &1_u64.to_ne_bytes());
     }
 
@@ -111,12 +111,12 @@ impl ChannelStore {
         self.wake.as_fd()
     }
 
-    /// Makes the descriptor wait for the next call of [`wake`](Self::wake).
+    /// Resets the descriptor, so that it becomes readable only at the next call of [`wake`](Self::wake).
     pub(crate) fn clear_wake(&self) {
         let _ = rustix::io::read(&self.wake, &mut [0; 8]);
     }
 
-    /// Returns the channels from number `from` on.
+    /// Returns the channels from index `from` on.
     pub(crate) fn channels_from(&self, from: usize) -> Vec<(usize, Arc<Channel>)> {
         self.channels().iter().enumerate().skip(from).map(|(at, one)| (at, one.channel.clone())).collect()
     }
@@ -137,8 +137,8 @@ impl ChannelStore {
         }
     }
 
-    /// Returns the message after message `number`, or the newest one if that is no longer queued. `None` if there is
-    /// none.
+    /// Returns the message after message `number`, or the newest one if that message is no longer queued. `None` if
+    /// there is no newer message.
     pub(crate) fn next(&self, id: usize, number: u64) -> Option<QueuedMessage> {
         let channels = self.channels();
         let queue = &channels.get(id)?.queue;
@@ -151,7 +151,7 @@ impl ChannelStore {
     }
 }
 
-/// A channel that messages are published on.
+/// Publisher of the messages of one channel.
 #[derive(Clone, Copy, Debug)]
 pub struct ChannelPublisher<'a> {
     store: &'a ChannelStore,
@@ -160,7 +160,7 @@ pub struct ChannelPublisher<'a> {
 }
 
 impl ChannelPublisher<'_> {
-    /// Returns whether a present or a later subscriber would get a message.
+    /// Returns whether a current or a later subscriber would get a message.
     pub fn is_needed(&self) -> bool {
         let one = &self.store.channels()[self.id];
         one.channel.is_kept || one.subscribers > 0
@@ -171,7 +171,7 @@ impl ChannelPublisher<'_> {
         self.store.channels()[self.id].subscribers > 0
     }
 
-    /// Queues a message of the time `wall_ns`, in nanoseconds since 1970. [`ChannelStore::wake_if_new`] wakes the
+    /// Queues a message with the time `wall_ns`, in nanoseconds since 1970. [`ChannelStore::wake_if_new`] wakes the
     /// server once for all messages that were queued together.
     pub fn publish(&self, wall_ns: u64, payload: &[u8]) {
         let one = &mut self.store.channels()[self.id];
@@ -188,15 +188,15 @@ impl ChannelPublisher<'_> {
         self.store.is_new.store(true, Ordering::Relaxed);
     }
 
-    /// Removes the messages that are no longer true.
+    /// Removes all queued messages, because they are no longer valid.
     pub fn clear(&self) {
         self.store.channels()[self.id].queue.clear();
     }
 }
 
-/// Minimum length of a queue.
+/// Minimum number of messages in a queue.
 const MIN_LEN: usize = 2;
-/// Maximum length of a queue.
+/// Maximum number of messages in a queue.
 const MAX_LEN: usize = 16;
 /// Time that a queue covers between these lengths.
 const QUEUE_SPAN_NS: u64 = 250_000_000;

@@ -17,9 +17,9 @@ use super::viewer::{Disconnected, Viewer};
 /// Maximum number of viewers.
 pub const MAX_VIEWERS: usize = 32;
 
-/// Time in which a client must send its request.
+/// Timeout for the request of a client.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
-/// Time in which a client must accept the response, even over a slow network.
+/// Timeout for sending the response. It allows for a slow network.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// State that all connections share.
@@ -187,9 +187,9 @@ fn receive(stream: &mut TcpStream, head: &mut Vec<u8>) -> Result<Option<(Request
 
 /// Result of a request.
 enum Reply<'a> {
-    /// These bytes, and then the connection is closed.
+    /// Response with these bytes, after which the connection is closed.
     Response(Vec<u8>),
-    /// A WebSocket with this subprotocol, for the key of the handshake.
+    /// WebSocket with this subprotocol, for the key of the handshake.
     WebSocket { key: &'a str, protocol: &'static str },
 }
 

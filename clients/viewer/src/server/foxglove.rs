@@ -1,5 +1,4 @@
-//! Messages of the protocol `foxglove.sdk.v1` between server and viewers
-//! (<https://github.com/foxglove/ws-protocol>). No I/O.
+//! Messages of the protocol `foxglove.sdk.v1` between server and viewers (<https://github.com/foxglove/ws-protocol>).
 
 use serde::{Deserialize, Serialize};
 
@@ -46,14 +45,14 @@ pub(crate) fn advertise<'a>(channels: impl Iterator<Item = (usize, &'a Channel)>
     text(&serde_json::json!({ "op": "advertise", "channels": channels }))
 }
 
-/// Returns the error for a subscription to a channel that does not exist.
+/// Returns the error message for a subscription to a channel that does not exist.
 pub(crate) fn unknown_channel(at: usize) -> String {
     const ERROR: u8 = 2;
     let message = format!("Unknown channel ID: {}", at.wrapping_add(1));
     text(&serde_json::json!({ "op": "status", "level": ERROR, "message": message }))
 }
 
-/// Returns a warning that viewers show until the next one with this `id`.
+/// Returns a warning, which viewers show until the next warning with this `id`.
 pub(crate) fn warning(id: &str, message: &str) -> String {
     const WARNING: u8 = 1;
     text(&serde_json::json!({ "op": "status", "level": WARNING, "message": message, "id": id }))
@@ -77,11 +76,12 @@ pub(crate) enum ClientMessage {
     Subscribe(Vec<(u32, usize)>),
     /// End these subscriptions.
     Unsubscribe(Vec<u32>),
-    /// Control the player. The protocol's own player messages have no step and no doubling.
+    /// Control the player. The protocol's own player messages have neither single steps nor doubling of the rate.
     Player(PlayerCommand),
 }
 
-/// Parses a message from a viewer. `None` if it is invalid, or about a capability that this server does not have.
+/// Parses a message from a viewer. Returns `None` if it is invalid, or requires a capability that this server does not
+/// have.
 pub(crate) fn parse(text: &str) -> Option<ClientMessage> {
     #[derive(Deserialize)]
     #[serde(tag = "op", rename_all = "camelCase")]

@@ -1,12 +1,11 @@
-//! HTTP as far as one page and one WebSocket need it: the head of a request, the check whether it may be made, and the
-//! responses.
+//! HTTP for one page and one WebSocket: heads of requests, access control, and responses.
 
 use std::net::IpAddr;
 
 /// Maximum length of the head of a request, in bytes.
 pub(crate) const MAX_HEAD_LEN: usize = 8192;
 
-/// The head of a request.
+/// Head of a request.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Request {
     pub(crate) method: String,
@@ -14,7 +13,7 @@ pub(crate) struct Request {
     /// Text after `?` in the path.
     query: String,
     pub(crate) host: Option<String>,
-    /// The header `Origin`, which programs do not send.
+    /// Header `Origin`. Only browsers send it.
     origin: Option<String>,
     authorization: Option<String>,
     /// Key of the WebSocket handshake, if the request is one.
@@ -23,7 +22,7 @@ pub(crate) struct Request {
     protocols: String,
 }
 
-/// The bytes are not a valid head.
+/// Error: the bytes are not a valid head.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct MalformedRequest;
 

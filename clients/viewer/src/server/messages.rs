@@ -1,6 +1,5 @@
-//! Messages for viewers, made from a scene and from samples: the channels, and the bytes of their messages. Scans and
-//! poses have the types of ROS, which every viewer draws; circles and marks those of Foxglove; states and the verdict
-//! are JSON objects.
+//! Channels for viewers, and encoders of their messages from a scene and from samples. Scans and poses have the types
+//! of ROS, which every viewer draws; circles and marks those of Foxglove; states and the verdict are JSON objects.
 
 mod scene_update;
 
@@ -215,7 +214,7 @@ pub(crate) fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, mode
 /// Value for ranges that are out of range.
 const BEYOND: u16 = u16::MAX - 1;
 
-/// Encodes the poses of the sensors, as far as they are known.
+/// Encodes the known poses of the sensors.
 pub(crate) fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let pose = |sensor: &Sensor| Some((sensor.name.clone(), sensor.placement.pose()?));
     let poses: Vec<_> = scene.sensors.iter().filter_map(pose).collect();

@@ -1,4 +1,4 @@
-//! The page: markup, style and script in one response, and the policy that lets a browser run only this script. Style
+//! Web page: markup, style and script in one response, and the policy that lets a browser run only this script. Style
 //! and script are sent without comments and indentation.
 
 use data_encoding::BASE64;
@@ -6,7 +6,7 @@ use sha2::{Digest, Sha256};
 
 const MARKUP: &str = include_str!("../../page/page.html");
 const STYLE: &str = include_str!("../../page/page.css");
-/// The files of the script, in the order in which the browser reads them.
+/// Files of the script, in the order in which the browser reads them.
 const SCRIPT: &str = concat!(
     include_str!("../../page/scene.js"),
     include_str!("../../page/wire.js"),
@@ -34,7 +34,8 @@ impl Page {
         Page { body, hashes: [hash(&script), hash(&style)] }
     }
 
-    /// The policy of the page as `host`: an address of a WebSocket is not every browser's 'self'.
+    /// Returns the content security policy of the page for `host`. It names the WebSocket's address, because 'self'
+    /// does not include it in every browser.
     pub(crate) fn policy(&self, host: &str) -> String {
         let [script, style] = &self.hashes;
         format!(
@@ -78,7 +79,7 @@ mod tests {
         assert_eq!(compact(text), "if (a) {\nb(\"//c\"); // Yes.\n}\nd\n");
     }
 
-    /// The colour `name` of the light and of the dark page, as 8-bit red, green and blue.
+    /// Returns the color `name` of the light and of the dark page, as 8-bit red, green and blue.
     fn color(name: &str) -> [[u8; 3]; 2] {
         let line = STYLE.lines().find_map(|line| line.trim().strip_prefix(&format!("--{name}: light-dark(")));
         let both = line.and_then(|line| line.strip_suffix(");")).unwrap_or_else(|| panic!("no {name}"));
@@ -87,7 +88,7 @@ mod tests {
         [0, 1].map(|scheme| [0, 1, 2].map(|at| channel(parts[scheme], at)))
     }
 
-    /// Contrast of two colours by WCAG 2.2 (relative luminance of sRGB), 1 to 21.
+    /// Returns the contrast of two colors by WCAG 2.2 (relative luminance of sRGB), 1 to 21.
     fn contrast(a: [u8; 3], b: [u8; 3]) -> f64 {
         let linear = |channel: u8| {
             let value = f64::from(channel) / 255.0;
@@ -99,8 +100,8 @@ mod tests {
         a.max(b) / a.min(b)
     }
 
-    /// WCAG 2.2, 1.4.3 and 1.4.11: text has 4.5 to 1, what is drawn and has a meaning 3 to 1, on the light page and the
-    /// dark.
+    /// WCAG 2.2, 1.4.3 and 1.4.11: text needs a contrast of 4.5 to 1, and figures with a meaning need 3 to 1, on the
+    /// light and the dark page.
     #[test]
     fn colors_have_the_contrast_that_wcag_requires() {
         assert!((contrast([0; 3], [255; 3]) - 21.0).abs() < 1e-9);

@@ -1,11 +1,11 @@
-//! The player of a recording, as viewers have it: their commands, and its progress as a message.
+//! Control of a player by viewers: their commands, and its progress as a message.
 
 use serde::{Deserialize, Serialize};
 
 use super::channels::Channel;
 use super::messages::{json_bytes, json_channel};
 
-/// A command of a viewer.
+/// Command of a viewer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PlayerCommand {
@@ -45,7 +45,7 @@ impl Progress {
     }
 }
 
-/// A player for the viewers of one server.
+/// Player that the viewers of one server control.
 pub trait Playback: Sync {
     /// Executes a command of a viewer.
     fn command(&self, command: PlayerCommand);

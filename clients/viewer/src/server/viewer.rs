@@ -1,5 +1,5 @@
-//! One viewer at its WebSocket: its subscriptions, and the message that it gets next. Few bytes are in flight, so
-//! memory is bounded, and a viewer that was slow continues with the newest messages.
+//! One viewer: its WebSocket, its subscriptions, and the choice of its next message. Few bytes are in flight, so memory
+//! is bounded, and a viewer that was slow continues with the newest messages.
 
 use std::io;
 use std::net::TcpStream;
@@ -34,9 +34,9 @@ pub(crate) struct Viewer {
     advertised: usize,
     /// Subscription that is served next.
     next: usize,
-    /// Time since when the socket does not accept all bytes.
+    /// Time from which on the socket has not accepted all bytes; `None` if it has.
     pending: Option<Instant>,
-    /// Whether the socket was full since this viewer last had all messages.
+    /// Whether the socket was full at any time since this viewer last had all messages.
     was_full: bool,
     replaced: ReplacedMessages,
     reported: ReplacedMessages,
@@ -50,20 +50,20 @@ pub(crate) struct Viewer {
 struct Subscription {
     id: u32,
     channel: usize,
-    /// Number of the last message that was sent, or that was older than the subscription.
+    /// Number of the last message that was sent, or of the last one before the subscription.
     number: u64,
 }
 
-/// Messages that were replaced by newer ones before they were sent.
+/// Counts of messages that were replaced by newer ones before they were sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct ReplacedMessages {
-    /// Messages that the viewer, or the network to it, was too slow for.
+    /// Number of messages that were replaced because the viewer or its network was too slow.
     by_viewer: u64,
-    /// Messages that this process was too late for.
+    /// Number of messages that were replaced because this process was too late.
     by_server: u64,
 }
 
-/// The viewer has disconnected, or has to be disconnected.
+/// Error: the viewer has disconnected, or must be disconnected.
 #[derive(Debug)]
 pub(crate) struct Disconnected;
 

@@ -1,5 +1,5 @@
-//! Draws a scene: the verdict as text, the picture or the counters, a line per sensor, and the keys. The same scene and
-//! view give the same cells.
+//! Screen of a scene: the verdict as text, the picture or the counters, a line per sensor, and the keys. The same scene
+//! and view always give the same cells.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -132,7 +132,7 @@ fn listed<'a>(scene: &'a Scene, view: &View, rows: u16) -> impl Iterator<Item = 
     scene.sensors.iter().enumerate().skip(first)
 }
 
-/// Returns the line of a sensor, the most important first. A part that does not fit is omitted completely.
+/// Returns the line of a sensor, with the most important parts first. A part that does not fit is omitted completely.
 fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static> {
     let dash = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
     let hz = dash(sensor.meter.hz().map(|hz| format!("{hz:.1}")));
@@ -200,7 +200,7 @@ fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
     lines
 }
 
-/// Returns the end of a name that fits in a column. It distinguishes the sensors of one machine.
+/// Returns the end of a name that fits in a column. The end distinguishes the sensors of one machine.
 fn short_name(name: &str) -> String {
     let excess = name.chars().count().saturating_sub(COLUMN_WIDTH - 1);
     name.chars().skip(excess).collect()
@@ -230,7 +230,7 @@ fn pointer_text(scene: &Scene, view: &View, room: usize) -> String {
     text
 }
 
-/// Appends `parts` with `between` before each but the first, until one does not fit in `room` columns.
+/// Appends `parts`, separated by `between`, until one does not fit in `room` columns.
 fn append_fitting(text: &mut String, parts: Vec<String>, between: &str, room: usize) {
     for part in parts {
         let between = if text.is_empty() { "" } else { between };
@@ -290,7 +290,7 @@ const NAME_WIDTH: usize = 32;
 const COLUMN_WIDTH: usize = 14;
 /// Maximum distance of a point from the pointer that is read, in dots.
 const MAX_POINTER_DISTANCE_DOTS: f64 = 6.0;
-/// Columns from which on the line of a sensor has more fields.
+/// Minimum number of columns for the line of a sensor with all fields.
 const MIN_WIDE_COLUMNS: u16 = 100;
 const LENGTHS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
 /// Maximum length of the scale bar, in cells.

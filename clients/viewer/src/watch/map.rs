@@ -1,5 +1,5 @@
-//! The robot from above: points and figures of its sensors as Braille dots, with ahead up. Without colors, each color
-//! is replaced by another sign.
+//! Map of the robot from above: points and figures of its sensors as Braille dots, with ahead up. Without colors, each
+//! color is replaced by another sign.
 
 use ratatui::style::Color;
 use ratatui::symbols::Marker;
@@ -45,7 +45,7 @@ pub(super) fn color(verdict: Verdict) -> Color {
 /// Points in the coordinates of the canvas: to the right, and up.
 type Dots = Vec<(f64, f64)>;
 
-/// Ends of both axes, and the cells between them.
+/// Ends of both axes, and the number of cells between them.
 struct Grid {
     x: [f64; 2],
     y: [f64; 2],
@@ -71,7 +71,7 @@ impl Grid {
     }
 }
 
-/// Everything that is drawn, in canvas coordinates.
+/// Everything that is drawn, in coordinates of the canvas.
 #[derive(Default)]
 struct Layers {
     colors: bool,
@@ -88,7 +88,7 @@ struct Layers {
     axes: Dots,
     pointer: Option<(f64, f64)>,
     marks: Dots,
-    /// Positions of sensors, and their numbers from 1.
+    /// Positions of sensors, and their numbers from 1 on.
     sensors: Vec<(f64, f64, String)>,
     /// Positions of people over the last seconds.
     tails: Dots,
@@ -262,7 +262,7 @@ fn dots_of(line: &scanhub_schema::Line, dot_m: f64) -> Dots {
     (0..=steps as u32).map(at).map(to_canvas).collect()
 }
 
-/// Returns `circle` as a dotted line, from the top on.
+/// Returns `circle` as a dotted line that starts at the top.
 fn dotted(circle: &crate::scene::Circle, dot_m: f64) -> Circle {
     let radius = circle.radius_m;
     let points = (radius / dot_m * std::f64::consts::TAU / CIRCLE_DOTS).clamp(8.0, 360.0) as u32;
@@ -284,13 +284,13 @@ fn grid_step_m(dot_m: f64) -> f64 {
 /// Colors of points without an intensity, and from the darkest to the brightest.
 const SHADES: [Color; 5] = [Color::Reset, Color::Blue, Color::Cyan, Color::Green, Color::Yellow];
 const STEPS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
-/// Minimum distance between two crossings.
+/// Minimum distance between two crossings of the grid, in dots.
 const GRID_DOTS: f64 = 18.0;
-/// Distance between two dots of an axis.
+/// Distance between two drawn points of an axis, in dots.
 const AXIS_DOTS: f64 = 4.0;
-/// Distance between two dots of a circle.
+/// Distance between two drawn points of a circle, in dots.
 const CIRCLE_DOTS: f64 = 3.0;
-/// Minimum radius of a circle with a label.
+/// Minimum radius of a circle with a label, in dots.
 const LABEL_DOTS: f64 = 7.0;
 
 #[cfg(all(test, feature = "web"))]

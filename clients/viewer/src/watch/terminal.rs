@@ -1,5 +1,5 @@
-//! The terminal of the picture: it is taken over at the start, and restored however the program ends. A frame is one
-//! write. Keys and the mouse are read without waiting.
+//! Terminal of the picture. It is switched to raw mode and the alternate screen at the start, and always restored at
+//! the end. A frame is one write. Keys and the mouse are read without waiting.
 
 use std::cell::Cell;
 use std::collections::VecDeque;
@@ -24,15 +24,15 @@ use rustix::termios::tcgetwinsize;
 use scanhub_schema::{Failure, Kind};
 use scanhub_verbs::output::ExitReason;
 
-/// The terminal while the picture is shown.
+/// Terminal while the picture is shown. Dropping it restores the terminal.
 pub(super) struct Terminal<'a> {
     screen: ratatui::Terminal<CrosstermBackend<FrameBuffer<'a>>>,
-    /// Bytes of the last frame.
+    /// Number of bytes of the last frame.
     written: Rc<Cell<usize>>,
     keys: Keys,
-    /// Last known columns and rows.
+    /// Last known number of columns and rows.
     size: Option<(u16, u16)>,
-    /// The panic hook before.
+    /// Panic hook that was set before.
     hook: Arc<Hook>,
     /// Whether a panic has already restored the terminal.
     is_restored: Arc<AtomicBool>,
@@ -44,7 +44,7 @@ type Hook = dyn Fn(&PanicHookInfo<'_>) + Sync + Send;
 pub(super) enum Input {
     /// A key, or the mouse.
     Key(Key),
-    /// The terminal has another size.
+    /// The size of the terminal has changed.
     Resized,
 }
 
@@ -72,7 +72,7 @@ impl<'a> Terminal<'a> {
         })?;
         let hook: Arc<Hook> = Arc::from(take_hook());
         let (before, restoring) = (hook.clone(), is_restored.clone());
-        // The message of a panic would disappear with the alternate screen.
+        // Restore the terminal first, because the message of a panic would disappear with the alternate screen.
         set_hook(Box::new(move |info| {
             if !restoring.swap(true, Ordering::Relaxed) {
                 let _ = execute!(io::stdout(), Print(MOUSE_OFF), LeaveAlternateScreen, Show);
@@ -124,8 +124,7 @@ fn size() -> Option<(u16, u16)> {
     tcgetwinsize(io::stdout()).ok().map(|size| (size.ws_col, size.ws_row))
 }
 
-/// Returns whether the terminal was closed. Not every program gets a signal then, and one that draws nothing has no
-/// failed write.
+/// Returns whether the terminal was closed. A program may get no signal then, and without a frame no write fails.
 fn hung_up() -> bool {
     let stdout = io::stdout();
     let mut ends = [PollFd::new(&stdout, PollFlags::empty())];
@@ -133,7 +132,7 @@ fn hung_up() -> bool {
     is_polled && ends[0].revents().intersects(PollFlags::HUP | PollFlags::ERR)
 }
 
-/// Converts the error of a closed terminal to [`End::ReaderClosed`].
+/// Converts the error of a closed terminal to [`ExitReason::ReaderClosed`].
 fn closed(error: io::Error) -> ExitReason {
     const EIO: i32 = 5;
     if error.raw_os_error() == Some(EIO) || error.kind() == ErrorKind::UnexpectedEof {
@@ -142,7 +141,7 @@ fn closed(error: io::Error) -> ExitReason {
     ExitReason::from(error)
 }
 
-/// Collects a frame, which is written at once.
+/// Buffer of a frame, which is written at once.
 struct FrameBuffer<'a> {
     out: &'a mut dyn Write,
     bytes: Vec<u8>,
@@ -168,7 +167,7 @@ impl Write for FrameBuffer<'_> {
 /// A key or an action of the mouse that has a meaning here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Key {
-    /// A printable ASCII character, even with Alt.
+    /// Printable ASCII character, with or without Alt.
     Sign(char),
     Tab,
     Escape,
@@ -189,11 +188,11 @@ pub(super) enum Key {
 /// Makes the terminal report where mouse buttons are pressed and dragged (xterm's mode 1002), without a maximum column
 /// (1006).
 const MOUSE_ON: &str = "\x1b[?1002h\x1b[?1006h";
-/// Ends these reports.
+/// Ends the reports of the mouse.
 const MOUSE_OFF: &str = "\x1b[?1006l\x1b[?1002l";
 
-/// Reads keys from stdin if it is a terminal, otherwise from the terminal of the process. Distinguishes a closed
-/// terminal from one where no key is pressed.
+/// Reader of keys from stdin if it is a terminal, otherwise from the terminal of the process. It distinguishes a closed
+/// terminal from one at which no key is pressed.
 struct Keys {
     terminal: File,
     pending: VecDeque<u8>,
@@ -235,7 +234,7 @@ impl Keys {
     }
 }
 
-/// Takes the first key from `typed`, and skips bytes without a meaning (ECMA-48, xterm). An incomplete sequence stays,
+/// Takes the first key from `typed`, and skips bytes without a meaning (ECMA-48, xterm). Leaves an incomplete sequence,
 /// because its end may arrive with the next bytes.
 fn next(typed: &mut VecDeque<u8>) -> Option<Key> {
     while let Some(&byte) = typed.front() {
@@ -253,13 +252,13 @@ fn next(typed: &mut VecDeque<u8>) -> Option<Key> {
                     let sequence: Vec<u8> = typed.drain(..length.min(typed.len())).collect();
                     typed.front().and_then(|last| parse_sequence(&sequence[2..], *last))
                 }
-                // The next character was typed with Alt.
+                // The character after it was typed with Alt, so skip only the escape.
                 Some(_) => None,
             },
             b' '..=b'~' => Some(Key::Sign(byte.into())),
             _ => None,
         };
-        // The last byte of a sequence, or a key of one byte.
+        // Remove the last byte of a sequence, or a key of one byte.
         typed.pop_front();
         if key.is_some() {
             return key;

@@ -1,6 +1,6 @@
-//! Whole screens of a simulated scene: they are compared cell by cell with the files in `tests/watch`, and with the
-//! picture in the documents. To accept a change, `SCANHUB_GOLDEN=write cargo test -p scanhub-viewer watch::tests`
-//! writes the files again.
+//! Tests of complete screens of a simulated scene. They are compared cell by cell with the files in `tests/watch`, and
+//! with the picture in the documents. To accept a change, `SCANHUB_GOLDEN=write cargo test -p scanhub-viewer
+//! watch::tests` writes the files again.
 
 use std::f64::consts::PI;
 use std::path::Path;
@@ -21,7 +21,7 @@ use crate::scene::{Scene, Sensor};
 
 /// Walls of the room, in meters ahead and to the left of the robot.
 const WALLS: [f64; 4] = [4.2, -3.4, 3.0, -3.6];
-/// Two legs ahead of the robot, and one behind it.
+/// Legs of people as x, y and radius in meters: two legs ahead of the robot, and one at its rear.
 const LEGS: [(f64, f64, f64); 3] = [(1.9, 0.9, 0.12), (2.1, 0.6, 0.12), (-0.75, -0.25, 0.1)];
 
 /// Returns the length of the beam from `pose` along `direction` to a leg or a wall.
@@ -98,7 +98,8 @@ fn zones(verdict: Verdict, nearest_mm: u32, violated: [u8; 2]) -> Zones {
     zones
 }
 
-/// Returns a scene with two sensors, a person ahead, and one behind who is near enough to slow the robot down.
+/// Returns a scene with two sensors, a person ahead, and a person at the rear who is near enough to slow the robot
+/// down.
 pub(super) fn scene() -> Scene {
     let mut scene =
         Scene { hub_is_running: true, hub_pid: 4711, hub_percent: Some(1.234), ..Scene::default() };
@@ -193,8 +194,8 @@ fn frozen_picture_has_the_current_verdict() {
     );
 }
 
-/// For light and dark terminals: no cell is black or white, or has a background color. Without colors, there are other
-/// signs.
+/// The picture suits light and dark terminals: no cell is black or white, or has a background color. Without colors,
+/// other signs replace them.
 #[test]
 fn uses_the_colors_of_the_terminal() {
     let scene = scene();
@@ -225,7 +226,7 @@ fn uses_the_colors_of_the_terminal() {
         assert!(may.contains(&color), "{color}");
     }
     let (colors, plain) = (text(&colors), text(&plain));
-    // The keys have an o and dots.
+    // Skip the line of keys, which has an o and dots too.
     let count =
         |text: &str, sign| text.lines().skip(1).take(35).flat_map(str::chars).filter(|c| *c == sign).count();
     assert!(count(&plain, 'o') > 3 && count(&colors, 'o') == 0);

@@ -1,4 +1,4 @@
-//! The part of a scene that is shown, its scale and its layers, and how keys and the mouse change them.
+//! View of a scene: the visible part, its scale and its layers, and their change by keys and the mouse.
 
 use ratatui::layout::{Position, Rect};
 
@@ -27,7 +27,7 @@ pub(crate) struct View {
     pub(crate) grid: bool,
     /// Whether the color of a point shows its intensity.
     pub(crate) intensity: bool,
-    /// Line features and corners. The hub computes them only while they have a subscriber.
+    /// Whether line features and corners are shown. The hub computes them only while they have a subscriber.
     pub(crate) lines: bool,
     /// Position of the pointer, in meters in the robot's frame; arrows move it.
     pub(crate) pointer_m: Option<(f64, f64)>,
@@ -58,7 +58,7 @@ pub(crate) enum ViewCommand {
 }
 
 impl View {
-    /// Shows all layers of the whole robot.
+    /// Creates a view of the whole robot with all layers except line features.
     pub(crate) fn new(colors: bool) -> View {
         View {
             only_sensor: None,
@@ -171,7 +171,7 @@ impl View {
         if !self.map.contains(Position { x: column, y: row }) {
             return None;
         }
-        // In dots from the middle of the picture.
+        // The distance from the middle of the picture is in dots.
         let from_middle =
             |cell: u16, cells: u16, dots: f64| (f64::from(cell) + 0.5 - f64::from(cells) / 2.0) * dots;
         let right = from_middle(column - self.map.x, self.map.width, DOTS_PER_CELL.0);
@@ -238,16 +238,16 @@ const STEP_DOTS: f64 = 8.0;
 const INITIAL_DOT_M: f64 = 0.05;
 const MIN_DOT_M: f64 = 0.001;
 const MAX_DOT_M: f64 = 1.0;
-/// Maximum distance of the center. It is more than the range of a sensor (82 m) beyond its maximum distance from the
-/// robot (100 m).
+/// Maximum distance of the center from the robot. It exceeds the range of a sensor (82 m) plus its maximum distance
+/// from the robot (100 m).
 const MAX_CENTER_M: f64 = 200.0;
 /// Minimum distance around the robot that is shown.
 const MIN_REACH_M: f64 = 0.5;
 /// Size of the picture relative to the points.
 const MARGIN_FACTOR: f64 = 1.1;
-/// The scale changes if the points need less than this share of the picture.
+/// Minimum share of the picture that the points must fill. With less, the scale changes.
 const MIN_FILL_SHARE: f64 = 0.6;
-/// Points per point that may lie outside at either end.
+/// Divisor of the number of points that gives the number of outliers at either end.
 const OUTLIER_DIVISOR: usize = 50;
 
 #[cfg(test)]
@@ -349,7 +349,7 @@ mod tests {
         view.map = Rect::new(0, 1, 60, 17);
         view.fit(&scene);
         let fitted = view.clone();
-        // Half a circle of four meters ahead, and half a meter behind.
+        // The points are half a circle with a radius of four meters ahead, and half a meter at the rear is added.
         assert!((fitted.center_m.0 - 1.75).abs() < 0.1 && fitted.center_m.1.abs() < 0.01, "{fitted:?}");
         assert!((8.0..10.0).contains(&(fitted.dot_m * 120.0)), "{fitted:?}");
         press(&mut view, &scene, "+l");

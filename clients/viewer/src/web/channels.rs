@@ -1,4 +1,4 @@
-//! Channels of sensors, mounts, and programs such as `tilt`: each is opened when its topics are followed, and publishes
+//! Channels of sensors, mounts, and programs such as `tilt`. Each is opened when its topics are followed, and publishes
 //! samples as messages.
 
 use std::collections::BTreeMap;
@@ -53,7 +53,7 @@ impl<'a> SensorChannels<'a> {
         }
     }
 
-    /// Publishes the background as it is learned until now.
+    /// Publishes the current background.
     pub(super) fn publish_background(&mut self, wall_ns: u64, model: &Background) {
         self.message.clear();
         messages::background(&mut self.message, &self.sensor, wall_ns, model);
@@ -72,8 +72,8 @@ impl<'a> SensorChannels<'a> {
     }
 }
 
-/// Channels of mounts, and of programs that publish sweeps. Angles and points are only followed while a viewer
-/// subscribes to them.
+/// Channels of mounts, and of programs that publish sweeps. Their topics with angles and points are only subscribed to
+/// while a viewer needs them.
 pub(super) struct TiltChannels<'a> {
     channels: &'a ChannelStore,
     mounts: BTreeMap<String, ChannelPublisher<'a>>,
@@ -118,7 +118,8 @@ impl<'a> TiltChannels<'a> {
         self.sweeps.entry(name.to_owned()).or_insert_with(open)
     }
 
-    /// Returns whether a viewer subscribes to `topic` of any mount or program. Other topics are always wanted.
+    /// Returns whether a viewer subscribes to `topic` of any mount or program. Returns true for topics other than
+    /// angles and points.
     pub(super) fn needs(&self, topic: Topic) -> bool {
         match topic {
             Topic::Tilt => self.mounts.values().any(ChannelPublisher::is_subscribed),

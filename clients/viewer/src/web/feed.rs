@@ -1,4 +1,4 @@
-//! The feed of the server: follows a hub into a scene, and publishes the scene and its samples on the channels.
+//! Feed of the server: updates a scene from the topics of a hub, and publishes the scene and the samples on channels.
 
 use std::collections::BTreeMap;
 use std::rc::Rc;
@@ -19,19 +19,19 @@ use crate::scene::{Circle, Problem, Scene, Sensor, SensorPlacement, circles, ver
 use crate::server::player::{self, Playback, Progress};
 use crate::server::{ChannelPublisher, ChannelStore, messages};
 
-/// Interval at which the verdict is repeated. The page takes it as unknown after half a second, and a distance that
-/// changes with every scan cannot be read. A change is published at once.
+/// Interval at which the verdict and the distance are repeated. The page takes the verdict as unknown after half a
+/// second, and users cannot read a distance that changes with every scan. A changed verdict is published at once.
 const ROBOT_INTERVAL: Duration = Duration::from_millis(90);
-/// Minimum interval between two messages of the player whose position alone has changed.
+/// Minimum interval between messages of the player if only its position has changed.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(50);
-/// Minimum interval between two messages of circles, marks or line features. A message has those of all sensors.
+/// Minimum interval between messages of circles, marks or line features. A message has those of all sensors.
 const OVERLAY_INTERVAL: Duration = Duration::from_millis(50);
-/// Interval at which unchanged circles are repeated: viewers delete them after a second.
+/// Interval at which unchanged circles are repeated, because viewers delete them after a second.
 const CIRCLES_INTERVAL: Duration = Duration::from_millis(300);
-/// Interval between two messages with the state of a sensor.
+/// Interval between messages with the state of a sensor.
 const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Follows a hub, and publishes for the viewers.
+/// Feed of the channels from a hub.
 pub(super) struct Feed<'a> {
     channels: &'a ChannelStore,
     /// Locations where the domain may be.
@@ -100,7 +100,7 @@ impl<'a> Feed<'a> {
         self.overlays.set_new();
     }
 
-    /// Publishes whatever is due, apart from samples.
+    /// Publishes all messages that are due, apart from samples.
     fn publish(&mut self, now: Instant) {
         let wall_ns = clock::wall_ns();
         self.overlays.publish(&self.live.scene, now, wall_ns);
@@ -118,7 +118,7 @@ impl<'a> Feed<'a> {
 }
 
 impl Feed<'_> {
-    /// Takes what arrives until the run ends.
+    /// Handles samples and events until the run ends.
     pub(super) fn follow(&mut self, following: &mut TopicRun<'_>) -> Result<(), ExitReason> {
         loop {
             following.set_subscribed(Topic::Lines, self.overlays.lines.channel.is_subscribed());
@@ -157,7 +157,7 @@ impl Feed<'_> {
         if let PublisherKind::Mount | PublisherKind::Tilted = name.topic.publisher_kind() {
             return self.tilted.publish(name, sample);
         }
-        // Only these topics have poses.
+        // Only these topics contain poses.
         let has_poses = matches!(sample, Sample::Tracks(_) | Sample::Status(_));
         let before = if has_poses { placements(&self.live.scene) } else { Vec::new() };
         let pair = self.live.take(name, sample);
@@ -275,7 +275,7 @@ impl<'a> SensorFeed<'a> {
     }
 }
 
-/// A channel with figures of all sensors.
+/// Channel with figures of all sensors.
 struct Overlay<'a> {
     channel: ChannelPublisher<'a>,
     /// Whether a sample has arrived since the last message.
@@ -285,8 +285,8 @@ struct Overlay<'a> {
 }
 
 impl Overlay<'_> {
-    /// Returns whether a message is due. If so, starts the next interval. No message is due without a subscriber. The
-    /// figures change with every scan, so a later subscriber misses nothing.
+    /// Returns whether a message is due. If so, starts the next interval. Without a subscriber, no message is due: the
+    /// figures change with every scan, so a later subscriber does not need old ones.
     fn take_due(&mut self, now: Instant) -> bool {
         let is_due = self.is_new && now >= self.publish_at && self.channel.is_subscribed();
         if is_due {

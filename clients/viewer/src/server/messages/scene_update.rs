@@ -1,5 +1,6 @@
-//! Circles, marks, line features, people and obstacles as `foxglove.SceneUpdate` in JSON. Each message has all entities
-//! of its channel. Viewers keep entities that are missing in the next message, so an entity has a lifetime of a second.
+//! Encoders of circles, marks, line features, people and obstacles as `foxglove.SceneUpdate` in JSON. Each message has
+//! all entities of its channel. Viewers keep entities that are missing in the next message, so each entity has a
+//! lifetime of one second.
 
 use scanhub_ros::BASE_FRAME;
 use scanhub_schema::{Header, Obstacle, Obstacles, Verdict};

@@ -1,5 +1,5 @@
-//! Compares the picture in the terminal with the messages for a browser: both have the same points. The messages are
-//! read here as the page reads them.
+//! Comparison of the picture in the terminal with the messages for a browser: both must have the same points. The tests
+//! read the messages as the page does.
 
 use crate::server::messages;
 use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value, read};
@@ -11,7 +11,8 @@ use super::super::view::View;
 use super::{Dots, Layers};
 use crate::scene::{Scene, Sensor};
 
-/// Two sensors in a room, and one upside down between them, which sees something in half of its beams; one found lines.
+/// Returns a scene with two sensors in a room. A third sensor between them is upside down, and has readings in half of
+/// its beams. One sensor has line features.
 fn scene() -> Scene {
     let mut scene = pictures::scene();
     let side = scene.sensor("side");
@@ -24,7 +25,7 @@ fn scene() -> Scene {
     lines.line_array[1] = Line { x1_m: 2.0, y1_m: 1.5, x2_m: -0.5, y2_m: 1.5, ..Line::default() };
     lines.corner_array[0] = Corner { x_m: 2.0, y_m: 1.5, ..Corner::default() };
     scene.sensor("front").lines = Some(Box::new(lines));
-    // One who walks and is seen, one who is not seen, and one who is perhaps nobody.
+    // Add a person who walks and is seen, one who is not seen, and a tentative track.
     let mut tracks = Tracks::default();
     for (id, state) in [(7, 1), (8, 2), (9, 0)] {
         tracks.push(Track { id, state, x_m: 1.0, y_m: id as f32 - 7.5, ..Track::default() });
@@ -36,7 +37,7 @@ fn scene() -> Scene {
     scene
 }
 
-/// As the page turns what `sensor` is sent in: by the pose that is sent, too.
+/// Transform from the frame of a sensor to the robot's, from the pose in the message, as the page uses it.
 struct SensorTransform(Vec<f64>);
 
 impl SensorTransform {
@@ -48,7 +49,7 @@ impl SensorTransform {
         SensorTransform(keys.iter().map(|key| one.number(&format!("transform.{key}")).unwrap()).collect())
     }
 
-    /// Ahead and to the left, in the robot's frame.
+    /// Transforms a point to meters ahead and to the left, in the robot's frame.
     fn point(&self, (x, y): (f64, f64)) -> (f64, f64) {
         let [dx, dy, qx, qy, qz, qw] = self.0[..] else { panic!("six numbers") };
         let ahead = (1.0 - 2.0 * (qy * qy + qz * qz)) * x + 2.0 * (qx * qy - qz * qw) * y;
@@ -57,7 +58,7 @@ impl SensorTransform {
     }
 }
 
-/// The points of a LaserScan.
+/// Returns the points of a LaserScan.
 fn points(message: &[u8], placed: &SensorTransform) -> Vec<(f64, f64)> {
     let scan = read(&LASER_SCAN, message).unwrap();
     let (first, step) = (scan.number("angle_min").unwrap(), scan.number("angle_increment").unwrap());
@@ -91,7 +92,7 @@ fn primitives<'a>(entities: &'a [Json], kind: &str) -> Vec<&'a Json> {
     entities.iter().flat_map(|entity| entity[kind].as_array().unwrap()).collect()
 }
 
-/// Whether `sent`, in the robot's frame, is what is `drawn`: to the right and up.
+/// Asserts that the points `sent`, in the robot's frame, are those `drawn`, to the right and up.
 fn assert_same_points(kind: &str, sent: Vec<(f64, f64)>, drawn: &Dots) {
     assert!(
         !sent.is_empty() && sent.len() == drawn.len(),
@@ -129,7 +130,7 @@ fn browser_and_terminal_draw_the_same_scene() {
             models.extend(points(&message, &placed));
         }
     }
-    // What stands before the background is drawn once in the terminal, and over the scan in the browser.
+    // The terminal draws the foreground in place of points of the scan, and the browser draws it on top.
     let drawn: Dots = layers.walls.iter().flatten().chain(&layers.foreground).copied().collect();
     assert_same_points("scans", scans, &drawn);
     assert_same_points("foreground", found, &layers.foreground);
@@ -167,7 +168,7 @@ fn browser_and_terminal_draw_the_same_scene() {
         let is_seen = at["color"]["a"] == 1.0;
         let text = word["text"].as_str().unwrap();
         assert_eq!(*number, if is_seen { text.to_owned() } else { format!("({text})") });
-        // The last of a tail is where the person is.
+        // The last position of a tail is that of the person.
         let line = positions(entity["lines"][0]["points"].as_array().unwrap().iter());
         assert_eq!(line.last(), Some(&position));
         tails.extend(line.into_iter().rev().skip(1));
@@ -191,7 +192,7 @@ fn browser_and_terminal_draw_the_same_scene() {
     let drawn: Vec<_> =
         layers.circles.iter().map(|circle| circle.label.as_ref().unwrap().2.clone()).collect();
     assert_eq!((sent.len(), sent), (2, drawn));
-    // The beam that is told with a circle ends at a point that is drawn.
+    // The beam in the message of circles ends at a drawn point.
     let beams = primitives(&zones, "lines");
     let ends = positions(beams.iter().map(|one| &one["points"][1]));
     assert_eq!(ends.len(), 1);
