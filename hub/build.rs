@@ -1,4 +1,4 @@
-//! Links the program with the functions that run for each telegram next to each other, so that they fill fewer pages.
+//! Build script that links the functions that run for each telegram next to each other, so that they fill fewer pages.
 
 use std::env;
 

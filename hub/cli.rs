@@ -1,4 +1,4 @@
-//! The command line: the table of the verbs, and the options that all of them have.
+//! Command line: the table of the verbs, and the options of all verbs.
 
 mod bridge;
 mod config;
@@ -93,11 +93,11 @@ pub(crate) struct GlobalOptions {
     pub(crate) json: bool,
 }
 
-/// Makes an enum of all verbs from the table below. A verb is run by its function `run`, which takes the whole [`Context`], or by
-/// the expression after the arrow.
+/// Defines the enum of all verbs from the table below. A verb is run by its function `run`, which takes the
+/// [`Context`], or by the expression after the arrow.
 macro_rules! verbs {
     ($($verb:ident($args:ty) $(=> |$name:ident, $context:ident| $run:expr)?,)*) => {
-        /// A verb with its arguments.
+        /// Verb with its arguments.
         #[derive(Debug, Subcommand)]
         pub(crate) enum Verb {
             $($verb($args),)*
@@ -121,7 +121,8 @@ macro_rules! verbs {
     }};
 }
 
-// The order is that of the help. The crate of the tools does not depend on the crate of `Context`.
+// The order is that of the help. Tools are run by expressions, because their crate does not depend on the crate of
+// `Context`.
 verbs! {
     Run(run::Run),
     Replay(replay::Replay),
@@ -176,7 +177,7 @@ mod shell;
 mod tests {
     use super::*;
 
-    /// Returns how this program parses its first command line in `line`.
+    /// Returns the result of parsing the first command of this program in `line`.
     fn read(line: &str) -> ArgMatches {
         let words = shell::scanhub_commands(line);
         let first = words.first().unwrap_or_else(|| panic!("nothing for this program: {line}"));

@@ -1,6 +1,6 @@
 //! `scanhub demo`: simulators, a hub, a subscriber for each sensor, and a people tracker, all in one terminal. Each of
 //! them is a separate process, as in real use. This process starts them, reads their output, compares sent with
-//! received telegrams, and shows the picture of `measure`.
+//! received telegrams, and shows the picture of `watch`.
 
 mod delivery_stats;
 mod environment;
@@ -57,12 +57,14 @@ Examples:
   scanhub demo --headless --for 10s";
 
 impl Demo {
-    /// Runs until the configured time has elapsed, the picture is closed, or a signal arrives. Then prints a summary for each sensor.
+    /// Runs until the configured time has elapsed, the picture is closed, or a signal arrives. Then prints a summary
+    /// for each sensor.
     ///
     /// # Errors
     ///
-    /// [`Kind::Check`] if a telegram that a sensor sent did not arrive, [`Kind::Interrupted`] if a bounded run was stopped,
-    /// [`Kind::Timeout`] if a sensor does not stream within 30 seconds, [`Kind::Failed`] if a process ends early.
+    /// - [`Kind::Check`] if a telegram that a sensor sent did not arrive. - [`Kind::Interrupted`] if a bounded run was
+    /// stopped. - [`Kind::Timeout`] if a sensor does not stream within 30 seconds. - [`Kind::Failed`] if a process ends
+    /// early.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let stop = context.signals.any_stop()?;
         let json = context.json;
@@ -70,7 +72,7 @@ impl Demo {
         let has_picture = shows && can_show_pictures();
         let sensors = self.world.sensors(self.family)?;
         let environment = DemoEnvironment::new(has_picture, self.world, sensors)?;
-        // If no port is free, the demonstration runs without the page.
+        // If the page cannot be served, the demonstration runs without it.
         let web = if shows { environment.start_web().ok() } else { None };
         let url = web.as_ref().map(|(_, url)| url.as_str());
         let played = if has_picture {
@@ -113,7 +115,7 @@ fn families() -> impl TypedValueParser<Value = Families> {
         .map(|name| Families::parse(&name).expect("one of the possible names"))
 }
 
-/// Does the same as [`play`] while the terminal shows the picture. Closing the picture ends the demonstration.
+/// Runs [`play`] while the terminal shows the picture. Closing the picture ends the demonstration.
 fn play_with_picture(
     options: &Demo,
     environment: &DemoEnvironment,
@@ -138,7 +140,7 @@ fn play_with_picture(
     })
 }
 
-/// Sets a flag when it is dropped, even by a panic, so that the other thread ends.
+/// Guard that sets a flag when it is dropped, even by a panic, so that the other thread ends.
 struct SetOnDrop<'a>(&'a AtomicBool);
 
 impl Drop for SetOnDrop<'_> {
@@ -147,7 +149,7 @@ impl Drop for SetOnDrop<'_> {
     }
 }
 
-/// View of a demonstration without pictures: lines for files and pipes, once a second.
+/// Output of a demonstration without the picture: lines for files and pipes, once a second.
 struct View {
     /// Command that shows a topic in another terminal.
     attach: String,
@@ -237,7 +239,7 @@ fn profile(sensor: &Sensor) -> String {
     (0..PROFILE_COLUMNS).rev().map(column).collect()
 }
 
-/// Columns of a profile.
+/// Number of columns of a profile.
 const PROFILE_COLUMNS: usize = 60;
 const PROFILE_BLOCKS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
 /// Range of the lowest block.
@@ -250,7 +252,7 @@ fn attach_hint(environment: &DemoEnvironment) -> String {
     format!("other terminal: scanhub echo {} {}", environment.world.topic(), environment.domain.flags())
 }
 
-/// Returns the address of the page, short enough for 80 columns together with the keys.
+/// Returns the hint with the address of the page. It fits in 80 columns together with the keys.
 fn page_hint(url: &str, domain: &Domain) -> String {
     format!("browser: {url}  domain: {}", domain.name())
 }
@@ -267,7 +269,7 @@ fn print_ready(out: &mut dyn Write, environment: &DemoEnvironment, json: bool) {
     let _ = out.write_all(format!("{line}\n").as_bytes());
 }
 
-/// Class `ready`. The order of keys is part of the contract.
+/// JSON line of class `ready`. The order of the keys is part of the contract.
 #[derive(Serialize)]
 struct ReadyLine<'a> {
     class: &'static str,
@@ -281,14 +283,14 @@ struct ReadyLine<'a> {
 enum EndReason {
     /// The configured time has elapsed.
     TimeOver,
-    /// The user stopped it.
+    /// The user stopped the demonstration.
     Stopped,
-    /// The user stopped it, and then did not wait for the telegrams that were on their way.
+    /// The user stopped the demonstration, and then stopped waiting for telegrams on their way.
     Interrupted,
 }
 
 /// Starts all processes, and compares sent telegrams with received ones until the configured time has elapsed or the
-/// user stops the demonstration. `is_asked` returns whether the user has requested the end since the last call.
+/// user stops the demonstration. `must_end` returns whether the user has requested the end since the last call.
 /// Telegrams on their way still arrive after that, unless there is another request.
 fn play(
     options: &Demo,
@@ -362,7 +364,7 @@ fn play(
     drop(hub);
     let mut open = simulators.len();
     drop(simulators);
-    // Their last lines are their summaries.
+    // The last lines of the simulators are their summaries.
     while open > 0
         && let Ok(line) = received.recv_timeout(SUMMARY_TIMEOUT)
     {
@@ -397,9 +399,9 @@ const TRACKER: usize = 104;
 const REFRESH_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum wait for a line before the time is checked.
 const MAX_LINE_WAIT: Duration = Duration::from_millis(50);
-/// Limit for all sensors to stream. It takes far less unless the machine is busy.
+/// Timeout until all sensors stream. They need far less time unless the machine is busy.
 const START_TIMEOUT: Duration = Duration::from_secs(30);
 /// Maximum wait for the last lines of a simulator that has ended.
 const SUMMARY_TIMEOUT: Duration = Duration::from_secs(2);
-/// A sensor without a telegram for this time has stopped streaming.
+/// Time without a telegram after which a sensor counts as stopped.
 const STREAM_TIMEOUT: Duration = Duration::from_secs(10);

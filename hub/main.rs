@@ -1,5 +1,5 @@
-//! The program: parses the command line, starts the log, runs the verb, and converts its result to lines and an exit code. No
-//! other crate uses all crates.
+//! The program `scanhub`: it parses the command line, starts the log, runs the verb, and converts its result to output
+//! and an exit code.
 
 mod cli;
 mod demo;
@@ -37,7 +37,7 @@ fn main() -> ExitCode {
         Err(error) => return refuse(&error),
     };
     start_log();
-    // Programs read the lines of these verbs on stdout, and a recording is not text: failures go to stderr.
+    // Programs read the output of these verbs on stdout, or it is a recording. Print failures to stderr.
     let quiet = match &cli.verb {
         Verb::Run(_) | Verb::Replay(_) | Verb::Simulate(_) => true,
         Verb::Record(record) => record.is_to_stdout(),
@@ -56,9 +56,10 @@ fn main() -> ExitCode {
 
 /// Runs the verb in the context of this process.
 fn run(cli: Cli) -> Result<(), Failure> {
-    // A file that must not grow is an error of its write, and does not end the process.
+    // At the limit of a file's length, the write must fail, and the signal must not end the process.
     flag(&[SIGXFSZ])?;
-    // Without the buffer of the standard library, which cuts at line feeds: one write is one sample, even a raw one.
+    // Bypass the buffer of the standard library, which splits writes at line feeds. One write must be one sample, even
+    // a raw one.
     let own = |name: &str, stream: BorrowedFd<'_>| {
         let file = stream.try_clone_to_owned().map(File::from);
         file.map_err(|error| Failure::new(Kind::Failed, format!("no {name}: {error}"), ""))
@@ -72,7 +73,7 @@ fn to_json_line(value: &impl Serialize) -> String {
     json_line(serde_json::to_string(value).unwrap_or_default())
 }
 
-/// A file would exceed the limit of its length. signal-hook has no name for this signal.
+/// Signal that a file would exceed the limit of its length. signal-hook has no name for it.
 const SIGXFSZ: c_int = Signal::XFSZ.as_raw();
 
 /// Signals of this process.
@@ -95,7 +96,7 @@ impl Signals for ProcessSignals {
     }
 }
 
-/// Returns a flag that `signals` set. They also end a wait, and do not end the process any more.
+/// Returns a flag that `signals` set. The signals also interrupt a wait, and no longer end the process.
 fn flag(signals: &[c_int]) -> Result<Arc<AtomicBool>, Failure> {
     let flag = Arc::new(AtomicBool::new(false));
     for signal in signals {
@@ -112,16 +113,16 @@ fn no_handler(error: io::Error) -> Failure {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] if it cannot be written, as on a full disk.
+/// Returns [`Kind::Failed`] if the text cannot be written, for example to a full disk.
 fn print(text: &str) -> Result<(), Failure> {
     print_own(&Printable(text).to_string())
 }
 
-/// Prints text that contains no input, and may therefore have tabs.
+/// Prints text of this program. It contains no input, so it may have tabs.
 ///
 /// # Errors
 ///
-/// As for [`print()`].
+/// Returns the errors of [`print()`].
 fn print_own(text: &str) -> Result<(), Failure> {
     match io::stdout().lock().write_all(format!("{text}\n").as_bytes()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
@@ -131,7 +132,7 @@ fn print_own(text: &str) -> Result<(), Failure> {
     }
 }
 
-/// Writes one line to stdout. Ignores errors, as of a reader that has closed it.
+/// Writes one line to stdout. Ignores errors, such as a closed pipe.
 fn print_status(line: &str) {
     let _ = print(line);
 }
@@ -143,13 +144,13 @@ fn report(failure: &Failure, json: bool, quiet: bool) {
         return print_error(&format!("scanhub: {failure}"));
     }
     let line = scanhub_verbs::error_line(failure);
-    // A full disk takes no error either.
+    // On a full disk, stdout cannot take the error either.
     if quiet || print(&line).is_err() {
         print_error(&line);
     }
 }
 
-/// Writes one line to stderr. Ignores errors, as of a terminal that was closed.
+/// Writes one line to stderr. Ignores errors, such as a closed terminal.
 fn print_error(line: &str) {
     let _ = io::stderr().lock().write_all(format!("{}\n", Printable(line)).as_bytes());
 }

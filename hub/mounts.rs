@@ -1,4 +1,5 @@
-//! Publishes the angles of simulated and recorded mounts as topics, as the program of an encoder does for a real mount.
+//! Publishers of the angles of simulated and recorded mounts. For a real mount, the program of its encoder publishes
+//! them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,9 +14,9 @@ use scanhub_shm::Domain;
 use scanhub_sim::mount::Report;
 use scanhub_sim::options::SimulateOptions;
 
-/// Publishing end of all simulated mounts. Dropping it removes the topics.
+/// Publishers of all simulated mounts. Dropping it removes the topics.
 pub(crate) struct SimulatedMounts {
-    /// Reports of the encoder at the port with a number; `None` once no more follow.
+    /// Reports of the encoders, with the number of the port; `None` once no more follow.
     reports: Option<Sender<(usize, Report)>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -25,7 +26,7 @@ impl SimulatedMounts {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Usage`] if a port has no mount. Otherwise the errors of [`PublishSession::open_named`].
+    /// Returns [`Kind::Usage`] if a port has no mount, and the errors of [`PublishSession::open_named`].
     pub(crate) fn start(
         names: &[String],
         options: &SimulateOptions,
@@ -106,7 +107,7 @@ impl Drop for RecordedMounts {
     }
 }
 
-/// The topic of a mount, and its subscribers' wake-up.
+/// Topic of a mount, with the means to wake its subscribers.
 struct MountTopic {
     topic: Publication<Tilt>,
     sensor: SensorPublisher,
@@ -122,13 +123,15 @@ impl MountTopic {
     /// Publishes `tilt` as of `stamp_ns`, with the header that `change` returns.
     fn publish(&mut self, stamp_ns: u64, tilt: Tilt, change: impl FnOnce(Header) -> Header) {
         let header = change(self.topic.header_at(stamp_ns));
-        // Without memory, the sample's number is skipped. A subscriber that is not woken polls ten times a second.
+        // If memory runs out, the sample is not sent and its number is skipped. A subscriber that is not woken polls
+        // ten times a second.
         let _ = self.topic.send_with(&header, |sample| *sample = tilt);
         let _ = self.sensor.wake(WakeEvent::Telegram);
     }
 }
 
-/// Starts a thread that calls `open` and then `publish` with its result. Publishers stay in the thread that opens them.
+/// Starts a thread that calls `open` and then `publish` with its result. Publishers must stay in the thread that opens
+/// them.
 ///
 /// # Errors
 ///

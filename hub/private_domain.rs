@@ -1,4 +1,4 @@
-//! A domain of this process alone, which is removed when it ends.
+//! Private domain of this process, which is removed when the process ends.
 
 use std::ops::Deref;
 
@@ -6,23 +6,24 @@ use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Directory, Domain, Environment};
 use tempfile::TempDir;
 
-/// The domain. Its directory and its shared memory are removed when this is dropped.
+/// Private domain. Its directory and its shared memory are removed when this is dropped.
 pub(crate) struct PrivateDomain {
     domain: Domain,
-    /// Directory that has the domain, if another user has occupied the usual one.
+    /// Temporary directory that contains the domain, if another user has occupied the usual one.
     base: Option<TempDir>,
 }
 
 impl PrivateDomain {
-    /// Creates a domain whose name begins with `word`, and has our process id.
+    /// Creates a domain whose name is `prefix` followed by the process ID.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if neither the usual directory nor one for temporary files can be used.
+    /// Returns [`Kind::Failed`] if neither the usual directory nor one for temporary files can be used.
     pub(crate) fn new(prefix: &str) -> Result<PrivateDomain, Failure> {
         let name = format!("{prefix}-{}", std::process::id());
         let environment = Environment::of_process();
-        // The user's directory may have too long a name for a domain. The one for users without a directory does not.
+        // The path of the user's directory may be too long for a domain. The directory for users without one is short
+        // enough.
         let fallback = Environment { uid: environment.uid, ..Environment::default() };
         for environment in [environment, fallback] {
             if let Ok(domain) = Domain::of_hub(&name, None, &environment)
@@ -59,7 +60,7 @@ impl Deref for PrivateDomain {
 
 impl Drop for PrivateDomain {
     fn drop(&mut self) {
-        // The name has our process id, so nothing in it belongs to another process.
+        // The name contains the process ID, so nothing in the directory belongs to another process.
         let _ = std::fs::remove_dir_all(self.root());
         let prefix = self.prefix();
         let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();

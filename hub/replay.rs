@@ -1,5 +1,5 @@
-//! `scanhub replay`: runs a hub that plays a recording. A terminal shows a progress line, and its keys control the
-//! player.
+//! `scanhub replay`, which runs a hub that plays a recording. A terminal shows a progress line, and its keys control
+//! the player.
 
 pub(crate) mod page;
 pub(crate) mod progress_line;
@@ -97,9 +97,11 @@ impl Replay {
         })
     }
 
-    /// The options of the player.
+    /// Returns the options of the player.
     ///
-    /// [`Kind::Usage`] if it ends before it starts.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Usage`] if the end is not after the start.
     fn play(&self) -> Result<PlaybackOptions, Failure> {
         let start = self.start.unwrap_or_default();
         if let Some(end) = self.end.filter(|end| *end <= start) {
@@ -116,9 +118,9 @@ impl Replay {
     }
 }
 
-/// The thread that handles keys and draws the progress line. Dropping it ends the thread.
+/// Thread that handles keys and draws the progress line. Dropping it ends the thread.
 struct Console {
-    /// Closing this end makes the thread end.
+    /// End of a socket pair. Closing it ends the thread.
     open: Option<UnixStream>,
     thread: Option<JoinHandle<()>>,
 }
@@ -140,7 +142,7 @@ impl Console {
 impl Drop for Console {
     fn drop(&mut self) {
         self.open = None;
-        // The thread returns nothing, and the log has the message of a panic.
+        // The thread has no result, and the log has the message of a panic.
         let _ = self.thread.take().map(JoinHandle::join);
     }
 }
@@ -204,7 +206,7 @@ fn handle_keys(player: &Player, mut pressed: &[u8]) {
     }
 }
 
-/// The terminal without echo and line buffering, for single keys. Dropping it restores the terminal.
+/// Terminal without echo and line buffering, for single keys. Dropping it restores the terminal.
 struct RawKeyboard {
     saved: Termios,
 }
@@ -232,7 +234,7 @@ impl RawKeyboard {
 
 impl Drop for RawKeyboard {
     fn drop(&mut self) {
-        // Fails if the terminal was closed. Then there is nothing to restore.
+        // This fails if the terminal was closed, and then there is nothing to restore.
         let _ = tcsetattr(stdin(), OptionalActions::Now, &self.saved);
     }
 }
@@ -252,7 +254,7 @@ fn parse_rate(text: &str) -> Result<PlaybackRate, String> {
     })
 }
 
-/// Class `replayed`.
+/// JSON line of class `replayed`.
 #[derive(Serialize)]
 struct ReplaySummary {
     class: &'static str,
@@ -277,7 +279,7 @@ const REDRAW_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: REDRAW_INTERVAL
 /// Value of a special character that no key produces (`_POSIX_VDISABLE`).
 const DISABLED_CHARACTER: u8 = 0;
 
-/// The keys, for the end of the help.
+/// Keys of the player, for the end of the help.
 const AFTER_HELP: &str = "\
 Examples:
   scanhub replay walk.mcap

@@ -1,5 +1,5 @@
-//! `scanhub bridge`: starts the program scanhub-bridge, which parses its own arguments. It is a separate program
-//! because few users need it, and its dependencies are five times those of everything else.
+//! `scanhub bridge`, which starts the program scanhub-bridge. That program parses its own arguments. It is a separate
+//! program because few users need it, and its dependencies are five times those of everything else.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
@@ -27,14 +27,13 @@ Examples:
   scanhub bridge --help";
 
 impl Bridge {
-    /// Replaces this process by the program, which is searched first in the directory of this program and then in
-    /// `PATH`.
+    /// Replaces this process by scanhub-bridge. Searches the directory of this program first, and then `PATH`.
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`] if there is none, if it has another version, or if it cannot be started.
+    /// Returns [`Kind::Configuration`] if scanhub-bridge is not found, has another version, or cannot be started.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        // The error and its remedy are in one line.
+        // Join the error and its remedy in one line.
         let program = find(&search_directories()).map_err(|Failure { kind, message, hint }| {
             Failure::new(kind, format!("{message}; {hint}"), "")
         })?;

@@ -1,4 +1,4 @@
-//! `scanhub config` on the command line: what it takes, and how it shows a configuration.
+//! `scanhub config`: its arguments, and the output of a configuration.
 
 use std::path::PathBuf;
 
@@ -97,7 +97,7 @@ fn checked(links: &[Link]) -> String {
     format!("ok: {} link{s}: {}", links.len(), named.join(", "))
 }
 
-/// Key, value and place, one below the other; what is longer than its column takes the room that it needs.
+/// Formats keys, values and origins as a table. A text that is longer than its column is not cut.
 fn table(values: &[Value]) -> String {
     let width =
         |of: &dyn Fn(&Value) -> usize| values.iter().map(of).filter(|&len| len <= MAX_COLUMN_WIDTH).max();
@@ -110,7 +110,7 @@ fn table(values: &[Value]) -> String {
     values.iter().map(row).collect::<Vec<_>>().join("\n")
 }
 
-/// A column is not made wider than this for the sake of one row.
+/// Maximum width of a column. Longer texts do not widen it.
 const MAX_COLUMN_WIDTH: usize = 48;
 
 const SHOW_EXAMPLES: &str = "\

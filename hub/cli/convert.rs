@@ -1,4 +1,4 @@
-//! `scanhub convert` on the command line: what it takes, and how it reports the result.
+//! `scanhub convert`: its arguments, and the report of the result.
 
 use std::io::{IsTerminal, Write, stderr};
 use std::path::{Path, PathBuf};
@@ -136,7 +136,7 @@ impl Convert {
     }
 }
 
-/// The line that reports the conversion; the order of the keys is part of the format.
+/// JSON line that reports the conversion. The order of the keys is part of the format.
 #[derive(Serialize)]
 struct ConvertedLine<'a> {
     class: &'static str,
@@ -163,7 +163,7 @@ struct LogDropped {
     lines: u64,
 }
 
-/// What was missing of the recording.
+/// Data that was missing in the recording.
 #[derive(Serialize)]
 struct Missing {
     telegrams: u64,
@@ -213,7 +213,7 @@ fn seconds(ns: u64) -> f64 {
     ns as f64 / 1e9
 }
 
-/// How a recording is repaired, for the end of the help.
+/// Instructions for repairing a recording, for the end of the help.
 const AFTER_HELP: &str = "\
 Examples:
   scanhub convert killed.mcap whole.mcap

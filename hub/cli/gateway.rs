@@ -1,4 +1,4 @@
-//! Section `gateway` of the configuration, in place of arguments of `scanhub gateway` that are missing.
+//! `scanhub gateway`, with the section `gateway` of the configuration for missing arguments.
 
 use clap::Args;
 use scanhub_config::SourceMap;
@@ -23,13 +23,13 @@ impl Gateway {
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let args = merge_section(&self.args, &self.configured.sources().read())?;
         if self.args.topics.is_empty() {
-            // They come from the configuration.
+            // The error comes from the configuration, so name its section.
             args.check().map_err(in_gateway_section)?;
         }
         args.run(context)
     }
 
-    /// Checks that a gateway accepts the section in `sources`.
+    /// Checks that a gateway would accept the section in `sources`.
     pub(super) fn check(sources: &SourceMap, domain: &DomainOptions) -> Result<(), Failure> {
         let args = merge_section(&GatewayArgs::default(), sources)?;
         domain.locations()?;
@@ -37,7 +37,7 @@ impl Gateway {
     }
 }
 
-/// Returns `args`, with the values of the section in `sources` for those that are missing.
+/// Returns `args`. Missing arguments get the values of the section in `sources`.
 fn merge_section(args: &GatewayArgs, sources: &SourceMap) -> Result<GatewayArgs, Failure> {
     let section = scanhub_config::Gateway::of(sources)?;
     let every = section.background_every.map(|text| duration::parse(&text)).transpose().map_err(|what| {

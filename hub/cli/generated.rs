@@ -1,6 +1,6 @@
-//! `scanhub completions` and `scanhub man`: text that is generated from the definition of the command line. The scripts
-//! call the hidden verb `complete` for the names of the running hub. That verb prints no errors, because they would
-//! disturb a user who types.
+//! `scanhub completions` and `scanhub man`: texts that are generated from the definition of the command line. The
+//! scripts call the hidden verb `complete` for the names of the running hub. That verb prints no errors, because they
+//! would disturb a user who types.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -37,7 +37,7 @@ impl Completions {
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if it cannot be written.
+    /// Returns [`Kind::Failed`] if the script cannot be written.
     pub(crate) fn run(&self, _: &mut Context) -> Result<(), Failure> {
         let mut text = Vec::new();
         let command = &mut Cli::command();
@@ -48,7 +48,7 @@ impl Completions {
         }
         let text = String::from_utf8_lossy(&text);
         let text = text.trim_end();
-        // The definition does not contain the names of the hub.
+        // The definition of the command line does not contain the names of the hub, so add them.
         match self.shell {
             Shell::Bash => print_own(&format!("{text}\n{}", BASH.trim_end())),
             // The last lines of the script call functions defined before them.
@@ -109,7 +109,7 @@ enum NameKind {
 /// A command line up to the cursor.
 #[derive(Debug, Default)]
 struct CommandLine {
-    /// Kind of the name that is expected next, if it is a name that the hub has.
+    /// Kind of the name that is expected next, if it is a name of the hub.
     name_kind: Option<NameKind>,
     /// Whether `robot`, all sensors together, is accepted too.
     takes_robot: bool,
@@ -117,7 +117,7 @@ struct CommandLine {
 }
 
 impl CommandLine {
-    /// Parses `words`, the program's name first, according to the definition `whole`.
+    /// Parses `words`, the program's name first, according to `definition`.
     fn read(definition: &Command, words: &[String]) -> CommandLine {
         let everywhere = Cli::command();
         let mut line = CommandLine::default();
@@ -175,7 +175,7 @@ fn option<'a>(command: &'a Command, word: &str) -> Option<&'a Arg> {
     command.get_arguments().find(is_it)
 }
 
-/// Returns which names of a hub `arg` takes, as its value name states.
+/// Returns the kind of names of a hub that `arg` takes, by its value name.
 fn name(arg: &Arg) -> Option<NameKind> {
     let named = arg.get_value_names().and_then(|names| names.first()).map(|name| name.to_string());
     match named.unwrap_or_else(|| arg.get_id().to_string().to_uppercase()).as_str() {
@@ -232,7 +232,7 @@ impl Man {
     ///
     /// # Errors
     ///
-    /// [`Kind::Output`] if the directory cannot be written to, [`Kind::Failed`] if stdout cannot.
+    /// Returns [`Kind::Output`] if the directory cannot be written to, and [`Kind::Failed`] if stdout cannot.
     pub(crate) fn run(&self, _: &mut Context) -> Result<(), Failure> {
         match &self.directory {
             Some(directory) => write_pages(directory),

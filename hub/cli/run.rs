@@ -1,4 +1,4 @@
-//! `scanhub run`: runs the hub. `scanhub doctor` reads the same configuration.
+//! `scanhub run`, which runs the hub, and `scanhub doctor`, which reads the same configuration.
 
 use std::path::{Path, PathBuf};
 
@@ -117,7 +117,7 @@ pub(crate) fn print_ready(ready: &scanhub_daemon::StartReport, domain: &Domain, 
     });
 }
 
-/// Class `ready`. The order of keys is part of the contract.
+/// JSON line of class `ready`. The order of the keys is part of the contract.
 #[derive(Serialize)]
 struct HubReady<'a> {
     class: &'static str,

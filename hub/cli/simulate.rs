@@ -1,4 +1,4 @@
-//! `scanhub simulate`: simulates scanners, and the mounts that tilt them.
+//! `scanhub simulate`, which simulates scanners and the mounts that tilt them.
 
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -180,7 +180,7 @@ impl Simulate {
     }
 }
 
-/// Class `ready`.
+/// JSON line of class `ready`.
 #[derive(Serialize)]
 struct SimulatorReady<'a> {
     class: &'static str,
@@ -201,7 +201,7 @@ Examples:
   scanhub simulate --port /tmp/front --replay robot.mcap --sensor front
   scanhub simulate --family rplidar --model a1 --tcp 127.0.0.1:0";
 
-/// Returns examples and the table of faults, for the end of the help.
+/// Returns the examples and the table of faults, for the end of the help.
 fn after_help() -> String {
     let rows = Faults::keys().map(|(key, meaning)| format!("  {key:13} {meaning}"));
     format!("{EXAMPLES}\n\nFaults:\n{}", rows.collect::<Vec<_>>().join("\n"))

@@ -1,5 +1,5 @@
-//! Compares the telegrams that the simulators sent with those that the subscribers received. Telegrams are identified
-//! by their hash, so a damaged telegram counts as lost.
+//! Comparison of the telegrams that the simulators sent with those that the subscribers received. Telegrams are
+//! identified by their hash, so a damaged telegram counts as lost.
 
 use std::collections::{HashMap, HashSet};
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use sha2::{Digest, Sha256};
 /// Counts of all sensors.
 pub(crate) struct DeliveryStats {
     pub(crate) sensors: Vec<Sensor>,
-    /// Telegrams whose last byte was sent after this time do not count, in nanoseconds of the monotonic clock.
+    /// Time of the cut, in nanoseconds of the monotonic clock. Telegrams whose last byte was sent later do not count.
     cut_ns: u64,
     cut_at: Option<Instant>,
     /// Results of three-dimensional perception, if a sensor is on a mount.
@@ -30,18 +30,18 @@ pub(crate) struct Sensor {
     pub(crate) name: String,
     pub(crate) state: String,
     pub(crate) baud: u64,
-    /// Whether the scanner rotates and sends packets. Packets before the first subscriber do not count.
+    /// Whether the scanner is a rotating one, which sends packets. Packets before the first subscriber do not count.
     is_rotating: bool,
     /// Hashes of packets that were sent before the first one arrived.
     sent_before_first: Vec<String>,
-    /// Telegrams of measured data that were sent whole before the cut.
+    /// Number of telegrams of measured data that were sent completely before the cut.
     pub(crate) sent: u64,
-    /// Hash of each telegram that was sent and has not arrived.
+    /// Number of telegrams that were sent and have not arrived, by hash.
     missing: HashMap<String, u64>,
-    /// Hash of each telegram that arrived before the simulator reported it.
+    /// Number of telegrams that arrived before the simulator reported them, by hash.
     early: HashMap<String, u64>,
     pub(crate) received_count: u64,
-    /// Ranges of the last scan from right to left, in millimeters. `None`: no reading.
+    /// Ranges of the last scan from right to left, in millimeters. `None` is a beam without a reading.
     pub(crate) ranges: Vec<Option<u64>>,
     pub(crate) nearest_mm: Option<u64>,
     pub(crate) nearest_deg: f64,
@@ -51,12 +51,12 @@ pub(crate) struct Sensor {
     /// Counters of the line in the last status, and those before the first telegram.
     line: Option<LineCounts>,
     line_before: LineCounts,
-    /// Samples of its telegrams that were published and that this program's subscriber did not receive.
+    /// Number of published samples of telegrams that the subscriber of this demonstration missed.
     pub(crate) missed: u64,
-    /// Hash of each telegram that was sent after the cut.
+    /// Hashes of telegrams that were sent after the cut.
     after_cut: HashSet<String>,
-    /// Whether one of them has arrived. Telegrams arrive in their order, so all that were sent before the cut have
-    /// arrived, or never will.
+    /// Whether a telegram that was sent after the cut has arrived. Telegrams arrive in their order, so no more
+    /// telegrams from before the cut will arrive.
     is_past_cut: bool,
     /// Time at which the last telegram arrived.
     arrived_at: Option<Instant>,
@@ -67,18 +67,18 @@ pub(crate) struct Sensor {
 struct LineCounts {
     read: u64,
     damaged: u64,
-    /// `None` while the period of the scans is unknown.
+    /// Number of scans that the line lost; `None` while the period of the scans is unknown.
     lost: Option<u64>,
 }
 
-/// CPU time that the hub had used at a time.
+/// CPU time that the hub had used at a point in time.
 #[derive(Clone, Copy)]
 struct CpuTime {
     since: Instant,
     used_ns: u64,
 }
 
-/// The line of a sensor in the summary. The order of keys is part of the contract.
+/// Line of a sensor in the summary. The order of the keys is part of the contract.
 #[derive(Serialize)]
 struct Summary<'a> {
     class: &'static str,
@@ -116,7 +116,7 @@ impl DeliveryStats {
         }
     }
 
-    /// Handles a line that the subscriber of sensor number `of` printed.
+    /// Handles a line that the subscriber of the sensor with this index printed.
     pub(crate) fn handle_line(&mut self, index: usize, line: &Value) {
         if line["class"] == "obstacles" {
             self.tilted.get_or_insert_default().take(line);
@@ -207,7 +207,7 @@ impl DeliveryStats {
         }
     }
 
-    /// Returns what was lost in all, and why; `None` if nothing was.
+    /// Returns a text about the total losses and their reasons; `None` without losses.
     pub(crate) fn loss(&self) -> Option<String> {
         let lossy = || self.sensors.iter().filter(|sensor| sensor.lost() > 0);
         let count = |of: fn(&Sensor) -> u64| lossy().map(of).sum::<u64>();
@@ -284,7 +284,7 @@ impl Sensor {
     }
 
     /// Returns the number of scans that the line lost since the first telegram, as the hub counts them. `None` while
-    /// the hub cannot tell.
+    /// the period of the scans is unknown.
     pub(crate) fn lost_on_line(&self) -> Option<u64> {
         let lost = self.line?.lost?;
         Some(lost.saturating_sub(self.line_before.lost.unwrap_or_default()))
@@ -374,7 +374,8 @@ impl Sensor {
         self.nearest_deg =
             nearest.map_or(0.0, |(_, i)| angle("first_angle_deg") + i as f64 * angle("step_deg"));
         if angle("step_deg") < 0.0 {
-            // A revolution starts ahead and runs clockwise. Put the rear at both ends, and the right first.
+            // A revolution starts ahead and runs clockwise. Rotate it so that the rear is at both ends and the right
+            // side comes first.
             let half = self.ranges.len() / 2;
             self.ranges.rotate_left(half);
             self.ranges.reverse();
@@ -382,13 +383,14 @@ impl Sensor {
     }
 }
 
-/// Results of three-dimensional perception, the last line of the summary. The order of keys is part of the contract.
+/// Results of three-dimensional perception, for the last line of the summary. The order of the keys is part of the
+/// contract.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 struct TiltSummary {
     class: &'static str,
     sensor: String,
     sweeps: u64,
-    /// Number in the last sweep.
+    /// Number of obstacles in the last sweep.
     obstacles: usize,
     /// Distance of the nearest obstacle from the center of the robot, in meters.
     nearest_m: Option<f64>,
@@ -418,7 +420,7 @@ impl TiltSummary {
     }
 }
 
-/// Removes one of `hash` from `counts`, and returns whether there was one.
+/// Decreases the count of `hash` in `counts` by 1. Returns whether it was in `counts`.
 fn remove_hash(counts: &mut HashMap<String, u64>, hash: &str) -> bool {
     let Some(count) = counts.get_mut(hash) else { return false };
     *count -= 1;
@@ -443,10 +445,10 @@ fn cpu_time_ns(pid: u32) -> u64 {
     spent.sum()
 }
 
-/// Command of a measured-value telegram.
+/// Command byte of a telegram with measured values.
 const MEASURED_VALUES_COMMAND: u64 = 0xB0;
 
-/// Returns `count` with `what`, in the plural unless it is 1.
+/// Returns `count` followed by `what`, with an `s` unless the count is 1.
 pub(super) fn counted(count: u64, what: &str) -> String {
     format!("{count} {what}{}", if count == 1 { "" } else { "s" })
 }
@@ -518,7 +520,7 @@ mod tests {
     #[test]
     fn a_revolution_is_shown_from_right_to_left() {
         let mut sensor = Sensor { is_rotating: true, ..Sensor::default() };
-        // Ahead, right, behind, left.
+        // The beams point ahead, right, to the rear, and left.
         let turn = serde_json::json!({ "unit_um": 1000, "first_angle_deg": 0.0, "step_deg": -90.0, "ranges": [1, 2, 3, 4] });
         sensor.take_scan(&turn);
         assert_eq!(sensor.ranges, [2, 1, 4, 3].map(Some));

@@ -1,5 +1,5 @@
-//! The processes of a demonstration: a hub, subscribers, a people tracker and simulators. They run in a temporary
-//! domain and directory.
+//! Processes of a demonstration: a hub, subscribers, a people tracker and simulators. They run in a temporary domain
+//! and directory.
 
 use std::fs::OpenOptions;
 use std::io::{self, BufRead, BufReader, Write};
@@ -19,7 +19,7 @@ use super::participants::{Sensor, World};
 use super::{HUB, SIMULATOR, TILTED, TRACKER, WEB};
 use crate::private_domain::PrivateDomain;
 
-/// The domain, the directory and the settings of all processes.
+/// Domain, directory and settings of all processes.
 pub(super) struct DemoEnvironment {
     pub(super) domain: PrivateDomain,
     pub(super) world: World,
@@ -53,8 +53,8 @@ impl DemoEnvironment {
         self.directory.path().join("log")
     }
 
-    /// Starts this program with `arguments` in the domain. With a `listener`, the lines of the child are sent there with
-    /// its number.
+    /// Starts this program with `arguments` in the domain. With a `listener`, sends the lines of the child there, with
+    /// the child's number.
     fn start(
         &self,
         arguments: &[String],
@@ -165,7 +165,7 @@ impl DemoEnvironment {
         Ok(self.start(&arguments, None)?.await_ready(SIMULATOR, lines)?.0)
     }
 
-    /// Starts the verb that sees in three dimensions, if the sensor is on a mount. The angles of the mount must exist.
+    /// Starts `scanhub tilt`, if the sensor is on a mount. The topic with the mount's angles must exist.
     pub(super) fn start_tilt(&self, lines: &Sender<ChildEvent>) -> Result<Option<Child>, Failure> {
         if self.world != World::Tilt {
             return Ok(None);
@@ -185,7 +185,7 @@ impl DemoEnvironment {
     }
 }
 
-/// An event of a child process. `of` is the number of the child.
+/// Event of a child process. `child` is the number of the child.
 #[derive(Debug)]
 pub(super) enum ChildEvent {
     /// The child printed a line.
@@ -194,14 +194,14 @@ pub(super) enum ChildEvent {
     Ended { child: usize },
 }
 
-/// A child process that runs a verb of this program. Dropping it ends the process.
+/// Child process that runs a verb of this program. Dropping it ends the process.
 #[derive(Debug)]
 pub(super) struct Child {
     process: Process,
 }
 
 impl Child {
-    /// Waits for the first line, which says that the child is ready, and returns it. Later lines are sent to `lines`.
+    /// Waits for the first line, which reports that the child is ready, and returns it. Sends later lines to `lines`.
     pub(super) fn await_ready(
         mut self,
         of: usize,
@@ -216,7 +216,7 @@ impl Child {
         if first.is_empty() { Err(super::ended(of)) } else { Ok((self, first)) }
     }
 
-    /// Returns the process id.
+    /// Returns the process ID.
     pub(super) fn pid(&self) -> u32 {
         self.process.id()
     }
@@ -242,7 +242,7 @@ impl Drop for Child {
 fn forward(stdout: BufReader<ChildStdout>, of: usize, lines: Sender<ChildEvent>) {
     thread::spawn(move || {
         for text in stdout.lines().map_while(Result::ok) {
-            // Read on without a receiver: a closed pipe would end the child with its next line.
+            // Continue to read without a receiver, because a closed pipe would end the child at its next line.
             let _ = lines.send(ChildEvent::Line { child: of, text });
         }
         let _ = lines.send(ChildEvent::Ended { child: of });
@@ -268,5 +268,5 @@ const TILT_ARGUMENTS: [&str; 11] = [
 /// Maximum time that the tracker waits for the scan of a sensor. Longer than the default, because the machine may be
 /// busy.
 const TRACKER_DELAY: &str = "200ms";
-/// Setting by which the hub saves no background: its directory is removed with the demonstration.
+/// Setting with which the hub saves no background, because its directory is removed with the demonstration.
 const NO_BACKGROUND_SETTING: &str = "--set=background.keep=false";

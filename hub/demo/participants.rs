@@ -1,49 +1,48 @@
-//! Who takes part in a demonstration: which sensors there are, of which families, where they sit, and what follows them. Refuses
-//! to know how they are started.
+//! Participants of a demonstration: its world, its sensors with their families and poses, and the settings of the hub.
 
 use scanhub_perception::track::Site;
 use scanhub_schema::{Failure, Family, Kind};
 
-/// A simulated sensor.
+/// Simulated sensor.
 #[derive(Clone, Debug)]
 pub(crate) struct Sensor {
     pub(crate) name: String,
     pub(crate) family: Family,
-    /// Where it sits, as its world has it: x and y in metres, yaw in radians.
+    /// Pose in the world: x and y in meters, yaw in radians.
     pub(crate) pose: [f64; 3],
 }
 
-/// Where a demonstration takes place.
+/// World of a demonstration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum World {
-    /// A robot in a hall.
+    /// Robot in a hall.
     Robot,
-    /// Two rooms and a corridor, in which people are followed.
+    /// Two rooms and a corridor, in which people are tracked.
     House,
-    /// A hall, seen by a sensor on a mount that tilts it.
+    /// Hall that a sensor on a tilting mount sees.
     Tilt,
 }
 
 impl World {
-    /// The names in all input: of the simulator's worlds.
+    /// Names of the worlds, on the command line and in the simulator.
     pub(crate) const NAMES: [&str; 3] = ["demo", "house", "tilt"];
 
-    /// The world that `name` says, if it is one of [`NAMES`](Self::NAMES).
+    /// Returns the world with this `name`, if it is one of [`NAMES`](Self::NAMES).
     pub(crate) fn parse(name: &str) -> Option<World> {
         [World::Robot, World::House, World::Tilt].into_iter().find(|world| world.name() == name)
     }
 
-    /// What the simulator calls it.
+    /// Returns the name of the world.
     pub(crate) fn name(self) -> &'static str {
         World::NAMES[self as usize]
     }
 
-    /// The site file that people are followed by, if there is one.
+    /// Returns the site file for the people tracker, if the world has one.
     pub(crate) fn site(self) -> Option<&'static str> {
         (self == World::House).then_some(HOUSE_SITE)
     }
 
-    /// A topic that is worth to look at.
+    /// Returns a topic that is interesting to print.
     pub(crate) fn topic(self) -> &'static str {
         match self {
             World::Robot => "front/scan",
@@ -52,8 +51,8 @@ impl World {
         }
     }
 
-    /// Keys of the hub. Nobody drives in the house: its circle is small, and lies outside of the walls. Whoever looks shall not
-    /// wait for long until the background is known.
+    /// Returns settings of the hub. The house has no robot, so its circle is small and outside the walls. The
+    /// background is learned fast, so that users need not wait long for people.
     pub(crate) fn settings(self) -> &'static [&'static str] {
         match self {
             World::Robot | World::Tilt => &[],
@@ -61,10 +60,12 @@ impl World {
         }
     }
 
-    /// Its sensors.
+    /// Returns the sensors of the world.
     ///
-    /// [`Kind::Usage`] for different families in the house, where each one's simulator would begin with the same sensor, and
-    /// on the mount for one that has no simulated heights.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Usage`] for mixed families in the house, because each family's simulator would begin with the
+    /// same sensor. Returns it on the mount for a family whose simulator does not support a mount.
     pub(crate) fn sensors(self, families: Families) -> Result<Vec<Sensor>, Failure> {
         match (self, families) {
             (World::Robot, families) => Ok(families.robot_sensors()),
@@ -89,22 +90,22 @@ impl World {
     }
 }
 
-/// Of which families the sensors are.
+/// Families of the sensors.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Families {
-    /// All of one.
+    /// One family for all sensors.
     One(Family),
-    /// One of each.
+    /// One sensor of each family.
     Mixed,
 }
 
 impl Families {
-    /// The names in all input: of the families, and `mixed`.
+    /// Returns the values on the command line: the names of the families, and `mixed`.
     pub(crate) fn names() -> impl Iterator<Item = &'static str> {
         Family::ALL.into_iter().map(Family::name).chain([MIXED])
     }
 
-    /// The families that `name` says, if it is one of [`names`](Self::names).
+    /// Returns the families for this `name`, if it is one of [`names`](Self::names).
     pub(crate) fn parse(name: &str) -> Option<Families> {
         if name == MIXED { Some(Families::Mixed) } else { Family::parse(name).map(Families::One) }
     }
@@ -121,7 +122,7 @@ impl Families {
             Families::One(family) => {
                 vec![sensor("front", family, FRONT_POSE), sensor("rear", family, REAR_POSE)]
             }
-            // Each family has a simulator of its own, and its first sensor sits in front: one above the other.
+            // Each family has its own simulator, whose first sensor is at the front, so all sensors have the same pose.
             Families::Mixed => ["front", "side", "top"]
                 .into_iter()
                 .zip(Family::ALL)
@@ -135,7 +136,7 @@ fn sensor(name: &str, family: Family, pose: [f64; 3]) -> Sensor {
     Sensor { name: name.to_owned(), family, pose }
 }
 
-/// The sensors of the site, in the order in which the simulated world has them.
+/// Returns the sensors of the site, in the order of the simulated world.
 fn house_sensors(family: Family) -> Result<Vec<Sensor>, Failure> {
     let sensors = Site::parse("house.toml", HOUSE_SITE)?.sensors.into_iter();
     let sensors = sensors.map(|sensor| {
@@ -145,13 +146,13 @@ fn house_sensors(family: Family) -> Result<Vec<Sensor>, Failure> {
     Ok(sensors.collect())
 }
 
-/// Whose simulator knows heights.
+/// Family whose simulator supports a mount.
 const TILTED_FAMILY: Family = Family::ALL[0];
 const MIXED: &str = "mixed";
-/// As `tests/worlds/demo.toml` has them.
+/// Pose of the front sensor, as in `tests/worlds/demo.toml`.
 const FRONT_POSE: [f64; 3] = [0.3, 0.0, 0.0];
 const REAR_POSE: [f64; 3] = [-0.3, 0.0, std::f64::consts::PI];
-/// As `tests/worlds/tilt.toml` has it.
+/// Pose of the sensor on the mount, as in `tests/worlds/tilt.toml`.
 const MOUNT_POSE: [f64; 3] = [0.06, 0.0, 0.0];
 const HOUSE_SITE: &str = include_str!("house.toml");
 

@@ -1,4 +1,4 @@
-//! `scanhub web --replay`: runs a hub in a domain of this process that plays a recording, and serves its picture. Viewers
+//! `scanhub web --replay`, which runs a hub that plays a recording in a private domain, and serves its picture. Viewers
 //! control the player. The hub and the server end together.
 
 use std::io::Write;
@@ -25,7 +25,7 @@ pub(crate) fn run(web: &WebArgs, context: &mut Context) -> Result<(), Failure> {
     }
 }
 
-/// Shows `file` until `stop` is set. The end of its hub sets `stop`, too.
+/// Plays `file` and serves its picture until `stop` is set. The end of the hub also sets `stop`.
 fn show(
     web: &WebArgs,
     file: &Path,
@@ -70,7 +70,7 @@ fn show(
     })
 }
 
-/// The player that viewers control.
+/// Player that viewers control.
 struct PlayerControls(Arc<Player>);
 
 impl Playback for PlayerControls {
@@ -101,7 +101,7 @@ impl Playback for PlayerControls {
     }
 }
 
-/// Sets `stop` when it is dropped.
+/// Guard that sets `stop` when it is dropped.
 struct SetOnDrop<'a>(&'a AtomicBool);
 
 impl Drop for SetOnDrop<'_> {

@@ -1,4 +1,4 @@
-//! One line that says how far a player is, drawn over itself. What the log says meanwhile stands above it.
+//! Progress line of a player at the bottom of stderr. Each update overwrites it, and log lines are printed above it.
 
 use std::io::{self, Write, stderr};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -6,23 +6,24 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rustix::termios::tcgetwinsize;
 use scanhub_daemon::{PlaybackRate, Progress};
 
-/// The line at the bottom of stderr, until it is dropped.
+/// Progress line, which is removed when this is dropped.
 #[derive(Default)]
 pub(super) struct ProgressLine {
     drawn: String,
 }
 
-/// stderr as the log writes to it.
+/// Writer of the log to stderr. It removes the progress line before each write.
 pub(crate) struct LogWriter;
 
-/// Whether there is a line where the next word on stderr would stand.
+/// Whether the progress line is shown where the next output on stderr would appear.
 static IS_SHOWN: AtomicBool = AtomicBool::new(false);
 
 impl ProgressLine {
     pub(super) fn draw(&mut self, progress: &Progress) {
         let text = text(progress, columns());
         if text != self.drawn || !IS_SHOWN.load(Ordering::Relaxed) {
-            // A line that wraps would not be drawn over: should the terminal have become narrower just now, it is cut.
+            // The next update could not overwrite a wrapped line. Turn wrapping off, in case the terminal has just
+            // become narrower.
             IS_SHOWN.store(true, Ordering::Relaxed);
             let _ = stderr().write_all(format!("{CLEAR_LINE}\x1b[?7l{text}\x1b[?7h").as_bytes());
             self.drawn = text;
@@ -53,7 +54,7 @@ fn clear_line() {
     }
 }
 
-/// What was played, when it is over.
+/// Returns the summary of a replay that has ended.
 pub(super) fn summary(played: &Progress) -> String {
     let Progress { telegrams, position_ns, took_ns, paused_ns, rate, lap, .. } = *played;
     let span = |ns: u64| match ns {
@@ -71,13 +72,14 @@ pub(super) fn summary(played: &Progress) -> String {
     words
 }
 
-/// As much as goes into `columns` but the last one, after which some terminals wrap.
+/// Returns the longest text that is shorter than `columns`. Some terminals wrap after the last column, so it stays
+/// empty.
 fn text(progress: &Progress, columns: usize) -> String {
     let texts = (0..=MAX_BREVITY).map(|brevity| shortened_text(progress, brevity));
     texts.into_iter().find(|text| text.len() < columns).unwrap_or_default()
 }
 
-/// Whole parts, the fewer the greater `brevity` is: first goes what helps least.
+/// Returns the text for a level of `brevity`. With each level, the least useful part is omitted or shortened.
 fn shortened_text(progress: &Progress, brevity: u32) -> String {
     let Progress { position_ns, length_ns, rate, is_paused, is_over, lap, telegrams, .. } = *progress;
     let mut text = clock(position_ns);
@@ -110,13 +112,13 @@ fn shortened_text(progress: &Progress, brevity: u32) -> String {
     text + if brevity < 3 { keys } else { "" }
 }
 
-/// Columns of the terminal; no end of them if it does not tell.
+/// Returns the number of columns of the terminal, or the maximum if it is unknown.
 fn columns() -> usize {
     let size = tcgetwinsize(stderr()).ok().map(|size| usize::from(size.ws_col));
     size.filter(|columns| *columns > 0).unwrap_or(usize::MAX)
 }
 
-/// Minutes, or hours where there are any, seconds and tenths.
+/// Formats a time as minutes, seconds and tenths, with hours if there are any.
 fn clock(ns: u64) -> String {
     let tenths = ns / 100_000_000;
     let (minutes, seconds) = (tenths / 600, tenths % 600);
@@ -127,11 +129,11 @@ fn clock(ns: u64) -> String {
     }
 }
 
-/// Places of the bar.
+/// Number of characters of the bar.
 const BAR_WIDTH: usize = 20;
-/// Brevity at which nothing is left but the time.
+/// Maximum brevity, with only the time left.
 const MAX_BREVITY: u32 = 8;
-/// To the line's begin, and nothing on it (ECMA-48).
+/// Control sequence that moves the cursor to the start of the line and clears the line (ECMA-48).
 const CLEAR_LINE: &str = "\r\x1b[K";
 
 #[cfg(test)]
