@@ -1,5 +1,5 @@
-//! Stores the commit that the module is built from, and the hash of its sources, so that the tests can detect a module
-//! of other sources.
+//! Build script that stores the commit from which the module is built, and the hash of its sources. With the hash, the
+//! tests detect a module that was built from other sources.
 
 mod sources;
 

@@ -1,5 +1,5 @@
-//! Hash of the sources of the native module. The build script compiles it in, and the tests compare it with that of
-//! their own sources, so that they detect a module of other sources.
+//! Hash of the sources of the native module. The build script compiles it in, and the tests compare it with the hash of
+//! the current sources.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 /// Directories below a package that do not change the module.
 const SKIPPED_DIRECTORIES: [&str; 4] = ["tests", "benches", "examples", "target"];
 
-/// Extensions of the files that change the module. Other files are documents, or products of Python, maturin or an editor.
+/// Extensions of the files that change the module. Other files are documents, or written by Python, maturin or an
+/// editor.
 const EXTENSIONS: [&str; 7] = ["rs", "toml", "txt", "py", "pyi", "typed", "lock"];
 
 /// Returns the hash of the sources in `packages`, relative to the directory `root` of the workspace.

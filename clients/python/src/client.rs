@@ -1,8 +1,8 @@
-//! The only contact with the client library: subscriptions to several topics or to the verdict of a robot, and the samples
-//! that a program keeps.
+//! Interface to the client library: subscriptions to several topics or to the verdict of a robot, and the samples that
+//! a program keeps.
 //!
-//! A program may use a subscription, and drop its samples, in any thread. Both are `Send` and not `Sync`, so each is behind a
-//! mutex.
+//! A program may use a subscription, and drop its samples, in any thread. Both are `Send` but not `Sync`, so a mutex
+//! protects each.
 #![allow(unsafe_code)]
 
 use std::collections::VecDeque;
@@ -27,10 +27,11 @@ use crate::sample::{Memory, Sample};
 
 type ClientError = scanhub_client::Error;
 
-/// Maximum time of one wait. After it, the caller handles signals.
+/// Maximum duration of one wait. Afterwards, the caller handles signals.
 const MAX_WAIT: Duration = Duration::from_millis(100);
 
-/// Time after which the program gets a warning of topics without a first sample, if there is a reason for the silence.
+/// Time after which the program gets a warning about topics without a first sample, if there is a reason for the
+/// silence.
 const WARN_AFTER: Duration = Duration::from_secs(2);
 
 /// Interval of the checks for the reason, after the first one has found none.
@@ -72,7 +73,7 @@ impl DomainOptions {
     }
 }
 
-/// Value that stays where it is used by one thread at a time, and that a child after `fork` neither uses nor drops, because it
+/// Cell with a value that one thread at a time uses. A child after `fork` neither uses nor drops the value, because it
 /// belongs to the parent.
 pub(crate) struct ForkSafeCell<T> {
     value: Mutex<Option<T>>,
@@ -103,9 +104,10 @@ impl<T> ForkSafeCell<T> {
         self.process == process::id()
     }
 
-    /// Calls `apply` with the value, after other threads have finished with it. `None` if it was taken or belongs to the parent.
+    /// Waits until other threads have finished with the value, and calls `apply` with it. Returns `None` if the value
+    /// was taken or belongs to the parent.
     pub(crate) fn with<R>(&self, apply: impl FnOnce(&mut T) -> R) -> Option<R> {
-        // A thread of the parent may have held the lock at the fork.
+        // Do not lock in a child, because a thread of the parent may have held the lock at the fork.
         if self.is_own() { self.lock().as_mut().map(apply) } else { None }
     }
 
@@ -136,50 +138,52 @@ impl Drop for Reservation<'_> {
     }
 }
 
-/// A source of items, with or without a descriptor to poll.
+/// Source of items, with or without a descriptor to poll.
 pub(crate) trait PollableSource: Sized + Send {
     /// Received item.
     type Item;
 
-    /// Returns the next item that has arrived. `None` while there are notices.
+    /// Returns the next item that has arrived. `None` while notices must be taken first.
     fn try_next(&mut self) -> Result<Option<Self::Item>, Error>;
 
-    /// Sleeps until an item may have arrived, at most for `longest` and 0.1 s.
+    /// Sleeps until an item may have arrived, for at most `longest` and at most 0.1 s.
     fn wait(&mut self, longest: Duration) -> Result<(), Error>;
 
-    /// Uses events from now on, and returns the descriptor to poll.
+    /// Changes the method of waiting to events, and returns the descriptor to poll.
     fn descriptor(&mut self) -> Result<i32, Error>;
 
-    /// Leaves the domain for good.
+    /// Leaves the domain permanently.
     fn leave(&mut self);
 
-    /// Returns whether it has left the domain.
+    /// Returns whether the source has left the domain.
     fn has_left(&self) -> bool;
 
-    /// Returns whether a hub or listener publishes in the domain, as of the last look.
+    /// Returns whether a hub or listener publishes in the domain, as of the last check.
     fn hub_is_running(&self) -> bool;
 
-    /// Returns the time since the last sample; if there was none, since the start. Time in suspend counts.
+    /// Returns the time since the last sample, or since the start if there was none. Includes the time that the machine
+    /// was suspended.
     fn silent_for(&self) -> Duration;
 
-    /// Takes the oldest change of the hub that was not taken yet.
+    /// Returns the oldest notice about the hub that was not returned yet.
     fn next_notice(&mut self) -> Option<&'static str> {
         None
     }
 
-    /// Returns the time of the next check for a warning. `None` after the warning, and if there is nothing to warn of.
+    /// Returns the time of the next check for a warning. `None` after the warning, and if there is nothing to warn
+    /// about.
     fn warn_at(&mut self) -> &mut Option<Instant>;
 
-    /// Returns the reasons why nothing was received since the start, each once. Empty if nothing is wrong. A subscription to
-    /// several topics checks those without a first sample.
+    /// Returns the distinct reasons why nothing was received since the start. Empty if nothing is wrong. A subscription
+    /// to several topics checks those without a first sample.
     fn why_silent(&mut self) -> Vec<Silence>;
 
-    /// Returns the time until [`warning`](Self::warning) must be called, if it may return something.
+    /// Returns the time until [`warning`](Self::warning) must be called, if it may return a reason.
     fn warning_due(&mut self) -> Option<Duration> {
         self.warn_at().map(|at| at.saturating_duration_since(Instant::now()))
     }
 
-    /// Returns the reason why nothing was received, once and after [`WARN_AFTER`].
+    /// Returns the reason why nothing was received, once, after [`WARN_AFTER`].
     fn warning(&mut self) -> Option<Error> {
         self.warn_at().take_if(|at| *at <= Instant::now())?;
         let reason = Error::of_silence(&self.why_silent());
@@ -199,14 +203,15 @@ pub(crate) trait PollableSource: Sized + Send {
 pub(crate) struct Topics {
     session: Session,
     sources: Vec<TopicState>,
-    /// Index of the source that is next in the round, so that no topic waits for the samples of another one.
+    /// Index of the source that is polled next. Sources take turns, so that no topic waits for the samples of another
+    /// one.
     next_source: usize,
     wait: Option<Wait>,
     /// Descriptor to poll, if the subscription waits by event.
     descriptor: Option<Arc<OwnedFd>>,
     notices: VecDeque<&'static str>,
-    /// Time of the next check for a warning; `None` before the first look, after the warning, and when all topics have had a
-    /// sample.
+    /// Time of the next check for a warning; `None` before the first check, after the warning, and when all topics have
+    /// had a sample.
     warn_at: Option<Instant>,
     has_left: bool,
 }
@@ -215,7 +220,7 @@ struct TopicState {
     name: Name,
     source: Source,
     last: Header,
-    /// Whether it has had no sample yet.
+    /// Whether the topic has had no sample yet.
     is_first: bool,
 }
 
@@ -239,11 +244,11 @@ impl Topics {
 
     fn check_and_receive(&mut self) -> Result<Option<(usize, AnySample)>, Error> {
         loop {
-            // A callback that fails must not lose a sample, so the program gets the notices first.
+            // Deliver notices before samples, so that a callback that fails does not lose a sample.
             if !self.notices.is_empty() {
                 return Ok(None);
             }
-            // Samples that have arrived come first, because a check for the hub takes longer than receiving.
+            // Receive samples before the check for the hub, because the check takes longer.
             if let Some(received) = self.receive(true)? {
                 return Ok(Some(received));
             }
@@ -266,7 +271,7 @@ impl Topics {
         }
     }
 
-    /// Checks for the hub, and notes its changes.
+    /// Checks for the hub, and queues notices about its changes.
     fn check_hub(&mut self) -> Result<(), Error> {
         let Change { ended, started } = self.session.check_hub()?;
         self.notices.extend(ended.map(|_| "hub_gone"));
@@ -303,7 +308,7 @@ impl Topics {
         Ok(None)
     }
 
-    /// Sets the method of waiting with the first look.
+    /// Sets the method of waiting, at the first check.
     fn begin(&mut self, wait: Wait) {
         (self.wait, self.warn_at) = (Some(wait), Some(Instant::now() + WARN_AFTER));
     }
@@ -312,15 +317,15 @@ impl Topics {
         self.sources.iter().filter_map(|followed| followed.source.time_left()).min()
     }
 
-    /// Returns the reasons for the silence of the sources for which `is_checked`, each once.
+    /// Returns the distinct reasons for the silence of the sources for which `is_checked` returns true.
     fn reasons(&mut self, is_checked: impl Fn(&TopicState) -> bool) -> Vec<Silence> {
         let mut reasons = Vec::new();
-        // The sources check for the hub, too, and would not note its changes. They return the same errors.
+        // Check first, because the sources check for the hub too, but queue no notices. They return the same errors.
         let _ = self.check_hub();
         for followed in self.sources.iter_mut().filter(|followed| is_checked(followed)) {
             match followed.source.why_silent(&mut self.session) {
                 Silence::Waiting => {}
-                // It is the reason for all of them.
+                // This reason applies to all sources.
                 reason @ (Silence::NoHub { .. } | Silence::OtherUser { .. }) => return vec![reason],
                 reason if reasons.contains(&reason) => {}
                 reason => reasons.push(reason),
@@ -336,7 +341,7 @@ impl PollableSource for Topics {
     fn leave(&mut self) {
         (self.has_left, self.warn_at) = (true, None);
         self.notices.clear();
-        // Samples that the program keeps stay.
+        // Samples that the program keeps stay readable.
         self.sources.clear();
         self.session = Session::new(Vec::new());
     }
@@ -360,7 +365,7 @@ impl PollableSource for Topics {
         self.warn_at.take_if(|_| self.sources.iter().all(|followed| !followed.is_first));
         let (missed, stale) = (sample.missed(), matches!(&sample, AnySample::Zones(update) if update.stale));
         let memory = match &sample {
-            // The client library has a copy already.
+            // The client library has already copied the zones.
             AnySample::Zones(_) => Memory::copy_of(sample.bytes()),
             _ => {
                 let bytes = sample.bytes();
@@ -415,7 +420,7 @@ impl PollableSource for Topics {
     fn why_silent(&mut self) -> Vec<Silence> {
         let mut reasons = self.reasons(|followed| followed.is_first);
         if self.sources.iter().any(|followed| !followed.is_first) {
-            // The hub has run, and `on_notice` reports its end.
+            // If the hub has run before, `on_notice` reports its end.
             reasons.retain(|reason| !matches!(reason, Silence::NoHub { .. } | Silence::OtherUser { .. }));
         }
         reasons
@@ -471,16 +476,16 @@ pub(crate) struct Verdicts {
     sensors: Vec<String>,
     domain_options: DomainOptions,
     early: bool,
-    /// `None` after it has left.
+    /// Subscriber that waits without a descriptor; `None` after it has left.
     robot: Option<RobotSubscriber>,
-    /// Takes the place of `robot` if the program polls.
+    /// Subscriber that replaces `robot` if the program polls.
     pollable: Option<PollableSubscriber<Robot>>,
     wait: Option<Wait>,
     /// Time of the next check for a warning; `None` after the warning, and after a verdict other than unknown.
     warn_at: Option<Instant>,
 }
 
-/// Verdict of a robot, by value.
+/// Copy of the verdict of a robot.
 pub(crate) struct Verdict {
     pub(crate) verdict: &'static str,
     pub(crate) worst: Option<String>,
@@ -507,7 +512,7 @@ impl Verdicts {
         Ok(Verdicts { sensors, domain_options, early, robot, pollable: None, wait: None, warn_at })
     }
 
-    /// Returns what is known now. Never waits.
+    /// Returns the current verdict. Never waits.
     pub(crate) fn now(&mut self) -> Result<Verdict, Error> {
         let Some(robot) = self.subscriber() else { return Ok(Verdict::default()) };
         let verdict = verdict(robot.now()?);
@@ -552,7 +557,7 @@ impl PollableSource for Verdicts {
 
     fn descriptor(&mut self) -> Result<i32, Error> {
         if self.wait.is_none() {
-            // Nothing was received, so another subscriber misses nothing.
+            // Nothing was received yet, so the new subscriber misses nothing.
             if self.robot.is_some() {
                 let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
                 self.pollable = Some(builder(&sensors, &self.domain_options, self.early).open_pollable()?);
@@ -607,7 +612,7 @@ fn verdict(robot: &Robot) -> Verdict {
     }
 }
 
-/// Published angles of a mount.
+/// Publication of the angles of a mount.
 pub(crate) struct Mount(Publication<Tilt>);
 
 impl Mount {
@@ -615,7 +620,7 @@ impl Mount {
         Ok(Mount(Publication::in_domain(&domain_options.publish_domain()?, name)?))
     }
 
-    /// Publishes the angle at `stamp_ns` of CLOCK_MONOTONIC. `None` means now.
+    /// Publishes the angle as of `stamp_ns` of CLOCK_MONOTONIC. `None` means now.
     pub(crate) fn send(&mut self, stamp_ns: Option<u64>, tilt: Tilt) -> Result<(), Error> {
         let fill = |sample: &mut Tilt| *sample = tilt;
         Ok(match stamp_ns {

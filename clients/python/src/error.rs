@@ -1,4 +1,4 @@
-//! Errors as exceptions of the Python package.
+//! Conversion of errors to exceptions of the Python package.
 
 use std::ffi::CString;
 
@@ -6,7 +6,7 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyModule, PyTuple};
 
-/// An error, with the name of its exception in `scanhub.errors`.
+/// Error, with the name of its exception in `scanhub.errors`.
 #[derive(Debug)]
 pub(crate) struct Error {
     pub(crate) class: &'static str,
@@ -24,7 +24,7 @@ impl Error {
         Error { message: format!("{what}: {}", self.message), ..self }
     }
 
-    /// Warns the program with `SilenceWarning`. Fails if warnings are errors.
+    /// Issues the warning `SilenceWarning`. Returns it as an error if the program treats warnings as errors.
     pub(crate) fn warn(&self, py: Python<'_>) -> PyResult<()> {
         let text = format!("nothing yet: {}\n  {}", self.message, self.remedy);
         let category = PyModule::import(py, "scanhub.errors")?.getattr("SilenceWarning")?;

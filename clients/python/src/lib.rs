@@ -1,5 +1,5 @@
-//! The native part of the Python package `scanhub`: the module `scanhub._scanhub` on top of `scanhub_client`. The package adds
-//! the functions that programs call, the exceptions and the named tuples.
+//! Native part of the Python package `scanhub`: the module `scanhub._scanhub`, based on `scanhub_client`. The package
+//! adds the functions that programs call, the exceptions and the named tuples.
 
 mod client;
 mod error;
@@ -29,11 +29,11 @@ use sample::Sample;
 
 #[pymodule]
 fn _scanhub(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    // With the first array, it would delay the first sample.
+    // Import it now, because an import with the first array would delay the first sample.
     module.py().import("numpy")?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("__commit__", env!("SCANHUB_COMMIT"))?;
-    // For tests, and not a name that the module exports.
+    // This attribute is only for tests.
     module.setattr("_sources", env!("SCANHUB_SOURCES"))?;
     module.add_class::<Sample>()?;
     topics::add_to(module)?;
@@ -58,7 +58,7 @@ fn parse(text: &str) -> Result<Name, Error> {
     Ok(Name { sensor: sensor.into(), topic })
 }
 
-/// Returns the names of the running hub's sensors and topics.
+/// Returns the sensors and topics of the running hub, by name.
 #[pyfunction]
 #[pyo3(name = "_topics")]
 fn topic_names(
@@ -97,8 +97,8 @@ fn request(
     model.map(|model| topics::wrap(py, model)).transpose()
 }
 
-/// Returns the result of `work`, which another thread does: only the main thread handles signals, and it must not wait
-/// for long. The thread continues after a signal that raises an exception.
+/// Returns the result of `work`, which runs in another thread, because only the main thread handles signals, and it
+/// must not wait for long. The thread continues after a signal that raises an exception.
 fn interruptible<T: Send + 'static>(
     py: Python<'_>,
     work: impl FnOnce() -> T + Send + 'static,
@@ -145,7 +145,7 @@ impl Publication {
             let what = format!("{sensor} is not the name of a mount");
             return Err(Error::new("Impossible", what, "one without a dot, for example mount").into());
         }
-        // A publication is created and used by one thread at a time.
+        // Only one thread at a time creates and uses a publication.
         let mount =
             py.detach(|| Mount::new(&sensor, &DomainOptions { domain, root }).map(ForkSafeCell::new))?;
         Ok(Publication(mount))

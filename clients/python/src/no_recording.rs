@@ -1,4 +1,4 @@
-//! Replaces `recording.rs` in builds without the feature `read`.
+//! Replacement of `recording.rs` in builds without the feature `read`.
 
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};

@@ -1,4 +1,4 @@
-//! Samples that the code of the hub computes from a recording, without a hub.
+//! Samples of a recording, computed by the code of the hub without a running hub.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -208,7 +208,7 @@ fn in_python(text: &str) -> String {
     let mut parts = text.split("set link.");
     let mut python = parts.next().unwrap_or_default().to_owned();
     for part in parts {
-        // A key, and maybe its value.
+        // The option may be followed by its value.
         let len = part.find([' ', ',', ';', ':']).unwrap_or(part.len());
         let (setting, remainder) = part.split_at(len);
         let (value, remainder) = match remainder.strip_prefix(" = \"").and_then(|rest| rest.split_once('"')) {
@@ -235,7 +235,7 @@ struct Scans {
 enum Angles {
     #[default]
     Unknown,
-    /// A row for all scans, which have these values of `first_angle` and `step`.
+    /// One row for all scans, which have these values of `first_angle` and `step`.
     Same(f64, f64, Vec<f64>),
     PerScan(Rows),
 }
@@ -281,7 +281,7 @@ impl Scans {
     }
 }
 
-/// A table whose rows are as long as the longest one.
+/// Table whose rows are as long as the longest one.
 #[derive(Default)]
 struct Rows {
     values: Vec<f64>,

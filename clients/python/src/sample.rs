@@ -1,4 +1,4 @@
-//! Samples: header and payload in shared memory or in a copy, and numpy arrays of them.
+//! Samples, with header and payload in shared memory or in a copy, and numpy arrays of their data.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -16,9 +16,9 @@ use crate::topics;
 /// Payload of a sample.
 #[expect(clippy::large_enum_variant, reason = "it is always behind an `Arc`")]
 pub(crate) enum Memory {
-    /// In shared memory.
+    /// Payload in shared memory.
     Hub(SharedPayload),
-    /// A copy of this number of bytes.
+    /// Copy of the payload, with its number of bytes.
     Copy(Vec<u64>, usize),
 }
 
@@ -46,7 +46,7 @@ impl Memory {
     }
 }
 
-/// Implements the properties of a class, and then its methods. Each property is an expression of the object, the
+/// Implements the properties of a class, and then its methods. Each property is an expression that uses the object, the
 /// sample and its payload.
 #[macro_export]
 macro_rules! getters {
@@ -113,7 +113,7 @@ getters! {
     quality: &'static str = if header.quality == 0 { "clean" } else { "suspect" };
     /// Reasons why the telegram is suspect.
     reasons: PyResult<Bound<'py, PyTuple>> = PyTuple::new(slf.py(), Reasons::names(header.reasons).collect::<Vec<_>>());
-    /// Flags that are set: `simulated`, `replayed`, `stamp_estimated`, `remote_machines`.
+    /// Flags that are set: `simulated`, `replayed`, `stamp_estimated`, `remote`.
     flags: PyResult<Bound<'py, PyFrozenSet>> = PyFrozenSet::new(slf.py(), Flags::names(header.flags));
     /// Nominal period of the scans in microseconds; None if unknown.
     period_us: Option<u32> = Some(header.period_us).filter(|period_us| *period_us != 0);

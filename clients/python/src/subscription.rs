@@ -1,4 +1,4 @@
-//! Subscriptions to topics and to the verdict of a robot. While a subscription waits, other threads of Python run.
+//! Subscriptions to topics and to the verdict of a robot. While a subscription waits, other Python threads can run.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use crate::client::{DomainOptions, ForkSafeCell, PollableSource, Topics, Verdict
 use crate::error::{Error, value};
 use crate::{parse, topics};
 
-/// Returns the next item, after a wait if none has arrived. `None` if the subscription is closed.
+/// Returns the next item, and waits if none has arrived. `None` if the subscription is closed.
 fn next<F: PollableSource>(
     py: Python<'_>,
     this: &Arc<ForkSafeCell<F>>,
@@ -20,7 +20,7 @@ fn next<F: PollableSource>(
 ) -> PyResult<Option<F::Item>> {
     let _reserved = this.reserve()?;
     let until = timeout.and_then(|seconds| {
-        // A timeout that is too long for the clock is none.
+        // A timeout that is too long for the clock never expires.
         Instant::now().checked_add(Duration::try_from_secs_f64(seconds.max(0.0)).ok()?)
     });
     loop {
@@ -45,7 +45,7 @@ fn poll<F: PollableSource>(
 ) -> PyResult<Option<F::Item>> {
     // The callback may close the subscription.
     while is_open(this) {
-        // First, because a topic can be silent while another one always has samples.
+        // Warn first, because a topic can be silent while another one always has samples.
         warn(py, this)?;
         let item = this.with(F::try_next).transpose()?.flatten();
         if item.is_some() || !notify(py, this, notice)? {
@@ -55,7 +55,8 @@ fn poll<F: PollableSource>(
     Ok(None)
 }
 
-/// Calls the program with each notice. Returns whether there was one. If the call fails, the others stay.
+/// Calls the program's callback with each notice. Returns whether there was a notice. If a call fails, the remaining
+/// notices stay queued.
 fn notify<F: PollableSource>(
     py: Python<'_>,
     this: &Arc<ForkSafeCell<F>>,
@@ -91,7 +92,7 @@ fn closed() -> Error {
     Error::new("Failure", "the subscription is closed", "subscribe again")
 }
 
-/// Implements a subscription with the methods that are the same for all of them. `$convert` makes an object of an item.
+/// Implements a subscription with the methods that all subscriptions share. `$convert` converts an item to an object.
 macro_rules! follower {
     ($class:ident, |$py:ident, $item:ident| $convert:expr; $($own:tt)*) => {
         #[pymethods]
@@ -115,7 +116,7 @@ macro_rules! follower {
             /// Whether a hub or listener publishes in the domain, as of the last look.
             #[getter]
             fn hub_is_running(&self, py: Python<'_>) -> bool {
-                // A thread that waits has the lock for a tenth of a second.
+                // A waiting thread can hold the lock for a tenth of a second.
                 py.detach(|| self.source.with(|source| source.hub_is_running())).unwrap_or_default()
             }
 

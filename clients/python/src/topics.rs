@@ -316,7 +316,7 @@ getters! {
 
 getters! {
     Background(slf, sample: slf.as_super().get(), background) = client::Background::of_words(cast_slice(sample.memory.words()));
-    /// Number of the model. It increases by 1 after a reset, a load, and a change of the beams or the unit.
+    /// Generation of the background. It increases by 1 after a reset, a load, and a change of the beams or the unit.
     generation: u32 = background.generation;
     /// Number of beams whose background is known.
     known_beams: u16 = background.known_beams;
@@ -351,7 +351,7 @@ getters! {
 
 getters! {
     Status(slf, sample: slf.as_super().get(), status) = fixed::<client::Status>(sample);
-    /// `missing_topics`, `probing`, `switching`, `starting`, `streaming_bench`, `silent_switches` or `paused_time`.
+    /// State of the link: `absent`, `probing`, `switching`, `starting`, `streaming`, `silent` or `paused`.
     state: &'static str = status.state().map_or("unknown", client::State::name);
     /// Stamp of the start of the state, in ns of `time.monotonic_ns()`.
     since_ns: u64 = status.since_ns;
@@ -466,7 +466,7 @@ getters! {
     last: bool = cloud.has(client::Cloud::LAST);
     /// Whether the sweep went from one reversal to the next, and no angle was missing.
     complete: bool = cloud.has(client::Cloud::COMPLETE);
-    /// Whether the angles contradict the background, so that nothing is known of obstacles.
+    /// Whether the angles contradict the background, so that obstacles are unknown.
     unreliable: bool = cloud.has(client::Cloud::UNRELIABLE);
     /// Number of points.
     count: usize = cloud.points().len();
@@ -502,7 +502,7 @@ getters! {
     generation: u32 = obstacles.generation;
     /// Whether the sweep went from one reversal to the next, and no angle was missing.
     complete: bool = obstacles.has(client::Obstacles::COMPLETE);
-    /// Whether the angles contradict the background, so that nothing is known of obstacles.
+    /// Whether the angles contradict the background, so that obstacles are unknown.
     unreliable: bool = obstacles.has(client::Obstacles::UNRELIABLE);
     /// Number of obstacles that did not fit.
     dropped: u32 = obstacles.dropped;
