@@ -1,5 +1,5 @@
-//! The shared library's name at run time, so that a program in C finds the version that it was linked to. Another first
-//! number of a layout or a function is another name.
+//! Build script that sets the shared library's name at run time (soname), so that a C program finds the version to
+//! which it was linked. An incompatible change of a layout or a function requires another name.
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");

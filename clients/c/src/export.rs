@@ -1,5 +1,5 @@
-//! The functions of the header, one call each. A panic does not leave a function, and each error stores its message for
-//! `scanhub_error`.
+//! Functions of the header, each of which calls one function of this crate. A panic does not leave a function, and each
+//! error stores its message for `scanhub_error`.
 #![allow(unsafe_code)] // For the unmangled names. No block in this file is unsafe.
 
 use std::ffi::{CStr, c_char, c_int};
@@ -87,7 +87,7 @@ pub extern "C" fn scanhub_wait(handle: *mut Opaque, timeout_ms: c_int) -> c_int 
     answer(|| with(handle, |handle: &mut Handle| handle.wait(timeout)).map(c_int::from))
 }
 
-/// Lends the next sample. Returns 1 if there was one, and 0 otherwise.
+/// Lends the next sample. Returns 1 if a sample was waiting, and 0 otherwise.
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_take(handle: *mut Opaque, taken: *mut BorrowedSample) -> c_int {
     answer(|| {
@@ -109,8 +109,8 @@ pub extern "C" fn scanhub_release(taken: *mut BorrowedSample) -> c_int {
     answer(|| {
         let taken = sample(taken)?;
         let BorrowedSample { of, number, .. } = *taken;
-        // A sample that was released or never filled needs nothing. After an error, the thread that took it still has
-        // it.
+        // A sample that was released or never filled needs no release. After an error, the thread that took the sample
+        // still has it.
         if !of.is_null() {
             with(of, |handle: &mut Handle| handle.release(number))?;
         }

@@ -1,5 +1,5 @@
-//! The boundary to C: addresses from C as Rust references, the sample that C sees, and the error of a call. All unsafe
-//! code of this crate is here.
+//! Boundary to C: addresses from C as Rust references, the struct of a sample, and the error of a call. All unsafe code
+//! of this crate is in this module.
 #![allow(unsafe_code)]
 
 use std::cell::RefCell;
@@ -21,11 +21,11 @@ pub struct BorrowedSample {
     pub payload: *const c_void,
     /// Bytes of the payload.
     pub length: usize,
-    /// Samples of this topic that were sent before it and not received.
+    /// Number of samples of this topic that were sent before this one and not received.
     pub missed: u64,
-    /// 1: the hub restarted since the last sample.
+    /// 1 if the hub has restarted since the last sample.
     pub restarted: c_int,
-    /// 1: zones that are unknown after a silence.
+    /// 1 for zones that are unknown after a silence.
     pub stale: c_int,
     /// Handle that lent the sample.
     pub of: *mut Opaque,
@@ -54,8 +54,8 @@ pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallEr
     if address.is_null() {
         return Ok(None);
     }
-    // SAFETY: it is not NULL, and the header requires a text that ends with 0 and does not change during the call. No
-    // caller in this crate keeps it longer.
+    // SAFETY: the address is not NULL, and the header requires a text that ends with 0 and does not change during the
+    // call. No caller in this crate keeps the text longer.
     let text = unsafe { CStr::from_ptr(address) };
     let not_text = CallError::Argument("a name is not UTF-8", "names are made of a-z, 0-9, _ and -");
     text.to_str().map(Some).map_err(|_| not_text)
@@ -64,8 +64,8 @@ pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallEr
 /// Returns the memory for an output argument. Its old content may be anything.
 pub(crate) fn output<'a, T>(address: *mut T) -> Result<&'a mut MaybeUninit<T>, CallError> {
     check(address)?;
-    // SAFETY: it is not NULL and aligned, and the header requires room for one T that only the library uses during the
-    // call. No caller in this crate keeps it longer.
+    // SAFETY: the address is not NULL and is aligned, and the header requires memory for one T that only the library
+    // uses during the call. No caller in this crate keeps the reference longer.
     unsafe { address.cast::<MaybeUninit<T>>().as_mut() }.ok_or(NULL_ARGUMENT)
 }
 
@@ -90,8 +90,8 @@ pub(crate) fn write_names(names: &[String], address: *mut c_char, size: usize) -
         check(address)?;
         let is_end = |end: &usize| *end < size && (*end == text.len() || text.as_bytes()[*end] == b' ');
         let end = (1..=text.len()).rev().find(is_end).unwrap_or(0);
-        // SAFETY: the address is not NULL, and the header requires room for `size` bytes that only the library uses
-        // during the call. It writes `end` + 1 bytes, and `end` is less than `size`.
+        // SAFETY: the address is not NULL, and the header requires memory for `size` bytes that only the library uses
+        // during the call. The code writes `end` + 1 bytes, and `end` is less than `size`.
         unsafe {
             ptr::copy_nonoverlapping(text.as_ptr(), address.cast(), end);
             address.add(end).write(0);
@@ -114,16 +114,16 @@ const NULL_ARGUMENT: CallError = CallError::Argument("an argument is NULL", "giv
 
 /// Error of a call from C: a negative number for the program, and a message with a remedy for its user.
 pub(crate) enum CallError {
-    /// An invalid argument, and the remedy.
+    /// Invalid argument, with the remedy.
     Argument(&'static str, &'static str),
-    /// An error of the client library.
+    /// Error of the client library.
     Client(Error),
-    /// A panic. Its message is on stderr.
+    /// Panic, whose message is on stderr.
     Bug,
 }
 
 impl CallError {
-    /// Returns the number in the header, `SCANHUB_REFUSED_` .. .
+    /// Returns the number in the header, `SCANHUB_REFUSED_..`.
     fn number(&self) -> c_int {
         match self {
             CallError::Argument(..) => -1,
@@ -143,9 +143,9 @@ impl CallError {
             CallError::Client(error) => error.to_string(),
             CallError::Bug => "a bug in this library\n  stderr shows where; please report it".to_owned(),
         };
-        // Messages are printable, so they contain no 0.
+        // Messages are printable text, so they contain no 0.
         let message = CString::new(message).unwrap_or_default();
-        // A thread that is ending stores nothing.
+        // A thread that is ending cannot store the message.
         let _ = LAST.try_with(|last| last.replace(message));
         self.number()
     }

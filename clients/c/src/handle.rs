@@ -1,5 +1,6 @@
-//! Objects behind the handles of a C program, and the table of the handles of a thread. An object is a subscription to
-//! any topic, with the samples that are lent to the program, or a mount whose angles the program publishes.
+//! Objects behind the handles of a C program, and the table of the handles of a thread. An object is either a
+//! subscription to any topic, with the samples that are lent to the program, or a mount whose angles the program
+//! publishes.
 //!
 //! A handle is a number that looks like an address. The table looks up each number that C passes, and never
 //! dereferences it. A child after `fork` has a copy of the table and never uses it, because the samples and the slots
@@ -24,9 +25,9 @@ use scanhub_schema::{Failure, Header, Kind, Tilt, Topic, limits};
 use crate::ffi::{BorrowedSample, CallError};
 use crate::silence::{silence_number, silence_text};
 
-/// An open subscription.
+/// Open subscription, with the samples that it has lent.
 pub(crate) struct Handle {
-    // Dropped before the source that lends the samples.
+    // This field is first, so that samples are dropped before the source that lends them.
     loans: [Option<(u64, Held)>; MAX_LOANS],
     found: Option<Held>,
     next: u64,
@@ -35,10 +36,10 @@ pub(crate) struct Handle {
     silence: CString,
 }
 
-/// Maximum number of samples that are lent at a time: as many as a subscriber can borrow from the hub.
+/// Maximum number of samples that are lent at a time. It is the number that a subscriber can borrow from the hub.
 const MAX_LOANS: usize = limits::MAX_BORROWED_SAMPLES;
 
-/// Kind of the subscriber of a topic: zones expire, other samples do not.
+/// Selects the subscriber type of a topic. Zones expire, other samples do not.
 macro_rules! kind {
     (Zones $payload:tt) => {
         ZonesUpdate
@@ -48,7 +49,7 @@ macro_rules! kind {
     };
 }
 
-/// Subscriber that waits as the program has chosen. Only one that waits by event has a descriptor.
+/// Subscriber with the chosen method of waiting. Only a subscriber that waits by event has a descriptor.
 enum Port<T: Subscribe + ?Sized> {
     Sleeping(Subscriber<T>),
     Pollable(PollableSubscriber<T>),
@@ -85,7 +86,7 @@ impl<T: Subscribe + ?Sized> Port<T> {
     }
 }
 
-/// Declares the sources and samples from the table of topics. A robot combines the zones of its sensors.
+/// Declares the enums of sources and samples from the table of topics. A robot combines the zones of its sensors.
 macro_rules! topics {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         enum Source { Robot(Port<Robot>), $($topic(Port<kind!($topic $payload)>),)* }
@@ -158,7 +159,7 @@ macro_rules! topics {
 
 scanhub_schema::for_each_topic!(topics);
 
-/// Converts a sample to the struct that a program in C reads.
+/// Conversion of a sample to the struct that a C program reads.
 trait Lend {
     fn lend(&self) -> BorrowedSample;
 }
@@ -187,7 +188,7 @@ impl<P: Payload + ?Sized> Lend for Received<P> {
 }
 
 impl Handle {
-    /// Follows `topic` of `sensor` in `domain`, or in the domain that the environment names.
+    /// Subscribes to `topic` of `sensor` in `domain`, or in the domain that the environment names.
     pub(crate) fn open(
         domain: Option<&str>,
         sensor: &str,
@@ -197,8 +198,8 @@ impl Handle {
         Ok(Handle::of(Source::open(domain, sensor, topic, wait)?))
     }
 
-    /// Follows the robot of `sensors` (if empty: all) in `domain`, as [`open`](Self::open) does, with or without
-    /// `early` warnings.
+    /// Subscribes to the robot of `sensors` (if empty, of all sensors) in `domain`, as [`open`](Self::open) does, with
+    /// or without `early` warnings.
     pub(crate) fn open_robot(
         domain: Option<&str>,
         sensors: &[&str],
@@ -214,7 +215,7 @@ impl Handle {
         Handle { loans: Default::default(), found: None, next: 1, source, silence: CString::default() }
     }
 
-    /// Waits until there is a sample to take, but not longer than `timeout`. Returns whether there is a sample.
+    /// Waits until a sample can be taken, but not longer than `timeout`. Returns whether a sample can be taken.
     pub(crate) fn wait(&mut self, timeout: Option<Duration>) -> Result<bool, CallError> {
         let until = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
@@ -265,7 +266,7 @@ impl Handle {
         Ok(())
     }
 
-    /// Returns the descriptor of a handle that waits by event, as [`PollableSubscriber`] has it.
+    /// Returns the descriptor of a handle that waits by event, see [`PollableSubscriber`].
     pub(crate) fn descriptor(&self) -> Result<c_int, CallError> {
         Ok(self.source.descriptor()?)
     }
@@ -280,8 +281,8 @@ impl Handle {
         self.source.silent_for()
     }
 
-    /// Returns why no sample arrives, as [`Subscriber::why_silent`] does: SCANHUB_SILENCE_.. of the header, and the text,
-    /// which lives until the next call.
+    /// Returns why no sample arrives, as [`Subscriber::why_silent`] does: the number SCANHUB_SILENCE_.. of the header,
+    /// and the text, which is valid until the next call.
     pub(crate) fn why_silent(&mut self) -> (c_int, &CStr) {
         let silence = self.source.why_silent();
         // Messages are printable, so they contain no 0.
@@ -320,7 +321,7 @@ struct SensorVerdict {
     nearest_mm: u32,
 }
 
-/// The verdict of a robot, and the memory that it points to: C may read it while it is lent.
+/// Verdict of a robot, with the memory to which it points. C may read both while the verdict is lent.
 struct OwnedVerdict {
     verdict: Verdict,
     _sensors: Box<[SensorVerdict]>,
@@ -329,7 +330,7 @@ struct OwnedVerdict {
 
 impl OwnedVerdict {
     fn new(robot: &Robot) -> OwnedVerdict {
-        // Names have no 0 in them.
+        // Names contain no 0.
         let names: Vec<CString> =
             robot.zones().map(|(name, _)| CString::new(name).unwrap_or_default()).collect();
         let of_sensor = |((_, zones), name): ((&str, &scanhub_schema::Zones), &CString)| SensorVerdict {
@@ -354,7 +355,7 @@ impl OwnedVerdict {
         OwnedVerdict { verdict, _sensors: sensors, _names: names }
     }
 
-    /// Returns what is lent. The memory that it points to lives as long as `self`.
+    /// Returns the struct that is lent. The memory to which it points lives as long as `self`.
     fn verdict(&self) -> &Verdict {
         &self.verdict
     }
@@ -363,23 +364,23 @@ impl OwnedVerdict {
 /// SCANHUB_NOTHING_MM of the header.
 const NOTHING_MM: u32 = u32::MAX;
 
-/// A mount whose angles are published.
+/// Mount whose angles are published.
 pub(crate) struct Mount(Publication<Tilt>);
 
 impl Mount {
-    /// Publishes as `name` in `domain`, or in the domain that the environment names.
+    /// Starts to publish as `name` in `domain`, or in the domain that the environment names.
     pub(crate) fn publish(domain: Option<&str>, name: &str) -> Result<Mount, CallError> {
         Ok(Mount(Publication::in_domain(&publish_domain(domain)?, name)?))
     }
 
-    /// Publishes the angle at `stamp_ns` of CLOCK_MONOTONIC; 0 means now.
+    /// Publishes the angle as of `stamp_ns` of CLOCK_MONOTONIC; 0 means now.
     pub(crate) fn send(&mut self, stamp_ns: u64, tilt: Tilt) -> Result<(), CallError> {
         let fill = |sample: &mut Tilt| *sample = tilt;
         Ok(if stamp_ns == 0 { self.0.send(fill) } else { self.0.send_at(stamp_ns, fill) }?)
     }
 }
 
-/// `struct scanhub_attachment` and `struct scanhub_publication` of the header. No value of it exists.
+/// `struct scanhub_attachment` and `struct scanhub_publication` of the header. No value of this type exists.
 #[repr(C)]
 pub struct Opaque {
     _nothing: [u8; 0],
@@ -408,7 +409,7 @@ impl Drop for Entry {
     fn drop(&mut self) {
         let object = self.object.take();
         if self.process != process::id() {
-            // The address is stored, so that a leak checker reports no leak.
+            // Keep the address, so that a leak checker reports no leak.
             let mut kept = INHERITED.lock().unwrap_or_else(PoisonError::into_inner);
             kept.extend(object.map(|object| Box::into_raw(object).expose_provenance()));
         }
