@@ -160,13 +160,16 @@ fn a_part_of_it_and_again() {
     let replayed = samples(&env.path("replayed.mcap"), "front/scan");
     assert!((8..=12).contains(&replayed.len()), "{} scans in a second", replayed.len());
     let ranges_of = |(_, payload): &(Header, Vec<u8>)| scan(payload).ranges().to_vec();
-    let mut rest = recorded.iter().map(ranges_of);
-    // The first and the last scan may be part of a revolution.
+    let expected: Vec<_> = recorded.iter().map(ranges_of).collect();
+    // The first and the last scan may be of a part of a revolution.
     let inner = &replayed[1..replayed.len() - 1];
-    assert!(
-        inner.iter().map(ranges_of).all(|ranges| rest.any(|then| then == ranges)),
-        "other scans, or another order"
-    );
+    let positions: Vec<_> =
+        inner.iter().map(|scan| expected.iter().position(|ranges| *ranges == ranges_of(scan))).collect();
+    let found: Vec<_> = positions.iter().flatten().collect();
+    assert!(!found.is_empty() && found.is_sorted_by(|a, b| a < b), "other scans, or another order: {positions:?}");
+    // On a busy machine, the recorder may have missed scans, which the replay computes from the telegrams.
+    let is_complete = recorded.windows(2).all(|pair| pair[1].0.topic_seq == pair[0].0.topic_seq + 1);
+    assert!(!is_complete || found.len() == inner.len(), "other scans: {positions:?}");
     assert!(replayed.windows(2).all(|pair| pair[0].0.stamp_first_ns < pair[1].0.stamp_first_ns));
     let file = env.path_argument("telegrams.mcap");
     let player =

@@ -232,8 +232,12 @@ impl LdSession {
                 self.listen(State::Silent);
             }
             Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(self.now) => {
-                let is_damaged = self.counters.is_mostly_damaged(self.framer.buffer.byte_counters());
-                self.problem = (!is_damaged).then_some(Problem::HeadBlocked);
+                self.problem = match self.counters.damaged_percent(self.framer.buffer.byte_counters()) {
+                    0 | 1 => Some(Problem::HeadBlocked),
+                    2..=50 => Some(Problem::DamagedRevolutions),
+                    // The hub reports such a line itself.
+                    _ => None,
+                };
             }
             _ => {}
         }
@@ -566,6 +570,8 @@ pub enum Problem {
     Silence,
     /// Packets arrive, but the head does not rotate.
     HeadBlocked,
+    /// No revolution is complete, because bytes are damaged on the line.
+    DamagedRevolutions,
     /// The number of points per revolution has changed, and with it the number of beams.
     BeamsChanged {
         /// Previous number of beams.
@@ -590,6 +596,10 @@ impl fmt::Display for Problem {
             Problem::HeadBlocked => {
                 f.write_str("packets arrive, but the head does not rotate: is it blocked?")
             }
+            Problem::DamagedRevolutions => f.write_str(
+                "packets arrive, but no revolution is complete, because bytes are damaged on the line: check the \
+                 cable, its ground and termination, and the adapter",
+            ),
             Problem::BeamsChanged { from, to } => {
                 write!(
                     f,

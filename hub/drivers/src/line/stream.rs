@@ -216,11 +216,11 @@ impl StreamCounters {
         self.revolution_start = (self.damaged, tally.in_packets);
     }
 
-    /// Returns whether most bytes since the last revolution were damaged. The next revolution may then be missing
-    /// because of the damage.
-    pub fn is_mostly_damaged(&self, tally: &ByteCounters) -> bool {
+    /// Returns the share of the bytes since the last revolution that were damaged, in percent.
+    pub fn damaged_percent(&self, tally: &ByteCounters) -> u64 {
         let (damaged, in_packets) = self.revolution_start;
-        self.damaged - damaged > tally.in_packets - in_packets
+        let (damaged, intact) = (self.damaged - damaged, tally.in_packets - in_packets);
+        100 * damaged / (damaged + intact).max(1)
     }
 
     /// Counts a restart of the session.

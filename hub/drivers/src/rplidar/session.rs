@@ -450,8 +450,12 @@ impl RplidarSession {
                 self.begin(State::Silent);
             }
             Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(now) => {
-                let is_damaged = self.counters.is_mostly_damaged(self.framer.buffer.byte_counters());
-                self.problem = (!is_damaged).then_some(Problem::HeadBlocked);
+                self.problem = match self.counters.damaged_percent(self.framer.buffer.byte_counters()) {
+                    0 | 1 => Some(Problem::HeadBlocked),
+                    2..=50 => Some(Problem::DamagedRevolutions),
+                    // The hub reports such a line itself.
+                    _ => None,
+                };
             }
             _ => {}
         }
@@ -715,6 +719,8 @@ pub enum Problem {
     Silence,
     /// Packets arrive, but the head does not rotate.
     HeadBlocked,
+    /// No revolution is complete, because bytes are damaged on the line.
+    DamagedRevolutions,
     /// The scanner reports a warning or an error.
     Unhealthy(Health),
     /// The scanner responds, but does not start to measure.
@@ -740,6 +746,10 @@ impl fmt::Display for Problem {
             Problem::HeadBlocked => {
                 f.write_str("packets arrive, but the head does not rotate: is it blocked?")
             }
+            Problem::DamagedRevolutions => f.write_str(
+                "packets arrive, but no revolution is complete, because bytes are damaged on the line: check the \
+                 cable, its ground and termination, and the adapter",
+            ),
             Problem::Unhealthy(health) => write!(f, "the scanner reports: {health}"),
             Problem::Refused => f.write_str("the scanner replies, but does not start to measure"),
             Problem::AmbiguousPackets => f.write_str(
