@@ -201,7 +201,7 @@ pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
         }
         let for_beams = place.matches("Box<[").count()
             + place.matches("; beams").count()
-            + place.matches("; CELLS]").count();
+            + place.matches("; CELL_COUNT]").count();
         HEAP.iter().map(|word| place.matches(word).count()).sum::<usize>() > for_beams
     });
     breaches.extend(on_heap);

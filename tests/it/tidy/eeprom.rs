@@ -40,17 +40,17 @@ fn only_configure_may_write_the_eeprom() {
                 "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n",
             ),
             tree.with("hub/drivers/src/lms/explain.rs", "//! Writes.\nlet telegram = Writer::new(0, SET);\n"),
-            tree.with("hub/drivers/src/lms/protocol_state.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
+            tree.with("hub/drivers/src/lms/protocol_state.rs", "//! Talks.\nuse crate::eeprom::EepromWrite;\n"),
             tree.with("hub/drivers/src/lms/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
             tree.with(
                 "hub/drivers/src/lms/request_channel.rs",
-                "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
+                "//! Sends.\nlet request = crate::eeprom::EepromWrite::Field(&[]);\n",
             ),
             tree.with("hub/daemon/src/link.rs", "//! A link.\nuse scanhub_lms_configure::Change;\n"),
             tree.with("hub/tools/src/probe.rs", "//! Probes.\nuse scanhub_lms_configure::{eeprom, Plan};\n"),
             tree.with(
                 "clients/verbs/src/planted.rs",
-                "//! Knows.\nuse scanhub_lms_configure::eeprom::Write;\n",
+                "//! Knows.\nuse scanhub_lms_configure::eeprom::EepromWrite;\n",
             ),
         ]
     });
@@ -68,7 +68,7 @@ fn consent_is_given_by_persons() {
             tree.with("hub/cli/planted.rs", planted),
             tree.with(
                 "hub/tools/src/configure.rs",
-                &ask.replace("fn ask_person", &format!("{planted}fn ask_person")),
+                &ask.replace("fn request_consent", &format!("{planted}fn request_consent")),
             ),
             tree.with(
                 "hub/lms-configure/src/plan.rs",
