@@ -28,7 +28,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("angles_unfit", &[]),
     ("pictures", &[]),
     ("trouble", &[]),
-    // Allowed for telegrams and datagrams that did not arrive, and for the reason of a verdict.
+    // Telegrams and datagrams that did not arrive.
     ("lost", &["summary demo", "lan listen", "lan_evicted listen", "bridge bridge", "leds leds"]),
     ("lan_given_up", &[]),
     ("bridge_given_up", &[]),
