@@ -289,7 +289,6 @@ impl Port {
     /// # Errors
     ///
     /// Returns an error if the line is lost.
-    /// Returns an error if the line is lost.
     pub fn changed_settings(&self) -> io::Result<Option<SettingsChange>> {
         self.tty().map_or(Ok(None), Tty::changed_settings)
     }
@@ -299,7 +298,6 @@ impl Port {
     ///
     /// # Errors
     ///
-    /// Returns an error if the line is lost.
     /// Returns an error if the line is lost.
     pub fn restore(&self, baud: u32) -> io::Result<()> {
         self.tty().map_or(Ok(()), |tty| tty.restore(baud))

@@ -2,7 +2,7 @@
 
 use scanhub_schema::{Nanos, line_time};
 
-/// Log of the last [`ReadLog::CAPACITY`] reads. Each entry has the offset of the byte after the read, and the time of
+/// Log of the last `CAPACITY` reads. Each entry has the offset of the byte after the read, and the time of
 /// the read.
 #[derive(Clone, Debug, Default)]
 pub struct ReadLog {
@@ -59,8 +59,9 @@ impl ReadLog {
         latest
     }
 
-    /// Returns the earliest time at which the byte at `offset` can have arrived. Returns `None` if the byte was in a
-    /// backlog: its read had more bytes than the scanner can have sent since the previous read.
+    /// Returns the earliest time at which the byte at `offset` can have arrived. Returns `None` if it is unknown,
+    /// because the log has no read before, or because the byte may have been in a backlog. A read has backlogged bytes
+    /// if it has more bytes than the scanner can have sent since the previous read.
     pub fn earliest(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         // The last read of a backlog in a full tty is shorter than the others, and the tty may return some more bytes a
         // moment later.

@@ -33,8 +33,8 @@ pub trait Protocol {
         false
     }
 
-    /// Handles that the port rejected the baud rate of the last [`Action::SetRate`]. Before the first action, handles
-    /// that the port rejected the rate at which it was to be opened. A protocol that can use other rates then tries
+    /// Handles that the port rejected the baud rate of the last [`Action::SetRate`]. A call before the
+    /// first action means that the port rejected its first baud rate. A protocol that can use other rates then tries
     /// those.
     fn reject_rate(&mut self, now: Nanos) {
         let _ = now;
