@@ -21,7 +21,7 @@ fn golden(size: usize, fields: &[(usize, &[u8])]) -> Vec<u8> {
     bytes
 }
 
-/// Returns the file of this name in `tests/vectors/v2`.
+/// Returns the bytes with this name in `tests/vectors/v2/bytes.txt`.
 fn read_vector(name: &str) -> Vec<u8> {
     let lines = include_str!("../../tests/vectors/v2/bytes.txt").lines();
     let digits = lines.filter_map(|line| line.split_once(' ')).find(|(of, _)| *of == name);

@@ -118,7 +118,7 @@ impl Mode {
         }
     }
 
-    /// Returns the number of upper bits that are a reflector level: 3, 2, 1 or 0. The other upper bits are field bits.
+    /// Returns the number of upper bits that are a reflector level: 3, 2 or 1, or 0 if they are field bits.
     pub fn intensity_bits(self) -> u8 {
         match self.0 {
             0x01 => 3,

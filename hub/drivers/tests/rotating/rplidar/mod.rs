@@ -237,7 +237,7 @@ enum ScannerState {
     Booting {
         until: Nanos,
     },
-    /// Time of the first point of the stream, and number of packets sent.
+    /// Packet format, time per point in microseconds, time of the first point of the stream, and number of packets sent.
     Measuring {
         kind: PacketFormat,
         us: f64,
