@@ -237,7 +237,7 @@ enum ScannerState {
     Booting {
         until: Nanos,
     },
-    /// Packet format, time per point in microseconds, time of the first point of the stream, and number of packets sent.
+    /// Packet format, microseconds per point, time of the first point of the stream, number of packets.
     Measuring {
         kind: PacketFormat,
         us: f64,
