@@ -11,8 +11,8 @@ use crate::{Failure, Kind};
 /// The table of topics. Calls the macro `$each` with its rows: with those of all topics, `links`: with those that a hub
 /// publishes for each link, or `makers`: with all rows in groups `MAKER { .. }`, one for each [`PublisherKind`].
 ///
-/// A row is `VARIANT PAYLOAD, name, number, type, group, rate, word, queue, history: description;`. Its columns are those
-/// of [`TopicSpec`], in that order. A payload other than `[u8]` is a type of this crate.
+/// A row is `VARIANT PAYLOAD, name, number, type, group, rate, word, queue, history: description;`. Its columns are
+/// those of [`TopicSpec`], in that order. A payload other than `[u8]` is a type of this crate.
 ///
 /// # Examples
 ///
