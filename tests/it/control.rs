@@ -1,4 +1,4 @@
-//! `scanhub control` with a running hub: pauses, resumes and restarts a sensor, and rejects invalid requests.
+//! `scanhub control` with a running hub: pauses, resumes and resyncs a sensor, and rejects invalid requests.
 
 use crate::testkit;
 use crate::testkit::{

@@ -100,7 +100,7 @@ fn leds_show_the_verdict_and_red_without_one() {
     diodes.wait_until_lit("rd");
     let hub = env.hub(&[env.link("front")]);
     diodes.wait_until_lit("gn mk");
-    // `leds` exits, so no program monitors the verdict any more, and it shows red.
+    // When `leds` exits, it switches to red, because no program monitors the verdict any more.
     let outcome = leds.end(INT);
     assert_eq!((outcome.exit_code, diodes.lit_names().as_deref()), (Some(0), Some("rd")), "{outcome}");
     assert_eq!(hub.end(TERM).exit_code, Some(0));

@@ -194,7 +194,7 @@ fn rejects_surplus_links_at_the_first_one() {
     assert_refused(&env, &["config", "check", &more], 78, "more.toml:770:8: more than 256 links");
     let far_more = env.file("far-more.toml", links(20_000));
     assert_refused(&env, &["config", "check", &far_more], 66, "it is longer than 524288 bytes");
-    // The hub stores the location of each of these values.
+    // The configuration stores the location of each of these values.
     let sectors = "{from_deg=1.0,to_deg=2.0,range=0.1},".repeat(13_000);
     let sectors = format!("{}[zones]\nbody_mask = [{sectors}]\n", links(2));
     let outcome = run_bounded(&env, &["config", "check", &env.file("sectors.toml", sectors)]);

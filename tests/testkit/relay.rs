@@ -81,7 +81,7 @@ impl Relay {
         inner.forwarded.len()
     }
 
-    /// Turns loss, delay and duplication on or off. Turning them off forwards all delayed datagrams at once.
+    /// Sets whether datagrams are dropped, delayed and duplicated. If not, forwards all delayed datagrams at once.
     pub(crate) fn set_faulty(&self, is_faulty: bool) {
         let mut inner = self.state();
         inner.is_faulty = is_faulty;

@@ -255,7 +255,7 @@ impl Stepper {
         }
     }
 
-    /// Waits until the thread stops. Returns the signal that stopped it, or `None` if ptrace did.
+    /// Waits until the thread stops. Returns the signal that stopped it, or `None` if ptrace stopped it.
     fn wait(&mut self) -> Result<Option<Signal>, String> {
         match waitpid(self.thread, Some(WaitPidFlag::__WALL)).map_err(trace_error)? {
             WaitStatus::Stopped(_, Signal::SIGTRAP)
