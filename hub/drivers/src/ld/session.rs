@@ -563,7 +563,7 @@ pub enum Problem {
     NoPackets {
         /// The only baud rate at which the session listened. `None` if it listened at both.
         baud: Option<u32>,
-        /// Duration in seconds, rounded down to a power of two.
+        /// Duration in seconds, rounded down to 1, 2, 4, ..
         seconds: u32,
     },
     /// No packet arrived for one second.

@@ -712,7 +712,7 @@ pub enum Problem {
     NoResponse {
         /// The only baud rate that the session tried. `None` if it tried all of them.
         baud: Option<u32>,
-        /// Duration in seconds, rounded down to a power of two.
+        /// Duration in seconds, rounded down to 1, 2, 4, ..
         seconds: u32,
     },
     /// No measured data arrived for one second.
