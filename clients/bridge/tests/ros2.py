@@ -1,6 +1,8 @@
-"""Looks at the bridge as nodes of ROS 2 do, without ROS: by PyPI's zenoh-ros2-sdk (graph and subscribers) and rosbags (types,
-hashes, CDR), and compares scans with what the hub's own consumers got. Usage: ros2.py PORT DOMAIN_ID SECONDS ECHO..., where
-each ECHO is a file of `scanhub echo SENSOR/scan --json` that grows meanwhile. Prints one JSON object."""
+"""Examines the bridge like a ROS 2 node, but without ROS: with zenoh-ros2-sdk (graph and subscribers) and rosbags
+(types, hashes, CDR) from PyPI. Compares scans with those that subscribers of the hub received. Prints one JSON object.
+
+Usage: ros2.py PORT DOMAIN_ID SECONDS ECHO... Each ECHO is a file to which `scanhub echo SENSOR/scan --json` writes
+during the test."""
 
 import json
 import math
@@ -23,12 +25,12 @@ store = get_typestore(Stores.ROS2_JAZZY)
 
 
 def text(name):
-    """The type with all that it contains, as rosbags knows it."""
+    """Returns the definition of a type with all types that it contains, from rosbags."""
     return store.generate_msgdef(name, ros_version=2)[0]
 
 
 def sdk_hash(name):
-    """The hash as zenoh-ros2-sdk computes it of the texts."""
+    """Returns the hash of a type, which zenoh-ros2-sdk computes from the definition."""
     first, *others = text(name).split("=" * 80 + "\nMSG: ")
     contained = {}
     for other in others:
@@ -58,14 +60,14 @@ def graph():
 
 
 def published(path):
-    """The scans of a file of lines, by the wall clock of beam 0."""
+    """Returns the scans in a file of JSON lines, by their `wall_ns`."""
     scans = {}
     with open(path) as lines:
         for line in lines:
             try:
                 scan = json.loads(line)
             except ValueError:
-                break  # still being written
+                break  # The line is still being written.
             if scan["class"] == "scan":
                 scans[scan["wall_ns"]] = scan
     return scans
@@ -76,7 +78,7 @@ def stamp_ns(header):
 
 
 def apart(message, scan):
-    """The greatest difference of angles, and whether all ranges are the float nearest to what was measured."""
+    """Returns the largest difference of angles, and whether every range is the float nearest to the measured one."""
     first, step = math.radians(scan["first_angle_deg"]), math.radians(scan["step_deg"])
     turned = step < 0
     if turned:
@@ -126,8 +128,8 @@ def main():
     for path, name in zip(echoes, scans):
         known = list(published(path).values())
         messages = heard[name]
-        # A message is stamped when its first beam was measured, an echo says when the telegram began: the same time apart
-        # for every scan of a sensor. The first message that has the ranges of a scan says how much.
+        # A message has the stamp of its first beam, and an echo that of the telegram's start. Their difference is the
+        # same for every scan of a sensor. It is taken from the first message with the ranges of a scan.
         lag = next((scan["wall_ns"] - stamp_ns(m.header) for m in messages for scan in known if apart(m, scan)[1]), 0)
         wanted = {scan["wall_ns"] - lag: scan for scan in known}
         pairs = [(message, wanted.get(stamp_ns(message.header))) for message in messages]
