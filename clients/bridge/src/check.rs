@@ -65,7 +65,11 @@ pub fn check(options: &BridgeOptions, stop: &AtomicBool, out: &mut dyn Write) ->
     }
     match findings.iter().filter(|finding| finding.state == "failed").count() {
         0 => Ok(()),
-        _ => Err(Failure::new(Kind::Check, "the bridge cannot work so", "its remedy is printed below it")),
+        _ => Err(Failure::new(
+            Kind::Check,
+            "the bridge would not work with these settings",
+            "its remedy is printed below it",
+        )),
     }
 }
 
@@ -105,7 +109,7 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
     let findings = match connection.session(&AtomicBool::new(true)) {
         Some(session) if is_linked => query_hubs(session)?,
         _ if !options.listen.is_empty() => {
-            vec![Finding::ok("it can listen; nobody is connected yet".to_owned())]
+            vec![Finding::ok("the bridge can listen; no client is connected yet".to_owned())]
         }
         _ => vec![unreachable(&reasons)],
     };
@@ -160,12 +164,12 @@ fn query_hubs(session: &ZenohSession) -> Result<Vec<Finding>, Failure> {
 fn check_hubs(hubs: &HubReplies) -> Vec<Finding> {
     let bad = |(hub, reply): (&u64, &Result<i64, DatagramError>)| match reply {
         Err(DatagramError::Version) => Some(Finding::failed(
-            format!("hub {hub:016x} speaks another version"),
+            format!("hub {hub:016x} uses another version"),
             "install the same version of scanhub-bridge on both machines",
         )),
         Err(error) => Some(Finding::failed(
-            format!("what hub {hub:016x} announces is refused as `{}`", error.name()),
-            "something else sends under its name: see the access control of the router",
+            format!("the announcement of hub {hub:016x} was rejected as `{}`", error.name()),
+            "another program sends under its ID: check the access control of the router",
         )),
         Ok(ahead_ns) if ahead_ns.unsigned_abs() > MAX_CLOCK_DIFFERENCE_NS => {
             let (seconds, which) =
@@ -174,7 +178,7 @@ fn check_hubs(hubs: &HubReplies) -> Vec<Finding> {
                 state: "warning",
                 ..Finding::failed(
                     format!("the clock of hub {hub:016x} is {seconds} s {which} this one"),
-                    "let both machines set their clocks by the network (`timedatectl set-ntp true`): ages cannot be told so",
+                    "synchronize the clocks of both machines (`timedatectl set-ntp true`): otherwise, ages are wrong",
                 )
             })
         }
@@ -183,10 +187,10 @@ fn check_hubs(hubs: &HubReplies) -> Vec<Finding> {
     let mut findings: Vec<Finding> = hubs.iter().filter_map(bad).collect();
     if findings.is_empty() {
         let text = match hubs.len() {
-            0 => "no hub is heard behind it".to_owned(),
+            0 => "no hub has announced itself".to_owned(),
             _ => {
                 let names: Vec<String> = hubs.keys().map(|hub| format!("{hub:016x}")).collect();
-                format!("heard: {}; their clocks and versions fit", names.join(", "))
+                format!("hubs: {}; their clocks and versions match", names.join(", "))
             }
         };
         findings.push(Finding::ok(format!("connected; {text}")));
@@ -230,7 +234,7 @@ mod tests {
             well.len() == 1 && well[0].state == "ok" && well[0].finding.contains("0000000000000002"),
             "{well:?}"
         );
-        assert!(of(&[])[0].finding.contains("no hub is heard"));
+        assert!(of(&[])[0].finding.contains("no hub has announced"));
         let bad =
             of(&[(1, Ok(7 * SECOND)), (2, Ok(-60 * SECOND)), (3, Err(DatagramError::Version)), (4, Ok(0))]);
         let states: Vec<_> = bad.iter().map(|it| it.state).collect();

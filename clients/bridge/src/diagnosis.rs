@@ -36,28 +36,28 @@ const KNOWN_CAUSES: &[KnownCause] = &[
     (
         &["recv opensyn. invalid", "recv initsyn. expected"],
         Diagnosis {
-            finding: "somebody was refused: the user or the password is wrong, or there is none",
-            remedy: "who may connect is in transport/auth/usrpwd/dictionary_file here, a line USER:PASSWORD each",
+            finding: "a client was refused: its user or password is wrong or missing",
+            remedy: "list the users in transport/auth/usrpwd/dictionary_file of this machine, one USER:PASSWORD per line",
         },
     ),
     (
         &["in response to an opensyn", "usrpwd", "authenticat", "password"],
         Diagnosis {
-            finding: "the user or the password is refused",
+            finding: "the router refused the user or the password",
             remedy: "compare transport/auth/usrpwd here with the router's dictionary_file",
         },
     ),
     (
         &["(reason 0) in response to an initsyn"],
         Diagnosis {
-            finding: "the router wants a user and a password",
+            finding: "the router requires a user and a password",
             remedy: "set transport/auth/usrpwd/user and password in the file of --config",
         },
     ),
     (
         &["unable to push non droppable"],
         Diagnosis {
-            finding: "a program that is connected read nothing for 5 s, so its link was closed",
+            finding: "a connected program has read nothing for 5 s, so its link was closed",
             remedy: "check whether it is stopped, or its network is too slow; it connects again by itself",
         },
     ),
@@ -76,20 +76,20 @@ const CERTIFICATE_CAUSES: &[KnownCause] = &[
         &["expired"],
         Diagnosis {
             finding: "a certificate has expired",
-            remedy: "renew it: the router's, or this machine's, whose date `openssl x509 -enddate` shows",
+            remedy: "renew the router's certificate, or this machine's; `openssl x509 -enddate` shows the date of each",
         },
     ),
     (
         &["notvalidyet", "not valid yet"],
         Diagnosis {
             finding: "a certificate is not valid yet",
-            remedy: "set the clock of this machine, or of the one that made it",
+            remedy: "set the clock of this machine, or of the one that created the certificate",
         },
     ),
     (
         &["certificate", "unknownissuer", "unknownca", "tls"],
         Diagnosis {
-            finding: "the certificates do not fit",
+            finding: "the certificates do not match",
             remedy: "root_ca_certificate must be the authority that signed the router's certificate, and --connect must name the \
                      router as its certificate does; a router with enable_mtls needs a connect_certificate",
         },
@@ -98,7 +98,7 @@ const CERTIFICATE_CAUSES: &[KnownCause] = &[
 
 /// Certificate error, as the side that listens reports it.
 const PEER_REFUSED: Diagnosis = Diagnosis {
-    finding: "somebody was refused: the certificates do not fit",
+    finding: "a client was refused: the certificates do not match",
     remedy: "a machine that connects must trust the authority of listen_certificate here; with enable_mtls, it must \
              also show a connect_certificate of the authority in root_ca_certificate here, which has not expired",
 };
@@ -115,7 +115,7 @@ mod tests {
             ("Unable to connect to tls/r:1! received fatal alert: UnknownCA", "do not fit", "--connect"),
             (
                 "Received a close message (reason GENERIC) in response to an OpenSyn on: TransportLinkUnicast",
-                "the user or the password is refused",
+                "the router refused the user or the password",
                 "dictionary_file",
             ),
             (
@@ -123,9 +123,9 @@ mod tests {
                 "wants a user",
                 "usrpwd/user",
             ),
-            ("UsrPwd extension - Recv OpenSyn. Invalid password.", "somebody was refused", "dictionary_file"),
-            ("invalid peer certificate: Expired.", "somebody was refused", "connect_certificate"),
-            ("received fatal alert: UnknownCA.", "somebody was refused", "listen_certificate"),
+            ("UsrPwd extension - Recv OpenSyn. Invalid password.", "a client was refused", "dictionary_file"),
+            ("invalid peer certificate: Expired.", "a client was refused", "connect_certificate"),
+            ("received fatal alert: UnknownCA.", "a client was refused", "listen_certificate"),
             (
                 "Unable to push non droppable network message to 1a2b. Closing transport!",
                 "read nothing for 5 s",

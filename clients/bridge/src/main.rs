@@ -16,14 +16,14 @@ use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Printable};
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, publisher_domain};
 
-/// Carry topics to other machines and back over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet
+/// Send and receive topics over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet
 #[derive(Debug, Parser)]
 #[command(name = "scanhub-bridge", version, max_term_width = 100, after_help = EXAMPLES, args_override_self = true)]
 struct Cli {
     /// Router to connect to: tcp/HOST:PORT or tls/HOST:PORT. Can be repeated; the first one that answers is used
     #[arg(long, value_name = "ADDRESS")]
     connect: Vec<String>,
-    /// Be a router, and listen there: tcp/0.0.0.0:7447, or tls/.. with certificates. Can be repeated
+    /// Run as a router that listens here: tcp/0.0.0.0:7447, or tls/.. with certificates. Can be repeated
     #[arg(long, value_name = "ADDRESS")]
     listen: Vec<String>,
     /// Zenoh's own configuration, JSON5: TLS, users, access control. --connect and --listen are added to it
@@ -37,7 +37,7 @@ struct Cli {
     /// Publish what other machines send in this machine's domain, as HUB.SENSOR; then nothing is sent without --send
     #[arg(long)]
     publish: bool,
-    /// Send too, beside --publish or --ros2
+    /// Also send, in addition to --publish or --ros2
     #[arg(long)]
     send: bool,
     /// Name a hub, instead of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
@@ -46,28 +46,28 @@ struct Cli {
     /// Hub to publish, by its 16 hex digits or its name from --name [default: all]
     #[arg(long = "hub", value_name = "HUB", requires = "publish")]
     hubs: Vec<String>,
-    /// Places for subscribers of each published topic, 1 to 250
+    /// Subscriber slots of each published topic, 1 to 250
     #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
     subscribers: u16,
     /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is refused
     #[arg(long, value_name = "MB", requires = "publish", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
     memory: u32,
-    /// Connect, print what would keep a bridge from working and what to do, and end; nothing is sent or published
+    /// Connect, print problems with their remedies, and exit; nothing is sent or published
     #[arg(long, conflicts_with = "publish")]
     check: bool,
-    /// Be a node of ROS 2 (rmw_zenoh) that publishes the hub's topics; then nothing else is sent without --send
+    /// Run as a ROS 2 node (rmw_zenoh) that publishes the hub's topics; then nothing else is sent without --send
     #[arg(long)]
     ros2: bool,
-    /// Release of ROS 2 whose nodes hear it: humble, jazzy, kilted or rolling
+    /// ROS 2 release of the nodes that receive the topics: humble, jazzy, kilted or rolling
     #[arg(long, value_name = "NAME", requires = "ros2", default_value = "jazzy", value_parser = distro)]
     ros_distro: Distro,
-    /// ROS_DOMAIN_ID of the node, 0 to 232 [default: that of the environment, else 0]
+    /// ROS_DOMAIN_ID of the node, 0 to 232 [default: the value in the environment, or 0]
     #[arg(long, value_name = "N", requires = "ros2", value_parser = clap::value_parser!(u32).range(0..=i64::from(MAX_DOMAIN_ID)))]
     domain_id: Option<u32>,
     /// Namespace before all topics of ROS 2, for example robot1
     #[arg(long, value_name = "NAME", requires = "ros2", default_value = "")]
     namespace: String,
-    /// Words before the topics of sensors in ROS 2, for example lidars for /lidars/front/scan
+    /// Prefix of the sensors' topics in ROS 2, for example lidars for /lidars/front/scan
     #[arg(long, value_name = "NAME", requires = "ros2", default_value = "")]
     topic_prefix: String,
     /// Frame of a sensor in ROS 2, for example front=laser [default: its name]
@@ -142,7 +142,7 @@ impl Cli {
             }
             if frame == scanhub_ros::BASE_FRAME {
                 let what = format!("--frame: {sensor}={frame} is the frame of the robot itself");
-                return Err(Failure::new(Kind::Usage, what, "give the sensor a frame of its own"));
+                return Err(Failure::new(Kind::Usage, what, "give the sensor its own frame"));
             }
         }
         // Check each flag separately, so that the message names the wrong one.
@@ -170,9 +170,10 @@ fn domain_id() -> Result<u32, Failure> {
     let value = std::env::var("ROS_DOMAIN_ID").unwrap_or_default();
     match value.as_str() {
         "" => Ok(0),
-        said => said.parse().ok().filter(|number| *number <= MAX_DOMAIN_ID).ok_or_else(|| {
-            let hint = format!("a number from 0 to {MAX_DOMAIN_ID}, or --domain-id, which wins");
-            Failure::new(Kind::Usage, format!("ROS_DOMAIN_ID={said} of the environment is no domain"), hint)
+        value => value.parse().ok().filter(|number| *number <= MAX_DOMAIN_ID).ok_or_else(|| {
+            let hint =
+                format!("use a number from 0 to {MAX_DOMAIN_ID}, or --domain-id, which takes precedence");
+            Failure::new(Kind::Usage, format!("ROS_DOMAIN_ID={value} is not a valid domain ID"), hint)
         }),
     }
 }
@@ -180,12 +181,10 @@ fn domain_id() -> Result<u32, Failure> {
 /// Returns the failure for a `text` that is not a valid ROS name. Names in ROS consist of letters, digits and `_`.
 fn no_name(flag: &str, text: &str) -> Failure {
     let hint = match flag {
-        "--frame" => "SENSOR=FRAME, the frame of letters, digits and _, for example front=laser",
-        _ => {
-            "words of letters, digits and _ with slashes between them, none at the end: robot1, or site/robot1"
-        }
+        "--frame" => "write SENSOR=FRAME with a frame of letters, digits and _, for example front=laser",
+        _ => "use words of letters, digits and _, separated by slashes: robot1, or site/robot1",
     };
-    Failure::new(Kind::Usage, format!("{flag}: {text:?} is no name of ROS 2"), hint)
+    Failure::new(Kind::Usage, format!("{flag}: {text:?} is not a valid ROS 2 name"), hint)
 }
 
 fn distro(name: &str) -> Result<Distro, String> {
@@ -218,8 +217,9 @@ fn run(cli: Cli) -> Result<(), Failure> {
         (signal_hook::consts::SIGUSR1, &report_requested),
     ];
     for (signal, flag) in signals {
-        signal_hook::flag::register(signal, flag.clone())
-            .map_err(|error| Failure::new(Kind::Failed, format!("cannot take signals: {error}"), ""))?;
+        signal_hook::flag::register(signal, flag.clone()).map_err(|error| {
+            Failure::new(Kind::Failed, format!("cannot install signal handlers: {error}"), "")
+        })?;
     }
     if is_check {
         return check(&options, &stop, &mut io::stdout());

@@ -72,8 +72,8 @@ impl<'a> Report<'a> {
     /// Reports that there is no connection yet. The bridge keeps trying.
     pub(crate) fn waiting(&mut self, options: &BridgeOptions) -> Result<(), ExitReason> {
         let message = match &options.connect[..] {
-            [] => "waits for the routers that --config names".to_owned(),
-            routers => format!("waits for a router: {}", routers.join(", ")),
+            [] => "waiting for the routers in --config".to_owned(),
+            routers => format!("waiting for a router: {}", routers.join(", ")),
         };
         if self.json {
             return self.out.json(&LinkJson { message: Some(&message), ..LinkJson::of("waiting") });
@@ -91,7 +91,7 @@ impl<'a> Report<'a> {
             if self.json {
                 return self.out.json(&LinkJson::of(if is_up { "up" } else { "down" }));
             }
-            let words = if is_up { "connected" } else { "nobody is connected" };
+            let words = if is_up { "connected" } else { "disconnected" };
             return self.notes.line(|line| write!(line, "{words}"));
         };
         let known = Diagnosis::of(words);

@@ -262,7 +262,7 @@ fn check_validity(block: &Pem, now_s: i64) -> Result<(), UnusableFile> {
         let why = format!("the certificate of {subject} is not valid before {}", validity.not_before);
         return Err(UnusableFile {
             reason: why,
-            remedy: "set the clock of this machine, or of the one that made it",
+            remedy: "set the clock of this machine, or of the one that created the certificate",
         });
     }
     Ok(())

@@ -90,13 +90,13 @@ fn only_certificates_of_the_authority_can_connect() {
     for (file, ca) in [("a.json5", "stranger"), ("b.json5", "ca")] {
         let config = of(file, ca, "thief");
         let mut intruder = bridge_without_peer(&other, &["--connect", &at, "--publish", "--config", &config]);
-        await_finding(&mut intruder, "the certificates do not fit");
+        await_finding(&mut intruder, "the certificates do not match");
         assert_eq!(intruder.end(INT).of_class("bridge_published").len(), 0);
     }
     // The robot only sends. It reports the finding about a refused peer, and counts the peer.
     let line = robot.await_line("the refusal", |line| {
         line["class"] == "bridge_link"
-            && line["finding"] == "somebody was refused: the certificates do not fit"
+            && line["finding"] == "a client was refused: the certificates do not match"
     });
     let remedy = line["remedy"].as_str().unwrap_or_default();
     assert!(remedy.contains("connect_certificate") && !remedy.contains("--connect"), "{line}");
@@ -135,9 +135,9 @@ fn wrong_or_missing_password_is_refused() {
     await_ready(&mut robot);
     assert_eq!(here.end(INT).exit_code, Some(0));
     let wrong = [
-        (auth("guess.json5", "desk", "guess", ""), "the user or the password is refused"),
-        (auth("nobody.json5", "nobody", "word", ""), "the user or the password is refused"),
-        (env.file("none.json5", "{}"), "the router wants a user and a password"),
+        (auth("guess.json5", "desk", "guess", ""), "the router refused the user or the password"),
+        (auth("nobody.json5", "nobody", "word", ""), "the router refused the user or the password"),
+        (env.file("none.json5", "{}"), "the router requires a user and a password"),
     ];
     for (config, finding) in &wrong {
         let mut intruder = bridge_without_peer(&other, &["--connect", &at, "--publish", "--config", config]);
@@ -146,7 +146,7 @@ fn wrong_or_missing_password_is_refused() {
         assert_eq!((outcome.exit_code, outcome.of_class("bridge_ready").len()), (Some(0), 0), "{outcome}");
     }
     assert!(check_finding(&other, &at, &wrong[0].0).contains(wrong[0].1));
-    await_finding(&mut robot, "somebody was refused: the user or the password is wrong, or there is none");
+    await_finding(&mut robot, "a client was refused: its user or password is wrong or missing");
 }
 
 /// Creates a configuration with a self-signed certificate for CN=robot that was valid on one day in 2024.
