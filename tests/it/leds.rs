@@ -260,8 +260,8 @@ fn rejects_unknown_leds_and_sensors() {
     let diodes = FakeLeds::new(&env);
     let [root, _] = diodes.flags();
     for (sensor, led, what) in [
-        ("front", "red=nd", "has no light \"nd\""),
-        ("front", "red=rd,green=nd", "has no light \"nd\""),
+        ("front", "red=nd", "has no LED \"nd\""),
+        ("front", "red=rd,green=nd", "has no LED \"nd\""),
         ("front", "blue=rd", "--led blue=rd cannot be shown"),
         ("front", "red", "--led red cannot be shown"),
         ("robot", "mark=mk", "--led mark=mk cannot be shown"),

@@ -10,8 +10,7 @@ fn world(env: &TestEnv, thing: &str) -> String {
     format!("--world={}", env.file("world.toml", format!("{room}\n{thing}")))
 }
 
-/// Parts of the warnings that `mask` prints when a person should check the result. Missed scans are not among them,
-/// because a busy machine may miss some.
+/// What is told beside a mask that a person should look at; on a busy machine also that scans were missed.
 const WARNINGS: [&str; 3] = ["nothing of the robot", "something moved", "are hidden"];
 
 const POST_WORLD: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
@@ -92,7 +91,7 @@ fn empty_mask_loads_into_a_hub() {
     await_verdict(&env, "clear");
     let outcome = mask(&env, &[]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
-    let warning = "nothing of the robot is seen within 1.0 m of its centre: no mask is needed";
+    let warning = "the sensor does not see the robot within 1.0 m of its center: no mask is needed";
     assert!(outcome.stderr.contains(warning), "{outcome}");
     assert!(outcome.stdout.ends_with(b"body_mask = []\n"), "{outcome}");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
@@ -154,6 +153,6 @@ fn too_little_to_learn_from_is_refused() {
     drop(hub.end(KILL));
     let left = looking.wait();
     assert_eq!(left.exit_code, Some(1), "{left}");
-    assert_eq!(left.of_class("error")[0]["message"], "the hub went away");
+    assert_eq!(left.of_class("error")[0]["message"], "the hub has exited");
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }

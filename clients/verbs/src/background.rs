@@ -149,7 +149,7 @@ fn wall() -> Duration {
 }
 
 fn shown(sensor: &str, shown: Option<ResponseModel>) -> Result<ResponseModel, Failure> {
-    let hint = "client and hub are of different versions";
+    let hint = "client and hub have different versions";
     shown.ok_or_else(|| {
         Failure::new(Kind::Failed, format!("the hub answered without a model of {sensor}"), hint)
     })
@@ -171,7 +171,7 @@ fn save(
     }
     if model.known_beams == 0 {
         let hint = format!(
-            "learning takes some seconds: `scanhub background {sensor} show`; frozen it learns nothing"
+            "learning takes some seconds, and a frozen model does not learn: `scanhub background {sensor} show`"
         );
         return Err(Failure::new(
             Kind::Failed,
@@ -184,7 +184,7 @@ fn save(
         return verb_result(printed.json(&object));
     }
     let mut content = serde_json::to_vec(&object)
-        .map_err(|error| Failure::new(Kind::Failed, format!("the model is no JSON: {error}"), ""))?;
+        .map_err(|error| Failure::new(Kind::Failed, format!("the model is not valid JSON: {error}"), ""))?;
     content.push(b'\n');
     output::write(file, &content, force)?;
     let (BackgroundHead { known_beams, count, generation, .. }, path_text) = (**model, file.display());

@@ -8,7 +8,7 @@ use std::time::Duration;
 ///
 /// Returns a message for the user if `text` is not a duration, or is longer than a year.
 pub fn parse(text: &str) -> Result<Duration, String> {
-    let wrong = || format!("{text:?} is no duration: write it like 10s, 250ms or 5m");
+    let wrong = || format!("{text:?} is not a duration: write it like 10s, 250ms or 5m");
     let unit = text.find(|c: char| c.is_ascii_alphabetic()).ok_or_else(wrong)?;
     let (number, unit) = text.split_at(unit);
     let digits = number.chars().all(|c| c.is_ascii_digit() || c == '.');

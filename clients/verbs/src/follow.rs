@@ -535,7 +535,7 @@ impl<'a> TopicRun<'a> {
         }
         if self.stop.load(Ordering::Relaxed) {
             if self.limits.is_bounded() {
-                return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
+                return Err(Failure::new(Kind::Interrupted, "interrupted", "").into());
             }
             self.end = Some(Ok(()));
         } else if self.limits.run_for.is_some_and(|limit| now - self.started >= limit) {
@@ -590,9 +590,7 @@ impl<'a> TopicRun<'a> {
         if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == is_hub_running) {
             let (what, hint) = match is_hub_running {
                 true => ("the hub has no sensors", "scanhub run --link NAME=PORT"),
-                false => {
-                    ("no sensor of another machine is published here", "`scanhub listen` shows who sends")
-                }
+                false => ("no remote sensor is published here", "`scanhub listen` shows who sends"),
             };
             return Err(Failure::new(Kind::NoTopic, what, hint).into());
         }

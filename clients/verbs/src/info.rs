@@ -40,7 +40,7 @@ impl InfoArgs {
         let mut output = Output::new(&mut context.out);
         for (sensor, status) in statuses(&domain, &sensors, &stop)? {
             let Some(status) = status else {
-                let hint = "the hub is there and does not publish: look at its log";
+                let hint = "the hub runs but does not publish: check its log";
                 return Err(Failure::new(Kind::Timeout, format!("no status of {sensor} arrived"), hint));
             };
             verb_result(if context.json {
@@ -163,7 +163,7 @@ fn line(status: &Status) -> String {
                 status.transmission_name()
             )
         }
-        _ => "the loss is not known".to_owned(),
+        _ => "the loss is unknown".to_owned(),
     };
     format!("{} of the bytes damaged, {lost}", percent(status.damaged_share()))
 }

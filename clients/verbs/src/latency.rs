@@ -40,7 +40,7 @@ pub struct LatencyArgs {
     /// How to wait for samples
     #[arg(long, value_enum, default_value = "doorbell")]
     wait: WaitMethod,
-    /// Do not ask for real-time priority and locked memory
+    /// Do not request real-time priority and locked memory
     #[arg(long)]
     no_realtime: bool,
     #[command(flatten)]
@@ -53,7 +53,7 @@ enum WaitMethod {
     Doorbell,
     /// Sleep on the event; the hub sends one message to each subscriber
     Event,
-    /// Do not sleep; uses a whole processor
+    /// Do not sleep; uses a whole CPU
     Spin,
 }
 
@@ -293,7 +293,8 @@ fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
     }
     if spans.before > 0 {
         let word = if spans.before == 1 { "was" } else { "were" };
-        remarks.push(format!("{name}: {} {word} sent before this listened, and left out", spans.before));
+        remarks
+            .push(format!("{name}: {} {word} sent before the subscription, and not measured", spans.before));
     }
     if spans.flags & Flags::REMOTE != 0 {
         remarks.push(format!(
@@ -527,7 +528,7 @@ total      3  601.5  1602.6  2615.0  2615.0  2615.0  2615.0
    6 us .. 8 us          0
    8 us .. 10 us         0
   10 us .. 20 us         1 ####################
-front/scan: 1 was sent before this listened, and left out
+front/scan: 1 was sent before the subscription, and not measured
 front/scan: simulated
 ";
         assert_eq!(text, expected);

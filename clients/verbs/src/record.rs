@@ -406,7 +406,7 @@ impl<'a> Recorder<'a> {
         let mut second = SecondStop::default();
         while !self.writer_thread.is_finished() {
             if second.poll(stop.swap(false, Ordering::Relaxed)) {
-                let what = "the disk had not stored the end of the recording when a second signal came";
+                let what = "a second signal arrived before the disk had stored the end of the recording";
                 return Err(Failure::new(Kind::Failed, what, REPAIR).into());
             }
             thread::sleep(POLL_INTERVAL);
@@ -467,10 +467,10 @@ fn no_file(path: &Path, is_split: bool, error: &io::Error) -> Failure {
         ErrorKind::InvalidInput => "name another file: -o FILE",
         ErrorKind::ResourceBusy => "stop it first, or name another file: -o FILE",
         ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
-            "free some space, or name another place: -o FILE"
+            "free some space, or name another location: -o FILE"
         }
         ErrorKind::FileTooLarge => "raise the limit: `ulimit -f unlimited`, for a service LimitFSIZE",
-        _ => "the directory must exist and be writable; -o FILE names another place",
+        _ => "the directory must exist and be writable; -o FILE names another location",
     };
     let kind = match kind(error) {
         Kind::Failed => Kind::Output,
@@ -485,7 +485,7 @@ fn no_stderr(error: io::Error) -> Failure {
 
 /// Returns the failure for a reader that has closed stdout. The reader has an incomplete recording.
 fn reader_closed(samples: u64) -> Failure {
-    let what = format!("the reader of the recording is gone: it has at most {samples} samples");
+    let what = format!("the reader of the recording has exited: it has at most {samples} samples");
     let hint = "see why the program or the connection behind the pipe ended; `scanhub convert` writes a copy with an index";
     Failure::new(Kind::Failed, what, hint)
 }

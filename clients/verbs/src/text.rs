@@ -41,7 +41,7 @@ pub(crate) fn notice(line: &mut Vec<u8>, names: &[Rc<TopicName>], notice: &Notic
             return write!(line, "{message}, waiting for one: {hint}");
         }
         Notice::HubGone => return write!(line, "no hub, waiting for one"),
-        Notice::HubBack => return write!(line, "the hub is here"),
+        Notice::HubBack => return write!(line, "the hub runs now"),
         Notice::Missed(_) | Notice::Stale => {}
     }
     for name in names {
@@ -49,7 +49,7 @@ pub(crate) fn notice(line: &mut Vec<u8>, names: &[Rc<TopicName>], notice: &Notic
     }
     match notice {
         Notice::Missed(missed) => write!(line, "missed {missed}"),
-        _ => write!(line, "nothing arrives any more"),
+        _ => write!(line, "no samples arrive any more"),
     }
 }
 
@@ -146,7 +146,7 @@ pub(crate) fn status(line: &mut Vec<u8>, status: &Status) -> io::Result<()> {
 pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
     numbers(line, header)?;
     if marks.lacks_level() {
-        let why = "unavailable: nobody said from which intensity on this scanner sees a reflector";
+        let why = "unavailable: the intensity of reflectors is unknown for this scanner";
         return write!(line, " {why}: set link.NAME.marks.level");
     }
     if !marks.is_available() {

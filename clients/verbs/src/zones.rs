@@ -34,13 +34,13 @@ pub struct ZonesArgs {
 #[derive(Clone, Debug, Subcommand)]
 enum ZonesCommand {
     /// Learn what the sensor sees of its own robot, and print it as configuration. Place the robot in an open area with
-    /// nobody near it
+    /// no one near it
     #[command(after_help = "Example:\n  scanhub zones front mask --for 10s")]
     Mask {
-        /// How long to look, for example 10s
+        /// How long to observe, for example 10s
         #[arg(long = "for", default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
         run_for: Duration,
-        /// Only points within this distance (metres) of the robot's centre can be its body [default: the largest circle
+        /// Only points within this distance (meters) of the robot's center can be its body [default: the largest zone
         /// of the zones]
         #[arg(long, value_name = "RADIUS")]
         within: Option<f64>,
@@ -63,11 +63,11 @@ impl ZonesArgs {
         let (sensor, ZonesCommand::Mask { run_for, within }) = (&self.sensor, &self.order);
         as_argument(check_sensor(sensor))?;
         if let Some(within_m) = within.filter(|metres| !(0.001..=MAX_DISTANCE_M).contains(metres)) {
-            let message = format!("--within {within_m} is no radius");
+            let message = format!("--within {within_m} is not a valid radius");
             return Err(Failure::new(
                 Kind::Configuration,
                 message,
-                "metres from the robot's centre, at most 65",
+                "use meters from the robot's center, at most 65",
             ));
         }
         if run_for.is_zero() {
@@ -188,7 +188,7 @@ impl Observation<'_> {
                     let body = self.body.get_or_insert_with(|| Body::new(pose, within_mm));
                     if !body.add(slice, scan) {
                         let message = format!("{} was set to another resolution or unit", name.sensor);
-                        return Err(Failure::new(Kind::Failed, message, "look again").into());
+                        return Err(Failure::new(Kind::Failed, message, "try again").into());
                     }
                 }
             }
@@ -199,7 +199,7 @@ impl Observation<'_> {
 
     fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), ExitReason> {
         if notice == Notice::HubGone {
-            return Err(Failure::new(Kind::Failed, "the hub went away", "try again when it is back").into());
+            return Err(Failure::new(Kind::Failed, "the hub has exited", "try again when it runs").into());
         }
         self.clear();
         Output::new(self.notes).line(|line| text::notice(line, names, &notice))
@@ -249,17 +249,17 @@ impl MaskReport<'_> {
         if self.mask.sectors.is_empty() {
             let so = if self.is_violated {
                 // The hub adds zones.margin to its circles, but does not publish it.
-                "but the largest circle is violated all the time. If by the robot, look farther: --within RADIUS, \
-                 at least the circle's and zones.margin"
+                "but the largest zone is violated all the time. If by the robot, use a larger --within RADIUS: \
+                 at least the zone's radius plus zones.margin"
             } else {
                 "no mask is needed"
             };
-            warnings.push(format!("nothing of the robot is seen within {within} m of its centre: {so}"));
+            warnings.push(format!("the sensor does not see the robot within {within} m of its center: {so}"));
         }
         for Sector { from_mdeg, to_mdeg, range_mm, .. } in &self.mask.moving {
             let (from, to) = (degrees(*from_mdeg), degrees(*to_mdeg));
             warnings.push(format!(
-                "from {from} to {to} degrees something moved, at {} m and farther: left out. Try again with nobody near",
+                "from {from} to {to} degrees an object moved, at {} m and farther: it is not in the mask. Try again with no one near",
                 meters(*range_mm)
             ));
         }
@@ -281,7 +281,7 @@ impl MaskReport<'_> {
     fn toml(&self) -> String {
         let MaskReport { sensor, run_for, scans, mask, .. } = self;
         let mut text = format!(
-            "# What {sensor} sees of its own robot within {} m of the centre: {} of {} beams, from {scans} scans in {run_for:?}.\n",
+            "# Beams of {sensor} that see its own robot within {} m of the center: {} of {} beams, from {scans} scans in {run_for:?}.\n",
             meters(self.within_mm as u32),
             self.beams(),
             mask.of_beams

@@ -40,17 +40,17 @@ impl Device {
     /// - [`Kind::Failed`] if this user may not switch it; the hint names its owner.
     pub(super) fn open(root: &Path, name: &str) -> Result<(Device, Option<String>), Failure> {
         if !root.is_dir() {
-            let message = format!("{} is no directory", root.display());
+            let message = format!("{} is not a directory", root.display());
             return Err(Failure::new(
                 Kind::Configuration,
                 message,
-                "--led-root names the one with the lights",
+                "--led-root names the directory with the LEDs",
             ));
         }
         let directory = root.join(name);
         let is_name = !name.is_empty() && !name.contains('/') && name != "." && name != "..";
         if !is_name || !directory.join(BRIGHTNESS).is_file() {
-            let message = format!("{} has no light {name:?}", root.display());
+            let message = format!("{} has no LED {name:?}", root.display());
             return Err(Failure::new(Kind::Configuration, message, available_leds(root)));
         }
         let mut device = Device { directory, is_on: None, retry_at: None };
@@ -112,12 +112,12 @@ impl Device {
             (io::ErrorKind::PermissionDenied, Ok(found)) => {
                 let (mode, uid, gid) = (found.mode() & 0o777, found.uid(), found.gid());
                 format!(
-                    "it is of user {uid} and group {gid} with mode {mode:04o}; a udev rule opens it: \
+                    "it belongs to user {uid} and group {gid} with mode {mode:04o}; a udev rule opens it: \
                      SUBSYSTEM==\"leds\", ACTION==\"add\", RUN+=\"/bin/chgrp GROUP /sys%p/brightness\", \
                      RUN+=\"/bin/chmod 0664 /sys%p/brightness\", with a GROUP that this user is in"
                 )
             }
-            (io::ErrorKind::NotFound, _) => "it went away; it is tried again every second".to_owned(),
+            (io::ErrorKind::NotFound, _) => "it was disconnected; it is tried again every second".to_owned(),
             _ => "it is tried again every second".to_owned(),
         };
         Failure::new(Kind::Failed, message, hint)

@@ -40,7 +40,7 @@ impl Split {
         };
         let digits = number.chars().all(|c| c.is_ascii_digit() || c == '.');
         let number: Option<f64> = number.parse().ok().filter(|_| digits);
-        let size = number.ok_or_else(|| format!("{text:?} is no size: write it like 512MiB or 2GB"))?;
+        let size = number.ok_or_else(|| format!("{text:?} is not a size: write it like 512MiB or 2GB"))?;
         let size = (size * *factor as f64) as u64;
         match (MIN_SPLIT_BYTES..=MAX_SPLIT_BYTES).contains(&size) {
             true => Ok(Split::Bytes(size)),

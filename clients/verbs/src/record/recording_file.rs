@@ -261,7 +261,7 @@ impl RecordingFile {
             return Err(io::Error::new(ErrorKind::NotFound, "another file has its name"));
         }
         if here.is_file() && here.len() < self.written {
-            return Err(io::Error::new(ErrorKind::NotFound, "another program cut it"));
+            return Err(io::Error::new(ErrorKind::NotFound, "another program truncated it"));
         }
         Ok(())
     }

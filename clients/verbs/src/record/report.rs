@@ -164,7 +164,7 @@ impl<'a> Report<'a> {
                 write!(line, "{} is written again, after {:.1} s", path.display(), after.as_secs_f64())
             }
             WriterEvent::Removed(path, samples) => {
-                write!(line, "{} was removed or cut: its {samples} samples are lost", path.display())
+                write!(line, "{} was removed or truncated: its {samples} samples are lost", path.display())
             }
             WriterEvent::ReaderClosed => Ok(()),
         })
@@ -176,7 +176,7 @@ impl<'a> Report<'a> {
             let (dropped, seconds) = (0, 0.0);
             return self.out.json(&DroppedJson { class: "notice", kind: "gap_begins", dropped, seconds });
         }
-        self.note(|line| write!(line, "memory for samples is full: samples are left out of the recording"))
+        self.note(|line| write!(line, "memory for samples is full: samples are dropped from the recording"))
     }
 
     /// Reports the end of a gap, with the number of dropped samples.
@@ -257,7 +257,11 @@ impl<'a> Report<'a> {
             if dropped > 0 {
                 write!(line, ", {dropped} dropped")?;
             }
-            if removed > 0 { write!(line, ", {removed} in files that were removed or cut") } else { Ok(()) }
+            if removed > 0 {
+                write!(line, ", {removed} in files that were removed or truncated")
+            } else {
+                Ok(())
+            }
         })
     }
 
