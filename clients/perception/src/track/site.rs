@@ -389,7 +389,7 @@ fn check_finite(source: &SourceText<'_>, span: Range<usize>, points: &[Point]) -
     let far = points.iter().flatten().find(|value| value.is_nan() || value.abs() > MAX_COORDINATE_M);
     far.map_or(Ok(()), |value| {
         let what = format!("{value} m is too far");
-        Err(source.refuse(Some(span), what, format!("metres, at most {MAX_COORDINATE_M}")))
+        Err(source.refuse(Some(span), what, format!("use meters, at most {MAX_COORDINATE_M}")))
     })
 }
 

@@ -34,22 +34,22 @@ pub struct TiltArgs {
     /// Also publish the topics NAME/cloud and NAME/obstacles. NAME must not be in use
     #[arg(long = "as", value_name = "NAME", value_parser = own_name)]
     name: Option<String>,
-    /// A point of the mount's axis in the robot's frame, in metres: x ahead, y left, z above the floor
+    /// A point of the mount's axis in the robot's frame, in meters: x ahead, y left, z above the floor
     #[arg(long, value_name = "X,Y,Z", value_parser = numbers::<3>, allow_hyphen_values = true)]
     axis_at: [f64; 3],
     /// Direction of the mount's axis. Angles are right-handed: around y, a larger angle tilts the scanner down
     #[arg(long, default_value = "0,1,0", value_name = "X,Y,Z", value_parser = axis, allow_hyphen_values = true)]
     axis: [f64; 3],
-    /// Where the beams come from while the mount is level [default: the point of --axis-at]
+    /// Origin of the beams while the mount is level [default: the point of --axis-at]
     #[arg(long, value_name = "X,Y,Z", value_parser = numbers::<3>, allow_hyphen_values = true)]
     sensor_at: Option<[f64; 3]>,
     /// Angle of the mount at which the scanner measures level
     #[arg(long, default_value_t = 0.0, value_name = "RADIANS", value_parser = number, allow_hyphen_values = true)]
     level: f64,
-    /// Where the scanner looks while the mount is level, counter-clockwise from ahead
+    /// Direction of the scanner while the mount is level, counterclockwise from ahead
     #[arg(long, default_value_t = 0.0, value_name = "RADIANS", value_parser = number, allow_hyphen_values = true)]
     yaw: f64,
-    /// The scanner hangs
+    /// The scanner is mounted upside down
     #[arg(long)]
     upside_down: bool,
     /// Report every object in this box, even if it is background: MIN_X,MAX_X,MIN_Y,MAX_Y,MIN_Z,MAX_Z, in meters
@@ -417,16 +417,14 @@ impl TiltJson<'_> {
             ),
             TiltJson::Angles { problem, .. } => {
                 let text = match problem {
-                    None => "the angles are well again",
+                    None => "the angles are reliable again",
                     Some(DropReason::Silent) => {
-                        "no points: no angles come, or too late; is the program that publishes them running, and its clock \
-                         right?"
+                        "no points: no angles arrive, or they are too late; is the program that publishes them \
+                         running, and its clock right?"
                     }
                     Some(DropReason::Jumped) => "no points: the angles have jumped",
-                    Some(DropReason::Inconsistent) => {
-                        "no points: the angles are not those that their rates say"
-                    }
-                    Some(DropReason::Standing) => "no points: the mount stands, or its encoder hangs",
+                    Some(DropReason::Inconsistent) => "no points: the angles contradict their rates",
+                    Some(DropReason::Standing) => "no points: the mount stands, or its encoder is stuck",
                 };
                 out.write_all(text.as_bytes())
             }

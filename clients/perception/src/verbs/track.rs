@@ -31,7 +31,7 @@ pub struct TrackArgs {
     /// Also publish the topics NAME/tracks and NAME/events. NAME must not be in use
     #[arg(long = "as", value_name = "NAME", value_parser = own_name)]
     name: Option<String>,
-    /// Print only how many went through this door, each time that somebody does. Can be repeated
+    /// Print only how many went through this door, each time that someone does. Can be repeated
     #[arg(long, value_name = "DOOR")]
     count: Vec<String>,
     /// How long to wait for a sensor's scan after other sensors have sent later ones
@@ -376,8 +376,8 @@ impl TrackJson<'_> {
             TrackJson::Count { door, .. } => door.text(out),
             TrackJson::Misplaced { name, other, dx_m, dy_m, .. } => write!(
                 out,
-                "{name} sees people ({dx_m:.2}, {dy_m:.2}) m beside where {other} sees them: correct one of their poses \
-                 in the site file; until then {name} is taken to be where {other} says"
+                "{name} sees people ({dx_m:.2}, {dy_m:.2}) m away from where {other} sees them: \
+                 correct one of their poses in the site file; until then, the pose of {name} is corrected to fit {other}"
             ),
             TrackJson::Late { name, late, delay, .. } => {
                 match late {
