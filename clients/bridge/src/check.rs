@@ -20,7 +20,7 @@ use crate::diagnosis::{Diagnosis, UNREACHED};
 use crate::session::{CheckedConfig, Connection, LinkEvent, ZenohSession};
 use crate::{BridgeOptions, now_s};
 
-/// A finding, which is one line of output.
+/// A finding: one line of output.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 struct Finding {
     class: &'static str,

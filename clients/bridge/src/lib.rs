@@ -83,10 +83,12 @@ pub struct PublishOptions {
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`] if neither a router nor an address to listen on is given, or if Zenoh rejects the
-/// configuration; [`Kind::Input`] if the configuration file cannot be read; [`Kind::Usage`] if a topic does not exist;
-/// [`Kind::DomainHeld`] if another listener publishes in the domain; [`Kind::NoTopic`] if the first hub has no such
-/// sensor.
+/// - [`Kind::Configuration`] if neither a router nor an address to listen on is given, or if Zenoh rejects the
+///   configuration.
+/// - [`Kind::Input`] if the configuration file cannot be read.
+/// - [`Kind::Usage`] if a topic does not exist.
+/// - [`Kind::DomainHeld`] if another listener publishes in the domain.
+/// - [`Kind::NoTopic`] if the first hub has no such sensor.
 pub fn bridge(
     options: &BridgeOptions,
     report_requested: &AtomicBool,

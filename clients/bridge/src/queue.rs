@@ -33,13 +33,13 @@ pub(crate) trait Queue: SampleSink {
 /// Queue that two threads share.
 pub(crate) struct SharedQueue<Q>(Arc<(Mutex<Q>, Condvar)>);
 
-/// Fills a queue with the samples of a hub.
+/// Receiver of a hub's samples, which fills a queue.
 pub(crate) struct QueueFiller<Q> {
     forwarder: Forwarder,
     queue: SharedQueue<Q>,
 }
 
-/// Sends the messages of a queue through a session. Each message belongs to a topic, which is given by its index.
+/// Sender of a queue's messages through a session. Each message belongs to a topic, which is given by its index.
 pub(crate) trait Sender {
     /// Queue that holds the messages.
     type Queue: Queue;
@@ -54,7 +54,7 @@ pub(crate) trait Sender {
     /// Sends `message`. Returns whether the links had room for it.
     fn send(&mut self, topic: usize, message: &[u8]) -> Result<bool, Failure>;
 
-    /// Adds what must be sent last, after everything else has been sent. Returns whether it added something.
+    /// Adds the last messages of a run, after all others have been sent. Returns whether it added any.
     fn finish(&mut self, queue: &mut Self::Queue) -> bool;
 }
 

@@ -110,7 +110,7 @@ pub(crate) fn run(
 impl InboxSender {
     /// Subscribes to announcements, samples of `topics`, and the tokens of sensors.
     fn listen(&self, session: &ZenohSession, topics: &[Topic]) -> Result<Vec<Subscriber>, Failure> {
-        // One key expression for all topics: a user with rights to all topics needs only this one.
+        // Use one key expression for all topics, so that a user with rights to all topics needs no others.
         let patterns = match topics.len() == Topic::ALL.len() {
             true => vec!["*"],
             false => std::iter::once(ANNOUNCE).chain(topics.iter().map(|topic| topic.name())).collect(),
@@ -159,9 +159,9 @@ struct ZenohReceiver<'a> {
     counts: Arc<Counts>,
     /// Inputs whose key is not one of scanhub's.
     foreign: u64,
-    /// Queries an address.
+    /// Function that queries an address.
     query: Box<QueryFn<'a>>,
-    /// Returns the number of connections that were refused so far.
+    /// Function that returns the number of refused connections.
     refused: Box<dyn Fn() -> u64 + 'a>,
 }
 
@@ -408,7 +408,7 @@ mod tests {
             bytes[at] = value;
             InboundEvent::Sample(key, bytes)
         };
-        // The version follows the magic number.
+        // The byte after the magic number is the version.
         let (output, _) = run(vec![corrupted(4, 9), corrupted(4, 9), zones(0)], true, |_| Ok(()));
         assert_eq!(output.matches("another version").count(), 1, "{output}");
         assert!(output.contains("\"version\":2,") && output.contains("\"received\":1,"), "{output}");

@@ -13,7 +13,7 @@ use crate::diagnosis::Diagnosis;
 use crate::sending::BridgeSender;
 use crate::session::LinkEvent;
 
-/// Writes the reports.
+/// Writer of a bridge's reports.
 pub(crate) struct Report<'a> {
     json: bool,
     /// Causes reported since the last connection, so that each remedy is printed once.
@@ -118,7 +118,7 @@ impl<'a> Report<'a> {
         sending.write_counters(self.json, &mut self.out)
     }
 
-    /// Reports how many connections failed or were refused.
+    /// Reports the number of connections that failed or were refused.
     pub(crate) fn refused(&mut self, connection: u64) -> Result<(), ExitReason> {
         if self.json {
             return self.out.json(&RefusedJson { class: "bridge_refused", connection });

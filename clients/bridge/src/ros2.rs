@@ -38,7 +38,7 @@ pub struct Ros2Options {
     pub distro: Distro,
     /// Names of topics and frames.
     pub names: RosNames,
-    /// Whether this part reports events of the hub; otherwise another part of the bridge does.
+    /// Whether the ROS 2 node reports events of the hub. Otherwise, the sender of datagrams reports them.
     pub reports_hub: bool,
 }
 
@@ -130,7 +130,7 @@ impl SampleSink for Graph {
     }
 }
 
-/// Sends the messages of a graph as a ROS 2 node.
+/// Sender of a graph's messages as a ROS 2 node.
 struct RosSender<'a> {
     session: &'a ZenohSession,
     node: Node,

@@ -19,7 +19,7 @@ use crate::queue::{Queue, QueueFiller, Sender, SharedQueue};
 use crate::report::Report;
 use crate::session::{DeclaredToken, Publisher, Queryable, Reply, ZenohSession};
 
-/// The sending side of a bridge.
+/// Sending side of a bridge.
 pub(crate) struct BridgeSender {
     pub(crate) identity: GatewayIdentity,
     filler: QueueFiller<Datagrams>,
@@ -146,7 +146,7 @@ impl Transmit for NullTransmit {
     }
 }
 
-/// Sends datagrams under their keys, and answers queries for the last ones.
+/// Sender of datagrams under their keys, which also replies to queries with the last ones.
 pub(crate) struct DatagramSender<'a> {
     session: &'a ZenohSession,
     hub: u64,

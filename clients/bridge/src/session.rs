@@ -43,7 +43,7 @@ struct State {
 pub(crate) enum LinkEvent {
     /// A link is connected, and before there was none.
     Up,
-    /// The last link has ended.
+    /// The session has no more links.
     Down,
     /// A connection failed, with Zenoh's message.
     Failing(String),
@@ -53,7 +53,7 @@ pub(crate) enum LinkEvent {
 const RETRY_INTERVAL: Duration = Duration::from_millis(300);
 /// Time limit for closing a session.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
-/// Interval between checks for the session.
+/// Interval at which a waiting thread checks for the session.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 impl Connection {
@@ -190,17 +190,17 @@ pub(crate) struct Publisher {
     key_expr: KeyExpr<'static>,
 }
 
-/// Announces that its key exists, until it is dropped.
+/// Token that announces that its key exists, until it is dropped.
 pub(crate) struct DeclaredToken {
     _token: LivelinessToken,
 }
 
-/// A subscription, until it is dropped.
+/// Subscription that ends when it is dropped.
 pub(crate) struct Subscriber {
     _subscriber: zenoh::pubsub::Subscriber<()>,
 }
 
-/// Answers queries, until it is dropped.
+/// Queryable that replies to queries until it is dropped.
 pub(crate) struct Queryable {
     _queryable: zenoh::query::Queryable<()>,
 }
@@ -213,7 +213,7 @@ pub(crate) struct Reply {
 }
 
 impl ZenohSession {
-    /// Returns whether there is a connection: to a router, or from another program.
+    /// Returns whether the session has a link, to a router or from another program.
     pub(crate) fn is_linked(&self) -> bool {
         self.links().is_linked
     }

@@ -82,7 +82,7 @@ struct PendingScan {
 #[derive(Clone, Copy)]
 struct SweepEnd {
     stamp_ns: u64,
-    /// Whether the mount reversed. Otherwise its angle is unknown from here on.
+    /// Whether the mount reversed. Otherwise, its angle is unknown after this stamp.
     is_reversal: bool,
 }
 
@@ -93,7 +93,7 @@ pub struct TiltScanner {
     reversals: ReversalDetector,
     waiting: VecDeque<PendingScan>,
     spare_scans: Vec<Box<Scan>>,
-    /// Stamp of the last scan.
+    /// First stamp of the last scan, in ns.
     scan_ns: Option<u64>,
     /// Stamp of the last processed beam.
     taken_ns: u64,
@@ -360,7 +360,7 @@ impl TiltScanner {
     }
 }
 
-/// End point of a beam.
+/// Point at the end of a beam.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Point {
     /// Position in the robot's frame in meters: forward, to the left, above the floor.
@@ -376,7 +376,7 @@ pub struct Point {
 /// A sweep: the points between two reversals of the mount.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sweep<'a> {
-    /// Number of the sweep, from 0.
+    /// Number of the sweep, starting at 0.
     pub number: u32,
     /// Time of the start in ns.
     pub from_ns: u64,
@@ -399,7 +399,7 @@ pub struct Sweep<'a> {
     pub dropped: u32,
 }
 
-/// Parameters for sweeps, background and obstacles.
+/// Parameters of sweeps, background and obstacles.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
     /// Maximum time for which a scan waits for the angles of its beams, in ns of the stamps.

@@ -62,7 +62,7 @@ struct WaitingScan {
     foreground: Box<Foreground>,
 }
 
-/// Tracks people with the scans of a site's sensors.
+/// Tracker of people with the scans of a site's sensors.
 pub struct PeopleTracker {
     tracker: Tracker,
     delay_ns: u64,
@@ -310,9 +310,9 @@ pub enum Kind {
     Door {
         /// Index of the door in the site.
         door: usize,
-        /// The room that the person left.
+        /// Index of the room that the person left.
         from: Option<usize>,
-        /// The room that the person entered.
+        /// Index of the room that the person entered.
         to: Option<usize>,
     },
 }
@@ -347,7 +347,7 @@ pub struct MisplacedSensor {
 pub struct Snapshot {
     /// Time of all positions in ns since 1970.
     pub wall_ns: u64,
-    /// Tracks by ID.
+    /// Tracks in the order of their IDs.
     pub tracks: Vec<Track>,
     /// Events in order of time.
     pub events: Vec<Event>,

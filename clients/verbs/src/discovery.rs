@@ -153,7 +153,7 @@ fn last_change(domain: &Domain) -> Option<SystemTime> {
 #[derive(Debug)]
 pub struct BackgroundTask<T>(Receiver<T>);
 
-/// Interval at which a waiting caller checks whether it must stop.
+/// Interval at which [`BackgroundTask::wait`] checks whether it must stop.
 const STOP_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 impl<T: Send + 'static> BackgroundTask<T> {

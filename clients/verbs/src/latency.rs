@@ -328,7 +328,7 @@ fn bars(out: &mut Output<'_>, spans: &Spans) -> Result<(), ExitReason> {
     let bars = spans.ages(Span::Age).bins();
     let most = bars.iter().map(|bar| bar.count).max().unwrap_or_default().max(1);
     for bar in bars {
-        // Every bar that is not empty is visible.
+        // Every bar with a count is visible.
         let length = (bar.count * MAX_BAR_LEN).div_ceil(most) as usize;
         out.line(|line| {
             let (from, to) = (time(bar.from_ns), time(bar.to_ns));

@@ -130,7 +130,7 @@ impl LineLossCounter {
         }
     }
 
-    /// Returns the losses since the first status.
+    /// Returns the losses since the first status of this run.
     pub(crate) fn loss(&self) -> Loss {
         let Sums { read, damaged, lost, is_known } = self.sums();
         let damaged = (read > 0).then(|| (damaged as f64 / read as f64).min(1.0));

@@ -219,7 +219,7 @@ const MAX_GRAZED_RAD: f32 = 0.007;
 /// Maximum absolute rise of beams that graze a top. Steeper beams meet a top in more than one scan.
 const MAX_GRAZING_RISE: f32 = 0.1;
 
-/// Finds obstacles: clusters of points whose cubes touch.
+/// Search for obstacles, which are clusters of points whose cubes touch.
 #[derive(Default)]
 pub(crate) struct Clusters {
     /// Cube of each point with the point's index, sorted by cube.

@@ -161,7 +161,7 @@ impl Person {
     }
 }
 
-/// Spectral density of the body's acceleration, m2/s3.
+/// Spectral density of the body's acceleration in m2/s3.
 const BODY_NOISE: f64 = 0.6;
 /// Angular frequency of the oscillation of legs in rad/s: 0.8 double steps per second.
 const SWING_RATE_RAD_S: f64 = 5.0;
@@ -173,7 +173,7 @@ const LEG_NOISE: f64 = 5.0;
 /// Maximum length of a prediction step in seconds, and maximum number of steps.
 const MAX_STEP_S: f64 = 0.05;
 const MAX_STEPS: f64 = 40.0;
-/// Standard deviations for a new person: velocity in m/s, and half of the distance between the legs.
+/// Standard deviations for a new person: velocity in m/s, and half of the distance between the legs in m.
 const INITIAL_SPEED_M_S: f64 = 0.9;
 const INITIAL_HALF_M: f64 = 0.17;
 
@@ -261,7 +261,7 @@ impl Filter {
         self.covariance -= gain * reach.transpose();
     }
 
-    /// Returns the middle between the legs.
+    /// Returns the middle between the legs, in the map, in meters.
     pub(crate) fn position(&self) -> Point {
         [self.state[(0, 0)], self.state[(0, 1)]]
     }

@@ -102,7 +102,7 @@ pub(crate) struct SensorView {
     farther: Vec<(u8, f64)>,
     is_foreground: Vec<bool>,
     legs: Vec<Leg>,
-    /// Beams that end at an object.
+    /// Beams that end at an object: in the foreground, or nearer than their farthest range.
     standing: Vec<usize>,
     /// Beams of the current cluster with their end points.
     points: Vec<(usize, Point)>,

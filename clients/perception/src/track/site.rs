@@ -41,7 +41,7 @@ pub struct Site {
 pub struct Sensor {
     /// Name as in topics: `front`, or `kitchen.front` for a remote sensor.
     pub name: String,
-    /// Position in the map in meters.
+    /// Position in the map, in meters.
     pub position: Point,
     /// Direction in radians, counterclockwise from x.
     pub yaw_rad: f64,
@@ -76,7 +76,7 @@ pub struct Door {
 pub struct Gap {
     /// Indexes of the two doors.
     pub doors: [usize; 2],
-    /// Minimum and maximum time in seconds.
+    /// Minimum and maximum duration of the path in seconds.
     pub seconds: [f64; 2],
 }
 
@@ -175,7 +175,7 @@ impl Sensor {
 pub(crate) const MAX_NAME_LEN: usize = 24;
 /// Name of the other side of a door that leads outside.
 pub(crate) const OUTSIDE_NAME: &str = "outside";
-/// Maximum width of a leaf of a door, in meters.
+/// Maximum width of a door's leaf in meters.
 const MAX_LEAF_WIDTH_M: f64 = 1.3;
 /// Maximum distance between a jamb and the end of an open leaf, in meters.
 const MAX_JAMB_DISTANCE_M: f64 = 0.15;

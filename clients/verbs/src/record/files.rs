@@ -306,7 +306,7 @@ fn holder(file: &File) -> Option<u32> {
     words[PROCESS_WORD].parse().ok().filter(|pid| *pid > 0)
 }
 
-/// Words of a line of /proc/locks: `1: FLOCK ADVISORY WRITE 4711 08:01:131 0 EOF`.
+/// Indexes of words in a line of /proc/locks: `1: FLOCK ADVISORY WRITE 4711 08:01:131 0 EOF`.
 const PROCESS_WORD: usize = 4;
 const FILE_WORD: usize = 5;
 
