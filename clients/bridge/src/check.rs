@@ -68,7 +68,7 @@ pub fn check(options: &BridgeOptions, stop: &AtomicBool, out: &mut dyn Write) ->
         _ => Err(Failure::new(
             Kind::Check,
             "the bridge would not work with these settings",
-            "its remedy is printed below it",
+            "the remedy is printed below each problem",
         )),
     }
 }

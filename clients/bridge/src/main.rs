@@ -20,7 +20,7 @@ use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, publisher_domain};
 #[derive(Debug, Parser)]
 #[command(name = "scanhub-bridge", version, max_term_width = 100, after_help = EXAMPLES, args_override_self = true)]
 struct Cli {
-    /// Router to connect to: tcp/HOST:PORT or tls/HOST:PORT. Can be repeated; the first one that answers is used
+    /// Router to connect to: tcp/HOST:PORT or tls/HOST:PORT. Can be repeated; the first one that responds is used
     #[arg(long, value_name = "ADDRESS")]
     connect: Vec<String>,
     /// Run as a router that listens here: tcp/0.0.0.0:7447, or tls/.. with certificates. Can be repeated
@@ -31,10 +31,10 @@ struct Cli {
     config: Option<PathBuf>,
     /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
     /// every fourth telegram. Can be repeated [default: all topics except telegram, lines, motion, early and cloud, of
-    /// all sensors]. With --publish, also the topics to receive: then only */scan and its like
+    /// all sensors]. With --publish, also the topics to receive, each in the form */scan
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
-    /// Publish what other machines send in this machine's domain, as HUB.SENSOR; then nothing is sent without --send
+    /// Publish topics of other machines in this machine's domain, as HUB.SENSOR; then nothing is sent without --send
     #[arg(long)]
     publish: bool,
     /// Also send, in addition to --publish or --ros2

@@ -160,7 +160,7 @@ impl LightPanel<'_> {
             let (device, trigger) = Device::open(&args.led_root, name)?;
             self.devices.push((light, name.to_owned(), device));
             if let Some(trigger) = trigger {
-                self.note(&format!("{name} was lit by {trigger}, now it shows {}", light.name()))?;
+                self.note(&format!("{name} was controlled by {trigger}, and now shows {}", light.name()))?;
             }
         }
         self.show(LightStates::UNKNOWN, true)

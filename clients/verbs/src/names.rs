@@ -25,8 +25,9 @@ impl TopicName {
         let unknown = |how: String| {
             Failure::new(Kind::Usage, format!("no topic {text:?}"), format!("{how}{}", topics()))
         };
-        let (sensor, word) =
-            text.split_once('/').ok_or_else(|| unknown("write SENSOR/TOPIC, as front/zones; ".into()))?;
+        let (sensor, word) = text
+            .split_once('/')
+            .ok_or_else(|| unknown("write SENSOR/TOPIC, such as front/zones; ".into()))?;
         let topic = Topic::parse(word).ok_or_else(|| unknown(nearest(sensor, word)))?;
         let name = TopicName { sensor: sensor.to_owned(), topic };
         if sensor == ROBOT && topic != Topic::Zones {
@@ -214,7 +215,7 @@ mod tests {
             assert!(failure.hint.contains("topics are telegram, scan, "), "{failure}");
         }
         let hint = |text: &str| TopicName::parse(text).unwrap_err().hint;
-        assert!(hint("zones").starts_with("write SENSOR/TOPIC, as front/zones; topics are "));
+        assert!(hint("zones").starts_with("write SENSOR/TOPIC, such as front/zones; topics are "));
         assert!(hint("front/backgroud").starts_with("did you mean front/background? topics are "));
         assert!(hint("front/x").starts_with("topics are "));
         assert!(TopicName::parse("robot/zones").unwrap().is_robot());

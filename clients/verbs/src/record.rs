@@ -46,7 +46,7 @@ use crate::names::{Selection, TopicName};
 use crate::output::{ExitReason, LossyWriter, verb_result};
 use crate::receive_stats::ReceiveStats;
 
-/// Record what the hub publishes in MCAP files
+/// Record topics in MCAP files
 #[derive(Args, Clone, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct RecordArgs {
@@ -107,7 +107,7 @@ const DEFAULT_TOPICS: [Topic; 9] = [
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Hint for a file without an end.
-const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";
+const REPAIR: &str = "the data in the file can be read; `scanhub convert` adds an index";
 
 impl RecordArgs {
     /// Returns whether the recording goes to stdout, which then carries nothing else.

@@ -209,7 +209,7 @@ pub(crate) fn motion(line: &mut Vec<u8>, header: &Header, motion: &Motion) -> io
             write!(line, " +- ({sd_x:.3}, {sd_y:.3}) m {:.2} deg", sd_yaw.to_degrees())?;
         }
     }
-    if motion.refused_steps > 0 { write!(line, ", {} steps refused", motion.refused_steps) } else { Ok(()) }
+    if motion.refused_steps > 0 { write!(line, ", {} steps rejected", motion.refused_steps) } else { Ok(()) }
 }
 
 pub(crate) fn early(line: &mut Vec<u8>, header: &Header, early: &Early) -> io::Result<()> {

@@ -33,15 +33,15 @@ pub struct ZonesArgs {
 
 #[derive(Clone, Debug, Subcommand)]
 enum ZonesCommand {
-    /// Learn what the sensor sees of its own robot, and print it as configuration. Place the robot in an open area with
-    /// no one near it
+    /// Learn which readings of the sensor are its own robot, and print them as configuration. Place the robot in an open
+    /// area with no one near it
     #[command(after_help = "Example:\n  scanhub zones front mask --for 10s")]
     Mask {
         /// How long to observe, for example 10s
         #[arg(long = "for", default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
         run_for: Duration,
-        /// Only points within this distance (meters) of the robot's center can be its body [default: the largest zone
-        /// of the zones]
+        /// Only points within this distance (meters) of the robot's center can be its body [default: the largest
+        /// zone]
         #[arg(long, value_name = "RADIUS")]
         within: Option<f64>,
     },

@@ -14,7 +14,7 @@ use serde::Serialize;
 use crate::track::Site;
 use crate::track::geometry::{Point, middle};
 
-/// Check and draw the plan of sensors, rooms and doors that people are followed in
+/// Check and draw the plan of a site: sensors, rooms and doors
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  scanhub site check house.toml")]
 pub struct SiteArgs {
@@ -24,7 +24,7 @@ pub struct SiteArgs {
 
 #[derive(Clone, Debug, Subcommand)]
 enum SiteCommand {
-    /// Check a site file; if it has an error, show the place and exit with 78
+    /// Check a site file; if it has an error, show its position and exit with 78
     #[command(after_help = "Example:\n  scanhub site check house.toml --svg house.svg")]
     Check {
         /// The site file: sensors, rooms and doors

@@ -508,7 +508,7 @@ fn write_findings(
     }
     if has_failed {
         let message = "the flags do not describe the mount";
-        let hint = "its remedy is printed below each item that failed";
+        let hint = "the remedy is printed below each item that failed";
         return Err(Failure::new(Kind::Check, message, hint).into());
     }
     Ok(())

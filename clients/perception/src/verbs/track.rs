@@ -21,7 +21,7 @@ use super::own_name;
 use super::results::{Results, Topics};
 use crate::track::{self, Counts, MisplacedSensor, PeopleTracker, SNAPSHOT_INTERVAL_NS, Site, Snapshot};
 
-/// Follow people across the sensors and rooms of a site, and count them at doors
+/// Track people across the sensors and rooms of a site, and count them at doors
 #[derive(Args, Clone, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct TrackArgs {
