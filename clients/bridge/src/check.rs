@@ -26,7 +26,7 @@ struct Finding {
     class: &'static str,
     state: &'static str,
     finding: String,
-    /// Remedy for the user; empty if there is nothing to do.
+    /// Remedy for the user, or an empty string.
     remedy: String,
 }
 

@@ -125,7 +125,7 @@ impl Connection {
         self.listens
     }
 
-    /// Returns the reason why the session can never open, if there is one.
+    /// Returns the reason why the session can never open; `None` while it may still open.
     pub(crate) fn failure(&self) -> Option<Failure> {
         self.state.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

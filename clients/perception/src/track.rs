@@ -245,7 +245,7 @@ impl PeopleTracker {
     }
 
     /// Estimates the offsets of the clocks. A sensor whose clock lags sees a walking person ahead of the expected
-    /// position, and one whose clock leads sees them behind it.
+    /// position. One whose clock leads sees the person farther back.
     fn compare_clocks(&mut self) {
         for (sensor, &hub) in self.hub_of.iter().enumerate() {
             if hub == 0 || hub != sensor {

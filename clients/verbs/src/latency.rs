@@ -1,5 +1,5 @@
-//! `scanhub latency`: measures the age of samples on arrival, and the spans of which it consists. Other programs get
-//! the same results if they use the client library and wait in the same way.
+//! `scanhub latency`: measures the age of samples on arrival, split into spans. Other programs get the same results if
+//! they use the client library and wait in the same way.
 
 mod spans;
 

@@ -71,7 +71,7 @@ fn topics() -> String {
     format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
 }
 
-/// Returns a hint with the topic of which `word` may be a misspelling. The hint is empty if there is none.
+/// Returns a hint with the topic that `word` resembles, in case it is misspelled. The hint is empty if no topic does.
 fn nearest(sensor: &str, word: &str) -> String {
     let topic = most_similar(word, Topic::ALL.into_iter().map(Topic::name));
     topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))

@@ -59,7 +59,7 @@ pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, stats: &ReceiveStats
     if let Some(hz) = stats.hz() {
         write!(line, ", {hz:.2} Hz")?;
     }
-    // Print losses only if there are any.
+    // Print only losses above 0.
     if let Some(lost) = stats.loss.lost_on_line.filter(|&lost| lost > 0) {
         write!(line, ", {lost} lost on the line")?;
     }

@@ -20,7 +20,7 @@ pub const SNAPSHOT_INTERVAL_NS: u64 = 40_000_000;
 /// Gain of a leg that is exactly at its expected position. It is also the limit of a leg's squared distance divided by
 /// the variance.
 const GATE: f64 = 11.0;
-/// The same for a tentative person, who has a lower priority.
+/// Value of [`GATE`] for a tentative person, who has a lower priority.
 const GATE_TENTATIVE: f64 = 9.0;
 /// Maximum distance of a leg from its person, in meters.
 const MAX_LEG_DISTANCE_M: f64 = 0.8;
@@ -50,7 +50,7 @@ const IGNORED_GRACE_NS: u64 = 5_000_000_000;
 const LEAF_SILENCE_NS: u64 = 300_000_000;
 /// Maximum distance from a door at which a person who comes out of it is first seen, in meters.
 const MAX_BEFORE_DOOR_M: f64 = 3.5;
-/// The same in a room with sensors, in which people are seen as soon as they have come through.
+/// Value of [`MAX_BEFORE_DOOR_M`] in a room with sensors, in which people are seen as soon as they have come through.
 const MAX_INSIDE_DOOR_M: f64 = 1.2;
 /// Minimum distance beyond a door of a person who has gone through it, in meters.
 const MIN_BEHIND_DOOR_M: f64 = 0.12;
@@ -58,7 +58,8 @@ const MIN_BEHIND_DOOR_M: f64 = 0.12;
 const PART_DISTANCE_M: f64 = 0.5;
 /// Maximum distance from a door at which a person who has come through it is first seen, in meters.
 const MAX_AT_DOOR_M: f64 = 0.7;
-/// The same for a door with leaves, if the person walks away from it at least at the following speed, in m/s.
+/// Value of [`MAX_AT_DOOR_M`] for a door with leaves, if the person walks away from it at least at the following speed,
+/// in m/s.
 const MAX_BEFORE_LEAVES_M: f64 = 1.6;
 const MIN_LEAVING_SPEED_M_S: f64 = 0.2;
 /// Distance below which a new person may be a leg of a confirmed one, in meters.

@@ -104,7 +104,7 @@ impl Write for PendingBytes {
 }
 
 impl RecordingFile {
-    /// Builds the start of a file, with the `description` of the run, and writes nothing yet.
+    /// Builds the start of a file with the `description` of the run, without writing it.
     pub(super) fn begin(
         output: RecordingOutput,
         options: FileOptions,
