@@ -1,4 +1,4 @@
-//! Requests of users to the links of a hub. The supervising thread receives each request and puts it into the bounded
+//! Requests of users to the links of a hub. The supervisor's thread receives each request and puts it into the bounded
 //! queue of its link's thread. It replies when the link has handled the request, and never blocks on a link in between.
 
 use std::os::fd::{AsFd, BorrowedFd};
@@ -15,7 +15,7 @@ use scanhub_shm::{IncomingRequest, Node};
 use crate::player::Player;
 use crate::process::EventFd;
 
-/// The server of control requests. It belongs to the supervising thread.
+/// Server of control requests. It belongs to the supervisor's thread.
 pub(crate) struct ControlServer {
     server: scanhub_shm::ControlServer,
     pub(crate) commands: CommandSender,
@@ -55,7 +55,8 @@ pub(crate) struct QueuedRequest {
 }
 
 impl CommandSender {
-    /// Creates a queue for the link of each sensor in `sensors`. The second value has the links' ends, in the same order.
+    /// Creates a queue for the link of each sensor in `sensors`. The second value has the links' ends, in the same
+    /// order.
     ///
     /// # Errors
     ///
@@ -98,13 +99,13 @@ impl CommandSender {
         }
     }
 
-    /// Queues a request for the link of `sensor`, and returns its number in [`outcome`](Self::outcome). `model` is the model
-    /// of [`Verb::Load`].
+    /// Queues a request for the link of `sensor`, and returns its number in [`outcome`](Self::outcome). `model` is the
+    /// model of [`Verb::Load`].
     ///
     /// # Errors
     ///
-    /// [`Kind::NoTopic`] if there is no such link, [`Kind::ResourceExhausted`] if too many requests wait for it, [`Kind::Failed`] if it
-    /// has ended.
+    /// [`Kind::NoTopic`] if there is no such link, [`Kind::ResourceExhausted`] if too many requests wait for it,
+    /// [`Kind::Failed`] if it has ended.
     pub fn enqueue(&mut self, sensor: &str, verb: Verb, model: Box<Background>) -> Result<u64, Failure> {
         let link = self.links.iter().find(|link| link.sensor == sensor).ok_or_else(|| {
             let sensors: Vec<_> = self.links.iter().map(|link| link.sensor.as_str()).collect();
@@ -137,7 +138,7 @@ impl ControlServer {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if no memory or descriptors are left.
+    /// [`Kind::ResourceExhausted`] if no memory or descriptors are left.
     pub(crate) fn open<'a>(
         node: &Node,
         sensors: impl Iterator<Item = &'a str>,
@@ -179,7 +180,7 @@ impl ControlServer {
         }
     }
 
-    /// Queues `asked`, or replies that it is refused.
+    /// Queues the request of `incoming`, or replies that it is refused.
     fn forward(&mut self, incoming: IncomingRequest) {
         match self.enqueue(&incoming) {
             Ok(number) => self.pending.push((number, incoming)),
@@ -187,7 +188,7 @@ impl ControlServer {
         }
     }
 
-    /// Puts `asked` into the queue of its link, and returns its number.
+    /// Puts the request of `incoming` into the queue of its link, and returns its number.
     fn enqueue(&mut self, incoming: &IncomingRequest) -> Result<u64, Failure> {
         let request =
             incoming.request().and_then(|request| Some((request.sensor, request.verb?, request.model)));
@@ -238,7 +239,7 @@ impl ControlQueue {
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if a session has to be restarted and there is none.
+    /// [`Kind::Failed`] if a session must be restarted, but the port is missing.
     pub(crate) fn control(
         &mut self,
         control: Control,
@@ -274,7 +275,7 @@ impl ControlQueue {
         self.queue.try_recv().ok()
     }
 
-    /// Reports the outcome of request `number` to the server.
+    /// Reports the outcome of request `id` to the server.
     pub(crate) fn report_outcome(&self, id: u64, outcome: Outcome) {
         // Without a server, no client waits.
         if self.outcomes.send((id, outcome)).is_ok() {

@@ -1,4 +1,4 @@
-//! Finds the problem of a link that its status reports:
+//! Diagnosis of the problem that a link's status reports:
 //!
 //! - the problem of the session, or a unit other than the configured one
 //! - more bytes than the line can carry, or a line that damages most bytes
@@ -76,7 +76,7 @@ struct Findings {
     /// Rate of the bytes that arrive while the session is [missing](line::Session::missing) something, or was
     /// interrupted.
     bytes_per_second: Option<u64>,
-    /// Whether bytes arrive that are not of the scanner that has streamed.
+    /// Whether bytes arrive that do not come from the scanner that has streamed.
     is_exchanged: bool,
     other_model: Option<&'static str>,
     unit_mm: Option<u8>,
@@ -377,8 +377,8 @@ impl<'a> Diagnosis<'a> {
         self.with_remedy(&text)
     }
 
-    /// Returns the message that `rate` bytes per second arrive that are not of the scanner of `session`, which has
-    /// streamed before.
+    /// Returns the message that `rate` bytes per second arrive that do not come from the scanner of `session`, which
+    /// has streamed before.
     fn bytes_of_other_scanner(&self, session: &PortSession, rate: u64) -> String {
         let name = scanner_name(session);
         let is_server = matches!(self.link.port, PortSpec::Tcp { .. });
@@ -393,9 +393,9 @@ impl<'a> Diagnosis<'a> {
         self.with_remedy(&text)
     }
 
-    /// Returns `words` about a scanner that does not reply, and how to find out whether it belongs to another family,
-    /// if the family is configured and both fit into a status. `scanhub probe` cannot search the port while the hub
-    /// has it.
+    /// Returns `text` about a scanner that does not reply, and how to find out whether it belongs to another family, if
+    /// the family is configured and both fit into a status. `scanhub probe` cannot search the port while the hub has
+    /// it.
     fn without_reply(&self, text: &str) -> String {
         let Some(keys) = self.family_keys() else { return text.to_owned() };
         let text = format!("{text} Another scanner?");
@@ -417,8 +417,8 @@ impl<'a> Diagnosis<'a> {
         (!keys.is_empty() && !matches!(self.link.port, PortSpec::File { .. })).then_some(keys)
     }
 
-    /// Returns `words` and the remedy, if the family is configured and they fit into a status: the scanner may belong
-    /// to another family.
+    /// Returns `text` and the remedy, if the family is configured and they fit into a status: the scanner may belong to
+    /// another family.
     fn with_remedy(&self, text: &str) -> String {
         let Some(keys) = self.family_keys() else { return text.to_owned() };
         let name = &self.link.name;
@@ -437,7 +437,7 @@ impl<'a> Diagnosis<'a> {
         self.with_port(|port| problem.message(port)).unwrap_or_else(|| problem.to_string())
     }
 
-    /// Returns the message for the name of the port, or else for its device. `None` if the port cannot be probed, or
+    /// Returns the message for the name of the port, otherwise for its device. `None` if the port cannot be probed, or
     /// no message fits into a status.
     fn with_port(&self, message: impl Fn(&str) -> String) -> Option<String> {
         let ports = match self.link.port {

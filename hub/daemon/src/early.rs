@@ -7,7 +7,7 @@ use scanhub_drivers::line::RawScan;
 use scanhub_preprocess::zones::{Warning, ZoneChecker};
 use scanhub_schema::{ArrayFlags, Early, Scan, Verdict};
 
-/// Warns of objects in the scan that is arriving.
+/// Source of warnings of objects in the scan that is arriving.
 pub(crate) struct EarlyWarner {
     /// The measured part of the scan.
     scan: Box<Scan>,
@@ -106,7 +106,8 @@ mod tests {
 
     const BEAMS: usize = 90;
 
-    /// Points of a revolution with near objects, in an order in which each comes at most `late` places late.
+    /// Returns the points of a revolution with near objects, in an order in which each point is at most `late`
+    /// positions late.
     fn points(random: &mut Rng, late: usize) -> Vec<Point> {
         let count = random.usize(40..200);
         let near: Vec<(f32, f32, u16)> = (0..random.usize(..4))
@@ -140,7 +141,7 @@ mod tests {
         }
     }
 
-    /// The zones of a whole revolution.
+    /// Returns the zones of a complete revolution.
     fn zones(check: &mut ZoneChecker, revolution: &RawScan<'_>) -> Zones {
         let mut scan = Scan::zeroed(revolution.payload_len());
         revolution.write(&mut scan);
@@ -149,7 +150,7 @@ mod tests {
         zones
     }
 
-    /// The state of a subscriber, which checks every message.
+    /// Model of a subscriber, which checks every message.
     #[derive(Default)]
     struct Subscriber {
         /// The warning in force.

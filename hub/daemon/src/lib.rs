@@ -4,7 +4,8 @@
 //!   system; `control.rs` receives requests of users, and `reload.rs` applies a new configuration.
 //! - A live link reads top to bottom in `reconnect.rs`, `session_driver.rs`, `link.rs`, `link_output.rs` and
 //!   `pipeline.rs`. `platform.rs` is the border below which a simulation replaces this machine.
-//! - `replay_hub.rs`, `replay.rs` and `player.rs` play a recording. `reader.rs` computes the same samples without a hub.
+//! - `replay_hub.rs`, `replay.rs` and `player.rs` play a recording. `reader.rs` computes the same samples without a
+//!   hub.
 
 mod control;
 mod diagnosis;

@@ -28,12 +28,12 @@ pub(crate) struct LinkState<'a, S: Platform> {
 }
 
 impl<'a, S: Platform> LinkState<'a, S> {
-    /// Creates the parts of `link`, which is number `number` in the configuration, and its topics. `boot` identifies the run
-    /// of the hub. The first sample follows with [`begin`](Self::begin).
+    /// Creates the parts of `link`, which is number `number` in the configuration, and its topics. `boot` identifies
+    /// the run of the hub. The first sample follows with [`begin`](Self::begin).
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Platform::medium`].
+    /// Returns the errors of [`Platform::transport`].
     pub(crate) fn new(
         link: &'a Link,
         number: u8,
@@ -118,8 +118,8 @@ impl<'a, S: Platform> LinkState<'a, S> {
         now >= self.next_status.min(self.next_history)
     }
 
-    /// Publishes the status if it has changed or is due, and gives new subscribers the history. `error` is the message of
-    /// the status. Returns whether a status was published.
+    /// Publishes the status if it has changed or is due, and gives new subscribers the history. `error` is the message
+    /// of the status. Returns whether a status was published.
     pub(crate) fn publish_status(
         &mut self,
         session: Option<&PortSession>,
@@ -131,7 +131,8 @@ impl<'a, S: Platform> LinkState<'a, S> {
         self.publish_due_status(session, state, changed, now)
     }
 
-    /// Does the same as [`publish_status`](Self::show) for a `session` that was examined, with the message of [`Diagnosis`].
+    /// Does the same as [`publish_status`](Self::publish_status) for a `session` that was examined, with the message of
+    /// [`Diagnosis`].
     pub(crate) fn publish_session_status(&mut self, session: &PortSession, state: State) -> bool {
         let now = self.platform.now();
         let error = self.diagnosis.message();
@@ -190,7 +191,7 @@ impl<'a, S: Platform> LinkState<'a, S> {
 
     /// Publishes what is due, and returns when the wait must end: at `until`, or earlier if the link itself has
     /// something to do. Some drivers report the loss of a port only to a thread that waits for bytes, so a line whose
-    /// bytes are `left_alone` is polled every 40 ms.
+    /// bytes stay unread (`is_unread`) is polled every 40 ms.
     pub(crate) fn next_deadline(&mut self, until: Nanos, is_unread: bool) -> Nanos {
         let now = self.platform.now();
         self.output.expire_verdict(now, until);
@@ -200,8 +201,8 @@ impl<'a, S: Platform> LinkState<'a, S> {
         until.min(history).min(self.output.stale_at()).min(poll)
     }
 
-    /// Returns whether a wait `until` ends now, for the reason `woken`. Otherwise only the history was due, which this
-    /// function delivers.
+    /// Returns whether a wait `until` ends now, for the reason `wake_reason`. Otherwise only the history was due, which
+    /// this function delivers.
     pub(crate) fn is_over(&mut self, wake_reason: WakeReason, until: Nanos) -> bool {
         self.stats.wakeups += 1;
         if wake_reason != WakeReason::Timeout {
@@ -289,6 +290,6 @@ const SEARCH_LOG_PERIOD: Nanos = 60_000 * MILLIS;
 const POLL_INTERVAL: Nanos = 40 * MILLIS;
 /// Maximum time between two samples of the status.
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
-/// Maximum time after which a new subscriber gets the history, and after which a subscriber that has not announced itself
-/// is found.
+/// Maximum time after which a new subscriber gets the history, and after which a subscriber that has not announced
+/// itself is found.
 const HISTORY_PERIOD: Nanos = 100 * MILLIS;

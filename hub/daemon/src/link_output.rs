@@ -2,9 +2,9 @@
 //!
 //! A session returns telegrams with a scan, or packets and then the scan of a revolution. [`LinkOutput::telegram`],
 //! [`packets`](LinkOutput::packets) and [`revolution`](LinkOutput::revolution) publish them. All scans then take the
-//! same path, `LinkOutput::publish_scan`: decode, send, zones, send, the other processors, send. A doorbell rings as soon
-//! as the last of its topics that has a subscriber was sent. Work without a waiting subscriber follows the last ring,
-//! such as a background that only learns. Nothing on this path allocates, locks or logs.
+//! same path, `LinkOutput::publish_scan`: decode, send, zones, send, the other processors, send. A doorbell rings as
+//! soon as the last of its topics that has a subscriber was sent. Work without a waiting subscriber follows the last
+//! ring, such as a background that only learns. Nothing on this path allocates, locks or logs.
 
 use scanhub_config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, ReceivedTelegram, TelegramContents};
@@ -147,8 +147,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.publish_scan(scan, recorded.measured_ns, period_us, is_backlogged)
     }
 
-    /// Publishes a scan and the results that are computed from it, and wakes the subscribers. Those of a stage are woken
-    /// before the results of the next stage are computed. A result without a subscriber is computed only if the
+    /// Publishes a scan and the results that are computed from it, and wakes the subscribers. Those of a stage are
+    /// woken before the results of the next stage are computed. A result without a subscriber is computed only if the
     /// state of a processor depends on it. The processors use `measured_ns` in place of the scan's stamp, if it is
     /// given. Returns how long the verdict is valid.
     fn publish_scan(
@@ -160,7 +160,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
     ) -> Nanos {
         let LinkOutput { topics, pipeline, scan, .. } = self;
 
-        // Decode and send the scan. The sample is a copy, because the processors read the scan after the sample was sent.
+        // Decode and send the scan. The sample is a copy, because the processors read the scan after the sample was
+        // sent.
         let len = raw.payload_len();
         let mut scan_sample = topics.publishers.scan.loan(len);
         decode(raw, scan);
@@ -456,5 +457,6 @@ pub(crate) fn verdict_lifetime(period_us: u32) -> Nanos {
 
 /// A verdict is valid for two scan periods and this time.
 const LIFETIME_MARGIN: Nanos = 20 * scanhub_schema::MILLIS;
-/// Validity of a verdict without a known scan period: two LMS scans of 361 beams at 38,400 baud, and [`LIFETIME_MARGIN`].
+/// Validity of a verdict without a known scan period: two LMS scans of 361 beams at 38,400 baud, and
+/// [`LIFETIME_MARGIN`].
 const UNKNOWN_PERIOD_LIFETIME: Nanos = 480 * scanhub_schema::MILLIS;

@@ -39,7 +39,7 @@ pub(crate) struct LinkStats {
 pub(crate) struct LineHealth {
     /// Share of the bytes that were damaged while scans arrived, 0 to 1.
     pub(crate) damaged: f64,
-    /// Share of the bytes that were in nothing, 0 to 1.
+    /// Share of the bytes outside telegrams and packets, 0 to 1.
     pub(crate) discarded: f64,
     /// Telegrams that arrived.
     pub(crate) telegrams: u64,
@@ -188,7 +188,7 @@ impl LossWindow {
         LossWindow { samples: VecDeque::with_capacity(MAX_SAMPLES) }
     }
 
-    /// Restarts at `now`, with the `counters` of that time. Earlier bytes do not belong to the scanner.
+    /// Restarts the window at `now`, with the `counters` of that time. Earlier bytes do not belong to the scanner.
     fn restart(&mut self, now: Nanos, counters: &Counters) {
         self.samples.clear();
         self.samples.push_back((now, *counters));

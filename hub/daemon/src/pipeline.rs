@@ -13,7 +13,7 @@ use scanhub_preprocess::zones::ZoneChecker;
 use scanhub_schema::{Background, Failure, Foreground, Kind, Lines, Marks, Motion, Pose, Scan, Verb, Zones};
 
 /// The processors of one link. They process suspect scans like clean ones: a suspected obstacle counts, and a
-/// background needs hundreds of scans in agreement, so that a bad one among them does no harm.
+/// background needs hundreds of scans in agreement, so a bad one among them has no effect.
 pub(crate) struct Pipeline {
     pub(crate) zones: ZoneChecker,
     marks: MarkDetector,
@@ -212,8 +212,8 @@ impl Pipeline {
     }
 
     /// Returns the model and the sensor's pose for the next hub if they are worth saving. They are if the generation
-    /// was not saved yet, or if the model has learned from as many scans as it needs. At the end of the hub (`is_last`),
-    /// one scan is enough.
+    /// was not saved yet, or if the model has learned from as many scans as it needs. At the end of the hub
+    /// (`is_last`), one scan is enough.
     pub(crate) fn take_background_to_save(&mut self, is_last: bool) -> Option<(Pose, Box<Background>)> {
         let Processing { pose, background, .. } = &self.processing;
         let stage = self.background.as_mut().filter(|stage| background.is_saved && !stage.is_moving())?;
@@ -226,8 +226,8 @@ impl Pipeline {
         Some((*pose, stage.copy()))
     }
 
-    /// Handles a user's request for the background of `sensor`. Returns the model for [`Verb::Show`]. `model` is the model of
-    /// [`Verb::Load`].
+    /// Handles a user's request for the background of `sensor`. Returns the model for [`Verb::Show`]. `model` is the
+    /// model of [`Verb::Load`].
     ///
     /// # Errors
     ///
@@ -344,7 +344,7 @@ mod tests {
         processing
     }
 
-    /// A wall at `range` all around.
+    /// Returns a scan of a wall at `range` on all sides.
     fn wall(count: usize, unit_mm: u32, range: u16) -> Box<Scan> {
         Scan::of(ScanHead::lms(count, -90_000, 500, unit_mm, 13), &vec![range; count])
     }

@@ -33,8 +33,8 @@ pub trait Platform {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes under it. The link then publishes without
-    /// waking its subscribers, which poll ten times a second.
+    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes under it. The link then publishes
+    /// without waking its subscribers, which poll ten times a second.
     fn take_name(&self) -> Result<(), Failure>;
 
     /// Opens the line at `source` at `baud`. Returns `None` while a connection is being made; call it again once
@@ -58,7 +58,7 @@ pub trait Platform {
     /// Keeps `line` of link `name` open even if this hub is killed.
     fn keep_open(&self, name: &str, line: &Self::Port);
 
-    /// Ends the effect of [`keep`](Self::keep_open).
+    /// Ends the effect of [`keep_open`](Self::keep_open).
     fn release(&self, name: &str);
 
     /// Creates the topic of `sensor` with payload `P`.
@@ -75,7 +75,7 @@ pub trait Platform {
     /// Returns whether the event of the link has a listener.
     fn has_listeners(&self) -> bool;
 
-    /// Rings the doorbell word `ring` of the link, which wakes the subscribers that sleep there.
+    /// Rings the doorbell at `word` of the link, which wakes the subscribers that sleep there.
     fn ring(&self, word: DoorbellWord);
 
     /// Wakes the subscribers that listen to the event of the link.

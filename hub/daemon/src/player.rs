@@ -67,7 +67,7 @@ struct LinkProgress {
     telegrams_of_laps: AtomicU64,
 }
 
-/// Access of link number `number` to its player.
+/// Access of one link to its player.
 #[derive(Clone, Copy)]
 pub(crate) struct PlayerHandle<'a> {
     pub(crate) player: &'a Player,
@@ -106,7 +106,7 @@ impl Default for PlaybackRate {
 }
 
 impl PlaybackRate {
-    /// Returns twice this rate. More than [`MAX_FACTOR`](Self::FASTEST) is [`Max`](Self::Max).
+    /// Returns twice this rate. More than [`MAX_FACTOR`](Self::MAX_FACTOR) is [`Max`](Self::Max).
     fn doubled(self) -> PlaybackRate {
         match self {
             PlaybackRate::Times(rate) if rate < PlaybackRate::MAX_FACTOR => {
@@ -135,7 +135,7 @@ impl Player {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind) if no descriptors are left.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind) if no descriptors are left.
     pub(crate) fn new(
         play: PlaybackOptions,
         links: usize,
@@ -419,7 +419,8 @@ struct Playback {
     is_step_pending: bool,
     /// Whether the next actions of waiting links may have changed.
     has_changed: bool,
-    /// End of the last silence that was skipped in this lap, as media time; 0 if there was none. Angles before it are not played.
+    /// End of the last silence that was skipped in this lap, as media time; 0 if there was none. Angles before it are
+    /// not played.
     skipped_until: Nanos,
 }
 

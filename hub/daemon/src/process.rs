@@ -43,9 +43,9 @@ impl Signals {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if no descriptors are left.
+    /// Returns [`Kind::ResourceExhausted`] if no descriptors are left.
     pub(crate) fn register() -> Result<Signals, Failure> {
-        // `nohup` has SIGHUP ignored.
+        // Under `nohup`, SIGHUP is ignored.
         let ends_with_terminal = has_terminal() && !is_hangup_ignored();
         let registered = || {
             let ((end, end_sender), (hangup, hangup_sender)) = (UnixStream::pair()?, UnixStream::pair()?);
@@ -83,7 +83,7 @@ impl EventFd {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if no descriptors are left.
+    /// Returns [`Kind::ResourceExhausted`] if no descriptors are left.
     pub(crate) fn new() -> Result<EventFd, Failure> {
         let created = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
         created.map(EventFd).map_err(|error| {
@@ -112,8 +112,8 @@ impl AsFd for EventFd {
     }
 }
 
-/// Makes SIGBUS end the process with the exit code of [`Kind::ResourceExhausted`], after one message: text to stderr, or with
-/// `json` an object of class `error` to stdout. If stdout `is_taken`, the object goes to stderr.
+/// Makes SIGBUS end the process with the exit code of [`Kind::ResourceExhausted`], after one message: text to stderr,
+/// or with `json` an object of class `error` to stdout. If stdout `is_taken`, the object goes to stderr.
 #[allow(unsafe_code)]
 pub fn explain_bus_error(json: bool, is_taken: bool) {
     let (message, output): (&[u8], fn() -> BorrowedFd<'static>) = match (json, is_taken) {
@@ -143,7 +143,7 @@ pub(crate) fn raise_descriptor_limit() {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Short`] with the free and the needed size.
+/// Returns [`Kind::ResourceExhausted`] with the free and the needed size.
 pub(crate) fn check_memory(limits: &[TopicLimits]) -> Result<(), Failure> {
     let needed = resource_estimate::memory(limits);
     resource_limits::check_address_space(needed + limits.len() as u64 * THREAD_ADDRESS_SPACE)?;
@@ -154,7 +154,7 @@ pub(crate) fn check_memory(limits: &[TopicLimits]) -> Result<(), Failure> {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Short`] with the limit and the needed number.
+/// Returns [`Kind::ResourceExhausted`] with the limit and the needed number.
 pub(crate) fn check_descriptors(links: usize) -> Result<(), Failure> {
     resource_limits::check_descriptors(resource_estimate::descriptors(links))
 }
@@ -170,7 +170,7 @@ fn has_terminal() -> bool {
     open("/dev/tty", OFlags::RDONLY | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty()).is_ok()
 }
 
-/// Returns whether this process ignores SIGHUP, as below `nohup`.
+/// Returns whether this process ignores SIGHUP, as under `nohup`.
 pub fn is_hangup_ignored() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));

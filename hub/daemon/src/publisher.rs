@@ -3,7 +3,8 @@
 //!
 //! iceoryx2 has the list of subscribers in a page of its own for each topic, and each send visits the slots of all
 //! possible subscribers. After a pause, none of this is in the processor's cache. The publisher therefore stores how
-//! many subscribers its topic had at the last [look](PreparedPublisher::look), and uses iceoryx2 only if it had any.
+//! many subscribers its topic had at the last [check](PreparedPublisher::find_subscribers), and uses iceoryx2 only if
+//! it had any.
 
 use std::fmt::Debug;
 
@@ -18,9 +19,9 @@ use crate::platform::Platform;
 /// A topic without a history is not sent while it has no subscriber, and its number is skipped.
 pub(crate) struct PreparedPublisher<P: Payload + ?Sized, M: SampleTransport<P>> {
     topic: TopicPublisher<P, M>,
-    /// Number of subscribers at the last look.
+    /// Number of subscribers at the last check.
     subscribers: usize,
-    /// Subscribers that got the last sample.
+    /// Number of subscribers that got the last sample.
     reached: usize,
     /// Loan for the next sample, with the length of the last one.
     prepared: Option<M::Loan>,
@@ -42,7 +43,8 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind::Short) if no memory or descriptors are left.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind::ResourceExhausted) if no memory or descriptors are
+    /// left.
     pub(crate) fn new(platform: &impl Platform<Transport<P> = M>, sensor: &str) -> Result<Self, Failure> {
         let topic = TopicPublisher::with_transport(platform.transport::<P>(sensor)?);
         Ok(PreparedPublisher { topic, subscribers: 0, reached: 0, prepared: None, last_len: 0 })
@@ -57,8 +59,8 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
         }
     }
 
-    /// Takes a loan for the sample that is about to arrive, as long as the last one, if the topic has a subscriber. This
-    /// also brings the slots of the subscribers into the cache.
+    /// Takes a loan for the sample that is about to arrive, as long as the last one, if the topic has a subscriber.
+    /// This also brings the slots of the subscribers into the cache.
     pub(crate) fn prepare(&mut self) {
         if self.prepared.is_none() && self.is_sent() {
             self.prepared = self.topic.loan(self.last_len).ok();
@@ -106,7 +108,7 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
         self.topic.failed()
     }
 
-    /// Returns whether the topic had a subscriber at the last look.
+    /// Returns whether the topic had a subscriber at the last check.
     pub(crate) fn has_subscribers(&self) -> bool {
         self.subscribers > 0
     }
@@ -178,7 +180,7 @@ mod tests {
 
     use super::*;
 
-    /// A topic that counts the calls of its functions.
+    /// Transport that counts the calls of its functions.
     #[derive(Clone, Default)]
     struct CountingMedium {
         subscribers: Rc<Cell<usize>>,

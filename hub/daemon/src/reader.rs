@@ -1,9 +1,9 @@
-//! Reader of a recording that needs no hub. The code of a replay computes the samples, and they stay in the memory of this
-//! process.
+//! Reader of a recording that needs no hub. The code of a replay computes the samples, and they stay in the memory of
+//! this process.
 //!
-//! A link plays each sensor, as in [`replay`](fn@crate::replay) at maximum rate, so that payloads are equal bit for bit.
-//! The reader never waits and starts no thread. [`RecordingReader::step`] plays the next telegram of the sensor whose
-//! telegram ends first, and publishes its samples into a queue. Memory is for these samples, not for the file.
+//! A link plays each sensor, as in [`replay`](fn@crate::replay) at maximum rate, so that payloads are equal bit for
+//! bit. The reader never waits and starts no thread. [`RecordingReader::step`] plays the next telegram of the sensor
+//! whose telegram ends first, and publishes its samples into a queue. Memory is for these samples, not for the file.
 
 use std::borrow::{Borrow, BorrowMut};
 use std::collections::VecDeque;
@@ -99,8 +99,8 @@ impl RecordingReader {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor or a topic is
-    /// not computed from telegrams, and [`Kind::Configuration`] if it contradicts the configuration. Returns
+    /// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor or a topic
+    /// is not computed from telegrams, and [`Kind::Configuration`] if it contradicts the configuration. Returns
     /// [`Kind::ResourceExhausted`] if no descriptors are left.
     pub fn open(options: &ReadOptions<'_>) -> Result<RecordingReader, Failure> {
         for topic in options.topics {

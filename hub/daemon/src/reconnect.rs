@@ -1,6 +1,6 @@
-//! Keeps a link connected to its port. It streams while the port exists, polls for it while it is missing, and opens it
-//! again under the same name, whatever device it is then. While another process publishes under the sensor's name, the
-//! link leaves the port alone and waits for the name. The log has each reason once.
+//! Connection of a link to its port. The link streams while the port exists, polls for it while it is missing, and
+//! opens it again under the same name, even if that is another device. While another process publishes under the
+//! sensor's name, the link does not open the port and waits for the name. Each reason is logged once.
 
 use std::io;
 
@@ -53,16 +53,16 @@ enum Phase<L> {
 }
 
 impl<'a, S: Platform> LiveLink<'a, S> {
-    /// Takes the name of `link`, number `number` in the configuration, and creates its topics for the run `boot` of
-    /// the hub. Publishes the first status, and tries to open the port. The caller then calls
+    /// Takes the name of `link`, number `number` in the configuration, and creates its topics for the run `boot` of the
+    /// hub. Publishes the first status, and tries to open the port. The caller then calls
     /// [`on_wakeup`](Self::on_wakeup) with a timeout.
     ///
     /// # Errors
     ///
-    /// Returns an error of kind [`PortNotTty`](scanhub_schema::Kind::PortNotTty) if the port is not a serial line at all, an
-    /// error of kind [`Short`](scanhub_schema::Kind::ResourceExhausted) if descriptors or memory run out, and those of
-    /// [`Platform::transport`]. The link waits for a port that is missing, in use or forbidden, or that cannot have the
-    /// rate, and for a name that another process has.
+    /// Returns an error of kind [`PortNotTty`](scanhub_schema::Kind::PortNotTty) if the port is not a serial line at
+    /// all, an error of kind [`Short`](scanhub_schema::Kind::ResourceExhausted) if descriptors or memory run out, and
+    /// those of [`Platform::transport`]. The link waits for a port that is missing, in use or forbidden, or that cannot
+    /// have the rate, and for a name that another process has.
     pub fn new(
         link: &'a scanhub_config::Link,
         number: u8,
@@ -70,7 +70,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         platform: &'a S,
         control: ControlQueue,
     ) -> Result<Self, Failure> {
-        // Before the topics: a subscriber that finds a topic sleeps at the doorbell.
+        // Take the name before creating the topics, because a subscriber that finds a topic sleeps at its doorbell.
         let name_failure = match platform.take_name() {
             Ok(()) => None,
             Err(failure) if failure.kind == Kind::NameHeld => Some(failure),
@@ -135,7 +135,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         }
     }
 
-    /// Handles the end of a wait, for the reason `woken`. Returns what to wait for next.
+    /// Handles the end of a wait, for the reason `wake_reason`. Returns what to wait for next.
     pub fn on_wakeup(&mut self, wake_reason: WakeReason) -> Wait<'_, S::Port> {
         let (_, until) = self.phase.wait();
         if !std::mem::replace(&mut self.has_begun, true) {

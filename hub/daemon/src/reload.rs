@@ -223,7 +223,7 @@ mod tests {
             (sections.join(" "), later),
             ("background".to_owned(), vec![("a".to_owned(), vec!["background.start"])])
         );
-        // A background that has not started takes the new start.
+        // A background that was off takes the new start.
         let off = of(&["background.method=off", "background.start=first-scan"]);
         let Differences { now, later } = Differences::between(&off, &of(&[]));
         assert_eq!((now[0].1.background.learning.start, later), (Start::Empty, Vec::new()));

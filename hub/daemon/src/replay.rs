@@ -2,8 +2,8 @@
 //! they can be read. The hub sends no requests, because nothing could reply to them.
 //!
 //! `recorded.rs` opens recordings and computes the media time of their telegrams. Recordings with stamps are played by
-//! `frames.rs`, and a stream of bytes by `bytes.rs`. A [`ReplayTiming`] defines when a telegram is due: [`PlayerTiming`] waits for
-//! the player of a hub, and `reader.rs` has one that never waits.
+//! `frames.rs`, and a stream of bytes by `bytes.rs`. A [`ReplayTiming`] defines when a telegram is due:
+//! [`PlayerTiming`] waits for the player of a hub, and `reader.rs` has one that never waits.
 //!
 //! [`RecordedMount`] plays the angles of a mount. Another program publishes them, because a hub has no topic for them.
 
@@ -92,8 +92,8 @@ pub(crate) trait ReplayTiming<S: Platform> {
     /// Returns the start of the played part, and its end if it is not that of the recording, as media times.
     fn range(&self) -> (Nanos, Option<Nanos>);
 
-    /// Waits until a telegram of time `media` is due. Meanwhile, `link` publishes the status that `shown` describes.
-    /// Returns `None` if the hub must end.
+    /// Waits until a telegram of time `media` is due. Meanwhile, `link` publishes the status that `description`
+    /// describes. Returns `None` if the hub must end.
     fn wait_until_due(
         &mut self,
         link: &mut LinkState<'_, S>,
@@ -206,8 +206,8 @@ impl<'f> Lap<'f> {
         }
     }
 
-    /// Returns the number of telegrams or bytes that the file contained when it was opened, and lacked in this pass. `None`
-    /// if it was read to its end.
+    /// Returns the number of telegrams or bytes that the file contained when it was opened, and lacked in this pass.
+    /// `None` if it was read to its end.
     pub(crate) fn shortfall(&self) -> Option<String> {
         let (read, whole, unit) = match self {
             Lap::Bytes(lap) => (lap.read_len, lap.stream.len(), "bytes"),

@@ -185,7 +185,8 @@ fn sensors(recording: &Recording, chosen: Option<&str>) -> Result<Vec<Sensor>, F
     Ok(sensors)
 }
 
-/// Returns the mounts of `recording`, under names that no link of `config` has. If the user chose a sensor, no mount is played.
+/// Returns the mounts of `recording`, under names that no link of `config` has. If the user chose a sensor, no mount is
+/// played.
 fn mounts(
     recording: &Recording,
     chosen: Option<&str>,

@@ -253,7 +253,7 @@ impl StateWriter {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if no thread can be started.
+    /// Returns [`Kind::ResourceExhausted`] if no thread can be started.
     pub(crate) fn start(mut saver: StateSaver<StateDirectory>) -> Result<StateWriter, Failure> {
         let (queue, is_ending) = (saver.queue(), Arc::new(AtomicBool::new(false)));
         let (thread_queue, thread_is_ending) = (queue.clone(), is_ending.clone());

@@ -1,6 +1,6 @@
-//! Protocol of the service manager that started the hub, if one did: sd_notify(3), as systemd has it. The hub reports
-//! that it is ready and that its links work. It also passes its open ports to the service manager, so that bytes of a
-//! scanner wait in the buffer of the line while a killed hub is replaced.
+//! Protocol of the service manager that started the hub, if any: sd_notify(3) of systemd. The hub reports that it is
+//! ready and that its links work. It also passes its open ports to the service manager, so that bytes of a scanner wait
+//! in the buffer of the line while a killed hub is replaced.
 
 use std::os::fd::{AsFd, OwnedFd};
 use std::sync::atomic::{AtomicBool, Ordering};

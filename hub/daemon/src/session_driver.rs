@@ -1,4 +1,4 @@
-//! Runs a session with a scanner on an open port until the port is lost.
+//! Driver that runs a session with a scanner on an open port until the port is lost.
 //!
 //! The path of a scan, from the line to its subscribers, starts here:
 //!
@@ -153,7 +153,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         }
     }
 
-    /// Handles the end of a wait, for the reason `woken`.
+    /// Handles the end of a wait, for the reason `wake_reason`.
     ///
     /// # Errors
     ///
@@ -556,7 +556,7 @@ impl SettingsCheck {
     }
 }
 
-/// Saves the identity of a link's scanner, so that the next hub can publish scans at once if this hub is killed.
+/// Store of the identity of a link's scanner, so that the next hub can publish scans at once if this hub is killed.
 /// Without it, the next hub first has to send the scanner two requests, and each reply costs a scan.
 ///
 /// The record is written as soon as the identity is known, and then once a second while the scanner streams.

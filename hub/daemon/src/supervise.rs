@@ -86,16 +86,17 @@ impl EndOfPlayback<'_> {
     }
 }
 
-/// Runs the hub in `domain` until SIGINT or SIGTERM. `on_ready` is called once, when all topics exist. `read` returns
-/// the configuration, at the start and at each SIGHUP, which applies the changes that are possible while links stream.
+/// Runs the hub in `domain` until SIGINT or SIGTERM. `on_ready` is called once, when all topics exist. `load_config`
+/// returns the configuration, at the start and at each SIGHUP, which applies the changes that are possible while links
+/// stream.
 ///
 /// # Errors
 ///
-/// Returns the error of `read` at the start. Returns [`Kind::DomainHeld`] if another hub has the domain, and
+/// Returns the error of `load_config` at the start. Returns [`Kind::DomainHeld`] if another hub has the domain, and
 /// [`Kind::NameHeld`] if another process publishes under the name of a link that plays a recording. Returns
-/// [`Kind::ResourceExhausted`] if memory or descriptors are short, [`Kind::PortNotTty`] if a port is not a serial line, and
-/// [`Kind::Failed`] if shared memory refuses. The hub waits for a port that cannot be opened for another reason, and
-/// for a name that another process has.
+/// [`Kind::ResourceExhausted`] if memory or descriptors are short, [`Kind::PortNotTty`] if a port is not a serial line,
+/// and [`Kind::Failed`] if shared memory refuses. The hub waits for a port that cannot be opened for another reason,
+/// and for a name that another process has.
 pub fn run(
     load_config: &dyn Fn() -> Result<Config, Failure>,
     domain: &Domain,

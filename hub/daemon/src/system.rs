@@ -64,8 +64,8 @@ pub(crate) struct LinkResources<'a> {
 }
 
 impl<'a> System<'a> {
-    /// Creates the platform of the link of `sensor` from the resources of `hub`. The link sets `worked` whenever it
-    /// has finished something, and hands state over to `save_slot`.
+    /// Creates the platform of the link of `sensor` from the `resources` of the hub. The link sets `activity` whenever
+    /// it has finished something, and passes state to `save_slot`.
     pub(crate) fn new(
         resources: LinkResources<'a>,
         sensor: &'a str,
@@ -126,7 +126,8 @@ impl<'a> System<'a> {
         is_soon
     }
 
-    /// Waits from `now` for one of the events at the descriptor, a request, or the end of the hub, at most until `until`.
+    /// Waits from `now` for one of the events at the descriptor, a request, or the end of the hub, at most until
+    /// `until`.
     fn wait(
         &self,
         requests: &ControlQueue,

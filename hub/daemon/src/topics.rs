@@ -1,8 +1,8 @@
-//! The topics of one link: numbers the samples, sets their headers, and wakes the subscribers. Nothing waits for memory. A
-//! sample without memory is counted and its number is skipped, so that subscribers notice the gap.
+//! The topics of one link: numbers the samples, sets their headers, and wakes the subscribers. Nothing waits for
+//! memory. A sample without memory is counted and its number is skipped, so that subscribers notice the gap.
 //!
-//! [`Publishers`] has one publisher for each topic of a link, from the table of topics. `link_output.rs` fills and sends
-//! the samples of a scan.
+//! [`Publishers`] has one publisher for each topic of a link, from the table of topics. `link_output.rs` fills and
+//! sends the samples of a scan.
 
 use scanhub_drivers::line::ReceivedTelegram;
 use scanhub_schema::limits::history_len;
@@ -43,7 +43,7 @@ macro_rules! publishers {
                 })*
             }
 
-            /// Returns whether any topic that `counts` had a subscriber at the last look.
+            /// Returns whether any topic that `counts` had a subscriber at the last check.
             fn has_subscribers(&self, counts: impl Fn(Topic) -> bool) -> bool {
                 $(counts(Topic::$topic) && self.$name.has_subscribers())||*
             }
@@ -78,8 +78,8 @@ impl<S: Platform> Publishers<S> {
         }
     }
 
-    /// Returns the last stage before the doorbell [`DoorbellWord::First`] whose topics had a subscriber at the last look;
-    /// `Telegram` if none had one.
+    /// Returns the last stage before the doorbell [`DoorbellWord::First`] whose topics had a subscriber at the last
+    /// look; `Telegram` if none had one.
     fn first_awaited(&self) -> Stage {
         if self.zones.has_subscribers() {
             Stage::Zones
@@ -90,7 +90,7 @@ impl<S: Platform> Publishers<S> {
         }
     }
 
-    /// Returns the last stage whose topics had a subscriber at the last look; `Scan` if none had one.
+    /// Returns the last stage whose topics had a subscriber at the last check; `Scan` if none had one.
     fn last_awaited(&self) -> Stage {
         if self.foreground.has_subscribers() || self.background.has_subscribers() {
             Stage::Background
@@ -133,22 +133,24 @@ pub(crate) struct Topics<'a, S: Platform> {
     last_telegram: LastStamps,
     last_revolution: LastStamps,
     next_seq: u64,
-    /// [`Platform::attached`] at the last look for subscribers.
+    /// [`Platform::attach_count`] at the last check for subscribers.
     attach_count: Option<u32>,
-    /// Whether the event of the link had a listener at the last look.
+    /// Whether the event of the link had a listener at the last check.
     has_listeners: bool,
-    /// Stage after which [`DoorbellWord::First`] rings, as of the last look.
+    /// Stage after which [`DoorbellWord::First`] rings, as of the last check.
     first_awaited: Stage,
-    /// Stage after which all doorbells ring and the event is sent, as of the last look.
+    /// Stage after which all doorbells ring and the event is sent, as of the last check.
     last_awaited: Stage,
 }
 
 impl<'a, S: Platform> Topics<'a, S> {
-    /// Creates the topics of `sensor`, which is number `number` in the configuration. `boot` identifies the run of the hub.
+    /// Creates the topics of `sensor`, which is number `number` in the configuration. `boot` identifies the run of the
+    /// hub.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind::Short) if no memory or descriptors are left.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind::ResourceExhausted) if no memory or descriptors are
+    /// left.
     pub(crate) fn new(platform: &'a S, sensor: &str, number: u8, boot: u64) -> Result<Self, Failure> {
         let header = Header { sensor: number, boot, hub_pid: std::process::id(), ..Header::default() };
         Ok(Topics {
@@ -182,9 +184,9 @@ impl<'a, S: Platform> Topics<'a, S> {
         (self.header.wall_ns, self.header.flags, self.is_recorded) = (wall_ns, flags, true);
     }
 
-    /// Looks for subscribers if any may have attached since the last look. Called when a header is made, before its
-    /// samples are loaned and sent: a new subscriber gets the next sample, and without one, this is one look at one word
-    /// for all topics.
+    /// Searches for subscribers if any may have attached since the last check. Called when a header is created, before
+    /// its samples are loaned and sent, so that a new subscriber gets the next sample. Without a new one, this reads
+    /// only one word for all topics.
     fn find_new_subscribers(&mut self) {
         let attached = self.platform.attach_count();
         if attached.is_none() || attached != self.attach_count {
@@ -193,8 +195,8 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Looks for the subscribers of all topics and the listeners of the event. Subscribers that were attached by another
-    /// library than this project's are found only here.
+    /// Searches for the subscribers of all topics and the listeners of the event. Only this function finds subscribers
+    /// that another library than this project's has attached.
     #[cold]
     pub(crate) fn find_subscribers(&mut self) {
         self.publishers.look();
@@ -210,7 +212,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.publishers.prepare(self.last_awaited);
     }
 
-    /// Returns whether a topic of `stage` or of a later one had a subscriber at the last look.
+    /// Returns whether a topic of `stage` or of a later one had a subscriber at the last check.
     pub(crate) fn is_awaited(&self, stage: Stage) -> bool {
         self.last_awaited >= stage
     }
@@ -224,8 +226,8 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Publishes a telegram, or packets, whose period is 0. Later samples have its number and its stamps, until the next
-    /// telegram.
+    /// Publishes a telegram, or packets, whose period is 0. Later samples have its number and its stamps, until the
+    /// next telegram.
     pub(crate) fn publish_telegram(&mut self, received: &ReceivedTelegram<'_>, period_us: u32) {
         self.begin_telegram(received, period_us);
         self.publishers.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
@@ -239,8 +241,8 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.header.flags |= if received.estimated || is_moved { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
-    /// Sets the stamps, the period, and the [`Reasons`](scanhub_schema::Reasons) for a revolution that the last packet completed.
-    /// `first` and `last` are the times of its first and last beam.
+    /// Sets the stamps, the period, and the [`Reasons`](scanhub_schema::Reasons) for a revolution that the last packet
+    /// completed. `first` and `last` are the times of its first and last beam.
     pub(crate) fn begin_revolution(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
         self.begin(first, last, reasons, period_us);
         let is_moved = self.last_revolution.make_increasing(&mut self.header);
@@ -350,7 +352,7 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 
     fn notify_event(&self, event: WakeEvent) {
-        // A listener may have attached since the last look, with a subscriber that the last sample reached.
+        // A listener may have attached since the last check, with a subscriber that the last sample reached.
         if self.has_listeners || self.platform.attach_count() != self.attach_count {
             self.platform.notify_event(event);
         }
@@ -363,7 +365,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise.
+    /// Rings the doorbell at `word` if samples were sent since the last time. Otherwise, saves the system call.
     pub(crate) fn ring(&mut self, word: DoorbellWord) {
         if self.due.take_due(word) {
             self.platform.ring(word);
@@ -375,26 +377,27 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.due != PendingWakeups::default()
     }
 
-    /// Looks for subscribers, and gives new ones the history that they would otherwise get with the next sample.
+    /// Searches for subscribers, and gives new ones the history that they would otherwise get with the next sample.
     #[cold]
     pub(crate) fn deliver_history(&mut self) {
         self.find_subscribers();
         self.publishers.deliver_history();
     }
 
-    /// Looks for subscribers, and returns whether any topic has one.
+    /// Searches for subscribers, and returns whether any topic has one.
     pub(crate) fn has_subscribers(&mut self) -> bool {
         self.find_subscribers();
         self.publishers.has_subscribers(|_| true)
     }
 
-    /// Looks for subscribers, and returns whether any topic other than `status` has one. Otherwise the scanner may stop.
+    /// Searches for subscribers, and returns whether any topic other than `status` has one. Otherwise, the scanner may
+    /// stop.
     pub(crate) fn has_data_subscribers(&mut self) -> bool {
         self.find_subscribers();
         self.publishers.has_subscribers(|topic| topic != Topic::Status)
     }
 
-    /// Returns whether `early` had a subscriber at the last look.
+    /// Returns whether `early` had a subscriber at the last check.
     pub(crate) fn has_early_subscribers(&self) -> bool {
         self.publishers.early.has_subscribers()
     }
@@ -404,7 +407,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.publishers.failed()
     }
 
-    /// Returns the number of subscribers that were attached at the last look but did not get the last sample, because
+    /// Returns the number of subscribers that were attached at the last check but did not get the last sample, because
     /// their descriptors or those of the hub ran out. (Sending succeeds nevertheless.) The topics of scans count only
     /// while scans arrive (`streaming`). Topics that are published after a change never count, because that is seldom.
     pub(crate) fn starved_subscribers(&self, streaming: bool) -> usize {
@@ -416,7 +419,7 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 
     /// Returns the header of a sample that is published at `now` without a telegram. Called before its loan is taken,
-    /// because it looks for new subscribers.
+    /// because it searches for new subscribers.
     pub(crate) fn header_at(&mut self, now: u64) -> Header {
         self.find_new_subscribers();
         let wall_ns = if self.is_recorded {
@@ -428,8 +431,8 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 }
 
-/// The stamps of the last telegram or revolution. On a busy machine, several telegrams may be read at once, so that their
-/// computed stamps are equal, but a stamp identifies a scan in ROS.
+/// The stamps of the last telegram or revolution. On a busy machine, several telegrams may be read at once, so that
+/// their computed stamps are equal, but a stamp identifies a scan in ROS.
 #[derive(Default)]
 struct LastStamps {
     first_ns: u64,

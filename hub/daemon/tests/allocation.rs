@@ -1,6 +1,6 @@
-//! The hub's memory is fixed once a scanner streams. For a scan and its results, a link allocates only what iceoryx2 needs for
-//! each loan: one small piece, which is freed when the sample is sent. Telegrams, marks and foreground without a subscriber
-//! need no loan.
+//! Test that the hub's memory is fixed once a scanner streams. For a scan and its results, a link allocates only what
+//! iceoryx2 needs for each loan: one small block, which is freed when the sample is sent. Telegrams, marks and
+//! foreground without a subscriber need no loan.
 
 #![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
 
@@ -29,8 +29,8 @@ use scanhub_schema::{Foreground, Marks, Scan};
 use scanhub_shm::Domain;
 use scanhub_shm::{Payload, Subscriber};
 
-/// A scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port
-/// has another rate, and it streams until it gets a request to stop.
+/// Scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port has
+/// another rate, and it streams until it gets a request to stop.
 struct PtyScanner {
     line: OwnedFd,
     received: Vec<u8>,
@@ -53,7 +53,7 @@ impl PtyScanner {
         (PtyScanner { line, received: Vec::new(), is_streaming: true, scans: 0 }, name)
     }
 
-    /// Writes all of it, however long a busy machine keeps the hub from reading.
+    /// Writes all `bytes`, even if a busy machine delays the hub's reads.
     fn send(&self, mut bytes: &[u8]) {
         let give_up_at = Instant::now() + Duration::from_secs(60);
         while !bytes.is_empty() {
@@ -94,7 +94,7 @@ impl PtyScanner {
         }
     }
 
-    /// Takes the next request out of the bytes that have arrived, once all of it has.
+    /// Removes the next request from the received bytes, once it is complete.
     fn next_request(&mut self) -> Option<Request> {
         loop {
             let begin = self.received.iter().position(|&byte| byte == STX).unwrap_or(self.received.len());
@@ -106,7 +106,7 @@ impl PtyScanner {
             }
             let telegram = self.received.get(..len).and_then(Telegram::check);
             let request = telegram.and_then(Request::decode);
-            // A request that the hub broke off hides no later one.
+            // Skip only one byte, so that an incomplete request does not hide a later one.
             self.received.drain(..if telegram.is_some() { len } else { 1 });
             if request.is_some() {
                 return request;
@@ -140,7 +140,7 @@ impl PtyScanner {
     }
 }
 
-/// Sends scans until `count` more were published.
+/// Sends scans until `count` further ones were published.
 fn stream(sensor: &mut PtyScanner, subscriber: &Subscriber<Scan>, count: u64) {
     for number in 0..count {
         let give_up_at = Instant::now() + Duration::from_secs(60);
@@ -158,7 +158,7 @@ fn stream(sensor: &mut PtyScanner, subscriber: &Subscriber<Scan>, count: u64) {
             );
             sensor.reply_to_all();
             if Instant::now() > next_scan {
-                // Until the sensor was asked for its mode a scan cannot be read, and is none.
+                // The hub cannot decode scans until it has requested the scanner's mode.
                 sensor.send_scan();
                 next_scan += Duration::from_millis(50);
             }
@@ -167,7 +167,7 @@ fn stream(sensor: &mut PtyScanner, subscriber: &Subscriber<Scan>, count: u64) {
     }
 }
 
-/// Waits until the link rests: it has given back what the last loans took, and taken those for the next telegram.
+/// Waits until the link is idle: it has freed the memory of the last loans, and taken the loans for the next telegram.
 fn wait_until_idle() {
     let (mut held, mut same) = (HELD_BYTES.load(Relaxed), 0);
     while same < 20 {
@@ -178,7 +178,7 @@ fn wait_until_idle() {
     }
 }
 
-/// A domain that goes with the test, however it ends.
+/// Domain that is removed at the end of the test, even after a failure.
 struct TestDomain(Domain);
 
 impl Drop for TestDomain {
@@ -192,7 +192,7 @@ impl Drop for TestDomain {
     }
 }
 
-/// The thread of this process with this name.
+/// Returns the ID of this process's thread with this name.
 fn thread_named(name: &str) -> i32 {
     let tasks = fs::read_dir("/proc/self/task").expect("threads").flatten();
     let found = tasks
@@ -205,23 +205,23 @@ fn thread_named(name: &str) -> i32 {
 struct AllocationWindow {
     scans: u64,
     seconds: u64,
-    /// Pieces of memory.
+    /// Number of allocations.
     allocations: u64,
-    /// Bytes that were kept.
+    /// Number of bytes that were not freed.
     held_bytes: i64,
 }
 
-/// Returns what the link of a hub with these settings takes for four windows of scans. With `follow_all`, marks and
-/// foreground have subscribers too.
+/// Returns the allocations of the link of a hub with these settings in four windows of scans. With `follow_all`, marks
+/// and foreground have subscribers too.
 fn windows(letter: char, follow_all: bool, set: &[&str]) -> [AllocationWindow; 4] {
     let name = format!("{letter}{}", std::process::id());
     let test_domain = TestDomain(Domain::at(&name, format!("/tmp/{name}").as_ref()).expect("a domain"));
     let domain = &test_domain.0;
     let (mut sensor, port) = PtyScanner::new();
     let sources = Sources {
-        // On a busy machine, a search would begin again.
+        // Name the family, because a search could restart on a busy machine.
         links: vec![format!("heap={port},family=lms")],
-        // In the state directory of whoever runs the tests nothing is left.
+        // Write nothing to the state directory of the user who runs the tests.
         set: set.iter().chain(&["background.keep=false"]).map(|flag| (*flag).to_owned()).collect(),
         ..Sources::default()
     };
@@ -244,7 +244,7 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [AllocationWindow; 4
             Foreground::subscriber(&node, &foreground).expect("a subscriber"),
         )
     });
-    // The rate, both questions, and what is made once.
+    // These scans cover the rate, both requests, and allocations at the start.
     stream(&mut sensor, &subscriber, 50);
     WATCHED_THREAD.store(thread_named("heap"), Relaxed);
     stream(&mut sensor, &subscriber, 50);
@@ -273,17 +273,17 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [AllocationWindow; 4
     windows
 }
 
-/// One after the other: a signal ends all hubs of a process.
+/// One test runs all hubs one after the other, because a signal ends all hubs of a process.
 #[test]
 fn a_scan_takes_nothing_from_the_heap() {
     for (letter, follow_all, set, topics) in [
-        // Scan and zones, and telegrams that nobody follows.
+        // Scan and zones have a subscriber, and telegrams have none.
         ('a', false, &["background.method=paper"][..], 2),
         ('b', true, &["background.publish=every-scan"][..], 5),
     ] {
         for AllocationWindow { scans, seconds, allocations, held_bytes } in windows(letter, follow_all, set) {
-            // Each topic takes a loan for a scan. There are more for a silence, and for a status each second and when the
-            // state changes. If the scanner has sent a scan twice, the hub may have missed the first one.
+            // Each topic takes a loan for a scan. There are more for a silence, and for a status each second and when
+            // the state changes. If the scanner has sent a scan twice, the hub may have missed the first one.
             let loans =
                 topics * (scans - MAX_MISSED_SCANS)..=topics * scans + MAX_OTHER_ALLOCATIONS + 4 * seconds;
             assert!(
@@ -295,7 +295,7 @@ fn a_scan_takes_nothing_from_the_heap() {
     }
 }
 
-/// Scans in a window that may go unheard on a busy machine.
+/// Maximum number of scans in a window that a busy machine may miss.
 const MAX_MISSED_SCANS: u64 = 15;
-/// Loans for what is no scan: fewer than scans in a window.
+/// Maximum number of loans for other samples than scans. It is less than the number of scans in a window.
 const MAX_OTHER_ALLOCATIONS: u64 = 20;

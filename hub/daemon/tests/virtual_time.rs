@@ -1,5 +1,5 @@
-//! Links that are driven in made-up time publish what those of lines do: every telegram, its scan, the moments that
-//! were told. Nobody sleeps here.
+//! Test that links in virtual time publish the same as links of real lines: every telegram, its scan, and the stamps of
+//! the virtual clock. No thread sleeps.
 
 #[path = "../../../tests/testkit/virtual_hub.rs"]
 mod virtual_hub;
@@ -19,7 +19,7 @@ use tracing::span;
 use tracing::{Event, Metadata, Subscriber};
 use virtual_hub::virtual_hub;
 
-/// A domain that goes with the test, however it ends.
+/// Domain that is removed at the end of the test, even after a failure.
 struct TestDomain(Domain);
 
 impl TestDomain {
@@ -96,7 +96,7 @@ fn marks_need_a_subscriber_and_status_is_streaming() {
         assert_eq!((sample.user_header().seq, sample.user_header().topic_seq), (1, 1));
         let status = Status::open(&node, "a").expect("a topic").expect("is there");
         let status = Status::subscriber(&node, &status).expect("a subscriber");
-        // A status goes out each second while nobody has anything to tell.
+        // Without other changes, the status is published every second.
         for second in 1..=3 {
             links[0].read(second * 1_000_000_000, telegram.bytes());
         }
@@ -106,7 +106,7 @@ fn marks_need_a_subscriber_and_status_is_streaming() {
     assert_eq!(outcome, Ok(()));
 }
 
-/// Collects the messages of the log.
+/// Collector of log messages.
 #[derive(Clone, Default)]
 struct LogCollector(Arc<Mutex<Vec<String>>>);
 
@@ -161,7 +161,7 @@ fn finds_unannounced_subscriber_within_154_ms() {
         found_after
     });
     let found_after = outcome.expect("it runs").expect("it was found");
-    // A tenth of a second, the telegram after which the hub looks, and the next one.
+    // The limit is a tenth of a second, the telegram after which the hub checks, and the next telegram.
     assert!((26_640_001..154_000_000).contains(&found_after), "found after {found_after} ns");
 }
 
@@ -177,7 +177,7 @@ fn rejected_rate_is_logged_once_and_scanner_is_found() {
             let status = Status::open(&node, "a").expect("a topic").expect("is there");
             let status = Status::subscriber(&node, &status).expect("a subscriber");
             links[0].reject(&[500_000, 921_600, 256_000]);
-            // Bytes of no scanner, for several rounds of the search.
+            // The bytes do not come from a scanner, for several rounds of the search.
             for read in 1..=200 {
                 links[0].read(read * 50_000_000, &[0x55; 5]);
             }

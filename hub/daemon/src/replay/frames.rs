@@ -117,7 +117,7 @@ impl<'f> FramesLap<'f> {
         Some(FrameTime::of(frame, *media, *media < self.start_ns))
     }
 
-    /// Returns the media time at which `verdict` becomes stale, if the frame at `when` ends after it.
+    /// Returns the media time at which `verdict` becomes stale, if the frame at `time` ends after it.
     fn stale_at(&self, verdict: &PendingVerdict, time: FrameTime) -> Nanos {
         verdict.until.clamp(self.start_ns, time.media)
     }
@@ -180,7 +180,7 @@ impl<'f> FramesLap<'f> {
         }
     }
 
-    /// Publishes that `verdict` is stale, which is not valid until the frame at `when`. Returns `None` if the hub must
+    /// Publishes that `verdict` is stale if it is not valid until the frame at `time`. Returns `None` if the hub must
     /// end.
     fn note_silence<S: Platform>(
         &mut self,
@@ -235,7 +235,7 @@ impl<'f> FramesLap<'f> {
         self.session.as_ref().filter(|_| !self.frames.is_whole).map(VirtualTime::session)
     }
 
-    /// Waits until the frame at `when` is due: `Some(None)` if it is skipped, `None` if the hub must end.
+    /// Waits until the frame at `time` is due. Returns `Some(None)` if it is skipped, and `None` if the hub must end.
     fn wait<S: Platform>(
         &mut self,
         replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
@@ -329,7 +329,7 @@ impl<'f> FramesLap<'f> {
         }
         let FramesLap { session, verdict, verdict_lifetime: last_limit, state, .. } = self;
         let session = session.as_mut()?;
-        // As on a line, an error of the line concerns the packets alone, not the revolution.
+        // As in the hub, an error of the line affects only the packets, not the revolution.
         session.session_mut().mark_suspect(frame.reasons & !suspect::LINE_ERROR);
         session.take(when.last, &frame.telegram, |event| {
             let Event::Scan(scan) = event else { return };

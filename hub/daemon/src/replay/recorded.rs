@@ -301,9 +301,9 @@ impl Timeline {
         }
     }
 
-    /// Returns the media time of a sample of another program with this `header`. Its stamp and those of the telegrams before it
-    /// in the recording are from the same clock. Returns `None` if it is before the first telegram, or if the machine was
-    /// restarted after the last one: scans follow only when the hub of the new start has sent a telegram.
+    /// Returns the media time of a sample of another program with this `header`. Its stamp and those of the telegrams
+    /// before it in the recording are from the same clock. Returns `None` if it is before the first telegram, or if the
+    /// machine was restarted after the last one: scans follow only when the hub of the new start has sent a telegram.
     pub(super) fn media_of_sample(&self, header: &Header) -> Option<Nanos> {
         let by_wall = i128::from(header.wall_ns) - self.wall_zero_ns;
         let by_stamp = self.run.map(|(_, zero_ns)| i128::from(header.stamp_first_ns) - zero_ns);

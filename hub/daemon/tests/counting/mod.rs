@@ -1,4 +1,4 @@
-//! The system's allocator with a count of what one thread takes from it: for tests that promise that nothing is taken.
+//! The system's allocator, with counts of the allocations of one thread, for tests that no memory is allocated.
 #![allow(unsafe_code)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -6,14 +6,14 @@ use std::sync::atomic::{AtomicI32, AtomicI64, AtomicU64, Ordering::Relaxed};
 
 use rustix::thread::gettid;
 
-/// Counts what one thread asks for.
+/// Allocator that counts the allocations of one thread.
 struct CountingAllocator;
 
-/// The thread whose requests are counted; 0: nobody's.
+/// ID of the thread whose allocations are counted; 0 for none.
 pub(crate) static WATCHED_THREAD: AtomicI32 = AtomicI32::new(0);
-/// Pieces taken.
+/// Number of allocations.
 pub(crate) static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
-/// Bytes taken and not given back.
+/// Number of bytes that were allocated and not freed.
 pub(crate) static HELD_BYTES: AtomicI64 = AtomicI64::new(0);
 
 fn note(allocations: u64, bytes: i64) {
@@ -24,9 +24,9 @@ fn note(allocations: u64, bytes: i64) {
     }
 }
 
-// SAFETY: every call goes to the system's allocator as it came; counting asks for no memory.
+// SAFETY: every call is passed to the system's allocator unchanged, and counting allocates no memory.
 unsafe impl GlobalAlloc for CountingAllocator {
-    // SAFETY: the caller keeps the promises of the trait, which are those of the system's allocator.
+    // SAFETY: the caller fulfills the contract of the trait, which is that of the system's allocator.
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         note(1, layout.size() as i64);
         // SAFETY: as above.
