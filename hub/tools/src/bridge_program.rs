@@ -1,5 +1,5 @@
-//! The program `scanhub-bridge`: finds it, checks its version, and lets it check whether a bridge could connect. Zenoh
-//! is linked into that program, not into this one.
+//! The program `scanhub-bridge`: the search for it, the check of its version, and its own check whether a bridge could
+//! connect. Zenoh is linked into that program, not into this one.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -22,11 +22,11 @@ pub fn search_directories() -> Vec<PathBuf> {
     own.into_iter().chain(std::env::split_paths(&path)).collect()
 }
 
-/// Returns the first program in `places`, which has the version of this program.
+/// Returns the first program in `directories`. It has the version of this program.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Configuration`] if there is none, if it does not run, or if it has another version.
+/// Returns [`Kind::Configuration`] if the program is not found, does not run, or has another version.
 pub fn find(directories: &[PathBuf]) -> Result<PathBuf, Failure> {
     let refuse = |what: String, hint: &str| Err(Failure::new(Kind::Configuration, what, hint));
     let Some(program) =
@@ -64,7 +64,8 @@ pub struct Bridge {
     pub connect: Vec<String>,
     /// A file of Zenoh's own configuration.
     pub config: Option<PathBuf>,
-    /// Directories in which the program may be, in the order of the search. If it is empty, those of [`search_directories`].
+    /// Directories in which the program may be, in the order of the search. If it is empty, those of
+    /// [`search_directories`].
     pub directories: Vec<PathBuf>,
 }
 

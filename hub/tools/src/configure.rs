@@ -1,8 +1,8 @@
 //! `scanhub configure`: changes the EEPROM settings of an LMS. Reads the settings, shows each difference, asks a
 //! person, writes, reads back, and reports the settings and the state of the scanner, above all after a failure.
 //!
-//! `request_consent` is the only place that creates consent: nothing is written into a scanner unless a person has typed
-//! `yes`.
+//! `request_consent` is the only place that creates consent: nothing is written into a scanner unless a person has
+//! typed `yes`.
 
 use std::fmt;
 use std::io::{IsTerminal, Write, stderr, stdin};
@@ -37,8 +37,8 @@ pub struct ConfigureArgs {
     /// Port of the sensor: a tty or tcp:HOST:PORT
     #[arg(value_name = "PORT")]
     port: String,
-    /// Settings to write: unit=mm|cm, mode=NAME|0x01, availability=1|2|3, indices=on|off, sensitivity=standard|medium|low|high,
-    /// power_on_baud=9600|keep, configuration=HEX
+    /// Settings to write: unit=mm|cm, mode=NAME|0x01, availability=1|2|3, indices=on|off,
+    /// sensitivity=standard|medium|low|high, power_on_baud=9600|keep, configuration=HEX
     #[arg(value_name = "KEY=VALUE")]
     settings: Vec<String>,
     /// Password of the installation mode
@@ -55,8 +55,8 @@ A person must confirm. If stdin or stderr is not a terminal, the difference is \
                            shown, nothing is written, and the exit code is 2";
 
 impl ConfigureArgs {
-    /// Changes the settings, and prints differences and the result to `out`. `locations` are the locations in which a client
-    /// would search for the domain of a hub, which may use the port.
+    /// Changes the settings, and prints differences and the result to `out`. `locations` are the locations in which a
+    /// client would search for the domain of a hub, which may use the port.
     ///
     /// # Errors
     ///

@@ -41,8 +41,8 @@ pub struct DoctorArgs {
     /// First remove what dead processes left in this domain; removes nothing while a hub runs there
     #[arg(long)]
     clean: bool,
-    /// Router that a bridge of this machine connects to, as in `scanhub bridge --connect`: checks whether that would work.
-    /// Can be repeated
+    /// Router that a bridge of this machine connects to, as in `scanhub bridge --connect`: checks whether that would
+    /// work. Can be repeated
     #[arg(long, value_name = "ADDRESS")]
     bridge: Vec<String>,
     /// The same by Zenoh's own configuration, as in `scanhub bridge --config`
@@ -51,8 +51,8 @@ pub struct DoctorArgs {
 }
 
 impl DoctorArgs {
-    /// Makes all checks, and prints each finding as soon as it is known. The configuration is that of `sources`. A hub would
-    /// create `domain`, and a client would search for it in `locations`.
+    /// Makes all checks, and prints each finding as soon as it is known. The configuration is that of `sources`. A hub
+    /// would create `domain`, and a client would search for it in `locations`.
     ///
     /// # Errors
     ///
@@ -104,8 +104,8 @@ impl DoctorArgs {
 /// The ports, the configuration and the machine to check.
 #[derive(Clone, Debug)]
 pub struct CheckTargets {
-    /// Ports as the user named them, or names of links of the running hub. If it is empty, those of the configuration and of
-    /// the running hub.
+    /// Ports as the user named them, or names of links of the running hub. If it is empty, those of the configuration
+    /// and of the running hub.
     pub ports: Vec<PortSpec>,
     /// The configuration, or the reason why it is invalid; `None` if there is none.
     pub config: Option<Result<Config, Failure>>,
@@ -332,8 +332,8 @@ pub fn run_checks(
     }
 }
 
-/// Returns the ports that the user named. If there are none, those of the configuration, or all ports of the machine, with
-/// the ports of the running hub.
+/// Returns the ports that the user named. If there are none, those of the configuration, or all ports of the machine,
+/// with the ports of the running hub.
 fn select_ports(
     targets: &CheckTargets,
     serial_ports: &[SerialPortInfo],
@@ -362,8 +362,8 @@ fn select_ports(
             .map(|source| PortTarget { link: of_link(&source), source, is_named: true })
             .collect();
     }
-    // The hub may have other links than this configuration, and ports that are not lines of this machine. A port that it
-    // waits for stays unopened.
+    // The hub may have other links than this configuration, and ports that are not lines of this machine. A port that
+    // it waits for stays unopened.
     let add_links_of_hub = |mut ports: Vec<PortTarget>| {
         for source in hub.map(Hub::ports).unwrap_or_default() {
             if !ports.iter().any(|subject| subject.source.is_same_port(&source)) {

@@ -1,6 +1,6 @@
-//! Runs protocol state machines on an open port, for a user at a terminal: [`run_protocol`] runs any of them. With it,
-//! [`search`] finds the scanner, and [`detect`] identifies one that rotates. A thread of the hub does the same for a
-//! link, without an end.
+//! Driver of protocol state machines on an open port, for a user at a terminal: [`run_protocol`] runs any of them. With
+//! it, [`search`] finds the scanner, and [`detect`] identifies one that rotates. A thread of the hub does the same for
+//! a link, without an end.
 
 use std::fmt;
 use std::io;
@@ -84,7 +84,7 @@ pub(crate) struct NotFound {
     pub(crate) coverage: Vec<Coverage>,
 }
 
-/// Searches `port` for a scanner of any family, or of `only` one, as the hub does. Calls `look` with each rate.
+/// Searches `port` for a scanner of any family, or of `only` one, as the hub does. Calls `on_rate` with each rate.
 ///
 /// # Errors
 ///
@@ -115,8 +115,8 @@ pub(crate) fn search(
     Ok(search.found().ok_or_else(not_found))
 }
 
-/// Identifies the rotating scanner that a search has found at `port`. Returns it, if more packets arrived than could match by
-/// chance; otherwise the number of bytes received.
+/// Identifies the rotating scanner that a search has found at `port`. Returns it, if more packets arrived than could
+/// match by chance; otherwise the number of bytes received.
 ///
 /// Sends nothing to a scanner that streams without a request. From other scanners it requests identity and health, lets
 /// them measure for a second, and stops them as a hub does.
@@ -270,7 +270,7 @@ struct EndTask;
 
 impl Task<Session> for EndTask {}
 
-/// A procedure with an end, such as requests to an LMS. Calls `progress` before each wait, and ends early if it returns
+/// Procedure with an end, such as requests to an LMS. Calls `progress` before each wait, and ends early if it returns
 /// false. Logs each rate once that the port cannot have; a search leaves it out.
 pub(crate) struct Procedure<F> {
     progress: F,

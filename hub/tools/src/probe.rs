@@ -1,6 +1,6 @@
 //! `scanhub probe`: finds the scanner at a port, whatever its family, by the search of the hub, and then requests what
-//! it reports of itself. Changes no settings. `SuggestedLink` is the link that a configuration needs for the scanner, as
-//! a command for the shell and as a section of a file.
+//! it reports of itself. Changes no settings. `SuggestedLink` is the link that a configuration needs for the scanner,
+//! as a command for the shell and as a section of a file.
 
 mod description;
 
@@ -46,14 +46,14 @@ Examples:
   scanhub probe /dev/ttyUSB0 --toml >> scanhub.toml";
 
 impl ProbeArgs {
-    /// Prints the scanner at the port, or the ports of this machine without opening any. `locations` returns the locations in
-    /// which a client would search for the domain of a hub.
+    /// Prints the scanner at the port, or the ports of this machine without opening any. `locations` returns the
+    /// locations in which a client would search for the domain of a hub.
     ///
     /// # Errors
     ///
-    /// Returns the kinds of a port that cannot be used, including [`Kind::PortBusy`] if another process has it open. Returns
-    /// [`Kind::PortMissing`] if there is no port to list, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`]
-    /// if `stop` is set.
+    /// Returns the kinds of a port that cannot be used, including [`Kind::PortBusy`] if another process has it open.
+    /// Returns [`Kind::PortMissing`] if there is no port to list, [`Kind::Timeout`] if no scanner replies, and
+    /// [`Kind::Interrupted`] if `stop` is set.
     pub fn run(
         &self,
         json: bool,
@@ -106,10 +106,10 @@ struct CandidateLine<'a> {
     driver: Option<&'a str>,
     product: Option<&'a str>,
     permitted: bool,
-    /// The process that has it open.
+    /// ID of the process that has the port open.
     holder: Option<u32>,
     program: Option<&'a str>,
-    /// The name below by-id that another adapter has too.
+    /// Name below by-id that another adapter has too.
     shared_name: Option<String>,
     caution: Option<String>,
     remedy: Option<String>,
@@ -212,8 +212,8 @@ impl fmt::Display for ProbeResult {
     }
 }
 
-/// Finds the scanner at `source`. Until its family is known, it gets only the requests of the search. Calls `look` with
-/// each rate at which it searches.
+/// Finds the scanner at `source`. Until its family is known, it gets only the requests of the search. Calls `on_rate`
+/// with each rate at which it searches.
 fn probe(
     source: &PortSpec,
     locations: &[Domain],
@@ -290,8 +290,9 @@ pub(crate) fn find(
     Ok(FoundScanner::Rotating(Box::new(scanner)))
 }
 
-/// Returns the failure for a port at which a search has found no scanner. The message lists the families and rates of the
-/// search, and the hint what to check at a scanner of each family. If a family was named, the scanner may belong to another one.
+/// Returns the failure for a port at which a search has found no scanner. The message lists the families and rates of
+/// the search, and the hint what to check at a scanner of each family. If a family was named, the scanner may belong to
+/// another one.
 fn nothing_found(source: &PortSpec, is_named: bool, NotFound { bytes, coverage }: &NotFound) -> Failure {
     let (possible, impossible): (Vec<_>, Vec<_>) = coverage.iter().partition(|it| !it.rates.is_empty());
     let at_rates = |it: &&Coverage| format!("{} at {} Bd", it.family.name(), or_list(&it.rates));
@@ -354,8 +355,8 @@ pub(crate) fn source(text: &str) -> Result<PortSpec, Failure> {
     })
 }
 
-/// Checks that no other process has `source` open, whether or not it has locked it: each of the two would get only a
-/// part of the bytes. `locations` are the locations in which a client would search for the domain of a hub.
+/// Checks that no other process has `source` open, whether or not it has locked it. Otherwise, each of the two would
+/// get only a part of the bytes. `locations` are the locations in which a client would search for the domain of a hub.
 ///
 /// # Errors
 ///
@@ -375,7 +376,8 @@ pub(crate) fn check_unused(source: &PortSpec, locations: &[Domain]) -> Result<()
     }
 }
 
-/// Opens `source` at the highest rate of an inquiry that it supports, in bits per second, unless `stop` is set before it is open.
+/// Opens `source` at the highest rate of an inquiry that it supports, in bits per second, unless `stop` is set before
+/// it is open.
 pub(crate) fn open(source: &PortSpec, stop: &AtomicBool) -> Result<(Port, u32), Failure> {
     let open = |rate: u32| Port::open(source, rate, stop).map(|port| (port, rate));
     let (port, rate) = open(HIGHEST_RATE).or_else(|failure| match failure.kind {
@@ -387,8 +389,8 @@ pub(crate) fn open(source: &PortSpec, stop: &AtomicBool) -> Result<(Port, u32), 
     Ok((port, rate))
 }
 
-/// Requests identity, settings and state of the scanner at `port` by `inquiry`. The highest rate of the port is `first`, in
-/// bits per second. If the family was named, the scanner may belong to another one.
+/// Requests identity, settings and state of the scanner at `port` by `inquiry`. The highest rate of the port is
+/// `first`, in bits per second. If the family was named, the scanner may belong to another one.
 ///
 /// # Errors
 ///
@@ -426,8 +428,8 @@ fn is_server(source: &PortSpec) -> bool {
     matches!(source, PortSpec::Tcp { .. })
 }
 
-/// Returns the failure for a scanner that did not reply to an inquiry, with possible reasons, after `bytes` bytes arrived.
-/// It may stream at `streams_at`. The highest rate of the port is `first`. Rates are in bits per second.
+/// Returns the failure for a scanner that did not reply to an inquiry, with possible reasons, after `bytes` bytes
+/// arrived. It may stream at `streams_at`. The highest rate of the port is `first`. Rates are in bits per second.
 fn no_reply(source: &PortSpec, first: u32, streams_at: Option<u32>, bytes: u64) -> Failure {
     let name = source.name();
     let received_text = match bytes {
@@ -515,7 +517,7 @@ fn permanent_name(source: &PortSpec, serial_ports: &[SerialPortInfo]) -> String 
     let PortSpec::Tty(path) = source else { return source.name() };
     let path: PathBuf = std::path::absolute(path).unwrap_or_else(|_| path.clone());
     let name = match candidate_of(source, serial_ports) {
-        // A link elsewhere was made by the user, who knows what it stands for.
+        // A symlink elsewhere was created by the user, so keep it.
         Some(candidate) if path == candidate.device || is_by_udev(&path) => &candidate.name,
         _ => &path,
     };
@@ -580,13 +582,13 @@ mod tests {
         assert!(noisy.message.contains("7 bytes arrived that scanhub does not recognize"), "{noisy}");
         let server = failure("tcp:box:4001", 0, &[]);
         assert!(server.hint.starts_with("set the serial server to the scanner's rate"), "{server}");
-        // A port that has no rate of one family, and lacks one rate of another.
+        // The port has no rate of one family, and lacks one rate of another.
         let slow = failure("/dev/ttyS0", 0, &[230_400, 921_600, 500_000]);
         let cannot =
             "; this port cannot have 230400 or 921600 Bd, so scanners of family ld cannot be found here";
         assert!(slow.message.ends_with(cannot) && !slow.message.contains("500000"), "{slow}");
         assert!(slow.hint.ends_with("; ld: use an adapter with a CP2102N, FT232R or newer"), "{slow}");
-        // A link that names its family.
+        // The link names its family.
         let mut only = coverage(&[230_400, 921_600]);
         only.retain(|it| it.family == Family::Ld);
         let not_found = NotFound { bytes: 0, coverage: only };

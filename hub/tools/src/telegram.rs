@@ -60,13 +60,13 @@ struct DecodeArgs {
 }
 
 impl TelegramArgs {
-    /// Explains all telegrams in a stream of bytes, in hexadecimal text or inside an MCAP recording, and reports the bytes
-    /// between them. The bytes of a recording are those of its telegrams, in order.
+    /// Explains all telegrams in a stream of bytes, in hexadecimal text or inside an MCAP recording, and reports the
+    /// bytes between them. The bytes of a recording are those of its telegrams, in order.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Check`] if there is no telegram, [`Kind::Input`] if the input cannot be read, [`Kind::NoTopic`] if the
-    /// recording does not have this sensor, and [`Kind::Usage`] if it has several sensors and none is selected.
+    /// Returns [`Kind::Check`] if there is no telegram, [`Kind::Input`] if the input cannot be read, [`Kind::NoTopic`]
+    /// if the recording does not have this sensor, and [`Kind::Usage`] if it has several sensors and none is selected.
     pub fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
         let Action::Decode(args) = &self.action;
         decode(args, json, out)
@@ -180,7 +180,7 @@ impl Input {
     ///
     /// # Errors
     ///
-    /// Returns [`ErrorKind::InvalidData`], with the line, if a word of hexadecimal text is not a byte.
+    /// Returns [`ErrorKind::InvalidData`], with the line, if a part of hexadecimal text is not a byte.
     pub(crate) fn next(&mut self) -> io::Result<Option<&[u8]>> {
         let mut len = match std::mem::take(&mut self.read_ahead) {
             0 => self.read()?,
@@ -545,7 +545,7 @@ fn text(field: &Field<'_>, all: bool) -> String {
     let mut text = format!("\n          {:>4}  {:<20}  {}", field.offset, hex(field.bytes, 6), field.name);
     let words = describe_field(field).map_or(String::new(), |words| format!(" ({words})"));
     let _ = match field.value {
-        // A number that means nothing to people.
+        // Show the meaning, because users do not know the number.
         Value::Number(_) if FRAME_FIELDS.contains(&field.name) => match describe_field(field) {
             Some(words) => write!(text, ": {words}"),
             None => Ok(()),

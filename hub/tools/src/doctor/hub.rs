@@ -9,7 +9,7 @@ use scanhub_schema::{Failure, Kind, State, Status, is_remote};
 use scanhub_shm::Payload;
 use scanhub_shm::{Domain, Environment, RunningHub};
 
-/// A running hub.
+/// Running hub.
 pub(crate) struct Hub {
     pub(crate) pid: u32,
     /// Command that shows a link of this hub, without the link's name.
@@ -18,14 +18,14 @@ pub(crate) struct Hub {
 }
 
 impl Hub {
-    /// Returns the hub in `domain`, if there is one.
+    /// Returns the hub in `domain`, if one runs.
     pub(crate) fn find(domain: &Domain) -> Option<Hub> {
         let pid = scanhub_shm::hub_pid(domain.root()).ok().flatten()?;
         Some(Hub { pid, info: "scanhub info".to_owned(), statuses: statuses(domain).unwrap_or_default() })
     }
 
-    /// Returns the hub that uses the port `source`: one of its `holders`, in `places` or in another domain of this machine, or
-    /// one in `places` that is connected to this serial server.
+    /// Returns the hub that uses the port `source`: one of its `holders`, in `locations` or in another domain of this
+    /// machine, or a hub in `locations` that is connected to this serial server.
     pub(crate) fn at(source: &PortSpec, holders: &[Holder], locations: &[Domain]) -> Option<Hub> {
         if let PortSpec::Tcp { .. } = source {
             let is_connected = |(_, status): (&str, &Status)| status.state() != Some(State::Absent);
@@ -160,8 +160,8 @@ impl Hub {
     }
 }
 
-/// Returns the process among the `holders` of a port that takes bytes away from `hub`. The service manager only keeps the
-/// port for the next hub.
+/// Returns the process among the `holders` of a port that takes bytes away from `hub`. The service manager only keeps
+/// the port for the next hub.
 pub(crate) fn other_reader(holders: &[Holder], hub: u32) -> Option<&Holder> {
     holders.iter().find(|holder| holder.pid != hub && holder.pid != SERVICE_MANAGER)
 }

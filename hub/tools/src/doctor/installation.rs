@@ -1,9 +1,9 @@
-//! Checks of the installation: the version of the running hub, and the files that systemd, udev and logind read. These are
-//! the service with its program and the udev rule, which `hub/dist/install.sh` installs, and the configuration of logind,
-//! which may remove shared memory at logout. A hub that is started by hand needs neither service nor rule.
+//! Checks of the installation: the version of the running hub, and the files that systemd, udev and logind read. These
+//! are the service with its program and the udev rule, which `hub/dist/install.sh` installs, and the configuration of
+//! logind, which may remove shared memory at logout. A hub that is started by hand needs neither service nor rule.
 //!
-//! Hub and clients of different versions refuse each other. Programs are compared by their bytes, or else by the version
-//! that they report.
+//! Hub and clients of different versions refuse each other. Programs are compared by their bytes, otherwise by the
+//! version that they report.
 
 use std::fs::{self, File, Metadata};
 use std::io::{ErrorKind, Read};
@@ -270,7 +270,7 @@ pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
     }
 }
 
-/// Checks whether the udev rule of this version is installed, and has named the adapters `there`.
+/// Checks whether the udev rule of this version is installed, and has named the adapters of `serial_ports`.
 pub(crate) fn rules(system: &System, serial_ports: &[SerialPortInfo]) -> Finding {
     const NAME: &str = "udev";
     let Some(path) = system.first(&RULE_DIRECTORIES, RULE_NAME) else {

@@ -323,9 +323,9 @@ fn rate(subject: &PortTarget, port: &Port, first: u32, found: Option<u32>) -> Fi
 /// Name of the check of bytes that arrived damaged, or were lost before they could be read.
 const LINE_ERRORS: &str = "line-errors";
 
-/// Judges the counters that the driver of an open line has kept since it was loaded, if it counts errors. `now` is the
-/// number of errors while a scanner replied at its rate. At a wrong rate every byte is an error, and the search for a
-/// scanner tries wrong rates, so a few errors are ignored.
+/// Judges the counters that the driver of an open line has kept since it was loaded, if it counts errors.
+/// `reply_errors` is the number of errors while a scanner replied at its rate. At a wrong rate every byte is an error,
+/// and the search for a scanner tries wrong rates, so a few errors are ignored.
 fn line_errors(counts: Option<UartCounters>, reply_errors: u64) -> Finding {
     let Some(counts) = counts else {
         return Finding::skipped(LINE_ERRORS, "the driver does not count errors");

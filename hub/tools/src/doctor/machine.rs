@@ -1,6 +1,6 @@
 //! Checks what a hub needs from the machine, whatever its sensors are: shared memory, its own domain, descriptors and
-//! file sizes, and the network interface of a gateway. Most checks judge [`MachineState`] that were gathered before, so that
-//! tests can provide any facts.
+//! file sizes, and the network interface of a gateway. Most checks use a [`MachineState`] that was gathered before, so
+//! that tests can provide any state.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -20,7 +20,7 @@ use super::installation::is_stopped;
 use super::shared_memory::{self, SharedFile};
 use super::{Finding, System};
 
-/// Facts about the machine and the domain.
+/// State of the machine and the domain.
 #[derive(Clone, Debug)]
 pub(crate) struct MachineState {
     pub(crate) links: usize,
@@ -82,7 +82,7 @@ pub(crate) struct ExistingDirectory {
 }
 
 impl MachineState {
-    /// Gathers all facts, without changing anything.
+    /// Gathers the state, without changing anything.
     pub(crate) fn gather(
         domain: &Domain,
         locations: &[Domain],
@@ -173,7 +173,7 @@ impl ExistingDirectory {
     }
 }
 
-/// Checks whether shared memory has room for the links. `less` is a remedy that reduces their need.
+/// Checks whether shared memory has room for the links. `saving_remedy` is a remedy that reduces their need.
 pub(crate) fn memory(state: &MachineState, saving_remedy: Option<String>) -> Finding {
     const NAME: &str = "memory";
     let Some(Memory { size, free, free_files, is_read_only }) = state.memory else {

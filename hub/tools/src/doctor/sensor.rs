@@ -203,7 +203,7 @@ fn describe_variant(variant: Variant) -> String {
 /// Operating mode in which the EEPROM can be written.
 const INSTALLATION_MODE: u8 = 0x00;
 
-/// Checks a rotating scanner that was `heard`.
+/// Checks a rotating `scanner` that was detected.
 pub(crate) fn check_rotating(scanner: &DetectedScanner, link: Option<&Link>) -> Vec<Finding> {
     let text = format!("{scanner}, family {}", scanner.family.name());
     let mut findings = vec![match &scanner.introduction {

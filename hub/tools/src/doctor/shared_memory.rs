@@ -62,8 +62,8 @@ pub(crate) fn leftovers(state: &MachineState) -> Finding {
     }
 }
 
-/// Removes everything that dead processes of `user` left in this domain, at all its `places`, and reports it. Has no
-/// effect while a hub or a listener runs at one of them.
+/// Removes everything that dead processes of `user` left in this domain, at all of its `locations`, and reports it. Has
+/// no effect while a hub or a listener runs at one of them.
 pub(crate) fn clean(locations: &[&Domain], user: u32) -> Finding {
     const NAME: &str = "clean";
     let Some(prefix) = locations.first().map(|location| location.prefix()) else {
@@ -108,7 +108,7 @@ pub(crate) fn clean(locations: &[&Domain], user: u32) -> Finding {
     clean_finding(dead, &removed_files, &roots)
 }
 
-/// Reports that everything of `dead` processes, the files `gone`, and the directories `roots` were removed.
+/// Reports that everything of `dead` processes, the files `removed_files`, and the directories `roots` were removed.
 fn clean_finding(dead: usize, removed_files: &[SharedFile], roots: &[String]) -> Finding {
     const NAME: &str = "clean";
     let mut removed = Vec::new();

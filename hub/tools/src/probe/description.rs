@@ -1,5 +1,5 @@
 //! Descriptions of a scanner that was found, as text and as JSON of class `probe`: [`Description`] of an LMS, and
-//! [`Turning`] of a rotating scanner.
+//! [`RotatingDescription`] of a rotating scanner.
 
 use std::fmt;
 
@@ -235,7 +235,7 @@ pub(super) struct RotatingDescription {
 }
 
 impl RotatingDescription {
-    /// Creates the description of the scanner that was `heard` at `port`.
+    /// Creates the description of the `scanner` that was detected at `port`.
     pub(crate) fn new(port: String, scanner: &DetectedScanner) -> RotatingDescription {
         let rounded = |value: f64| (value > 0.0).then(|| (value * 100.0).round() / 100.0);
         let is_received = scanner.packets > 0 || scanner.introduction.is_none();

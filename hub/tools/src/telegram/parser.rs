@@ -1,5 +1,6 @@
-//! Splits a stream of bytes, in both directions, into items: the telegrams of the scanner that the framer finds, and between
-//! them requests, acknowledgements, damaged and incomplete telegrams, and other bytes. Every byte is in exactly one item.
+//! Parser that splits a stream of bytes, in both directions, into items: the telegrams of the scanner that the framer
+//! finds, and between them requests, acknowledgements, damaged and incomplete telegrams, and other bytes. Every byte is
+//! in exactly one item.
 
 use std::io;
 
@@ -28,9 +29,9 @@ pub(crate) enum Item<'a> {
         /// The announced length.
         announced: usize,
     },
-    /// A single byte before a reply.
+    /// Acknowledgement: a single byte before a reply.
     Ack,
-    /// A single byte instead of one.
+    /// Negative acknowledgement: a single byte instead of a reply.
     Nak,
     /// Bytes that belong to no telegram.
     Other(&'a [u8]),
@@ -87,7 +88,7 @@ impl StreamParser {
         Ok(())
     }
 
-    /// Reports bytes that the framer has dropped long ago, up to a position at which no telegram is split.
+    /// Reports old bytes that the framer has dropped, up to a position at which no telegram is split.
     fn report_old(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
         let max = self.pending.len() - 2 * MAX_TELEGRAM;
         let across = whole_telegrams(&self.pending).find(|&(at, telegram)| at + telegram.bytes().len() > max);
@@ -112,7 +113,8 @@ fn report_gap(bytes: &[u8], base: u64, before_reply: bool, sink: &mut Sink<'_>) 
     report_fragments(&bytes[reported..], base + reported as u64, (after_telegram, before_reply), sink)
 }
 
-/// Returns the telegrams with a valid checksum in `bytes`, in either direction, with their positions. They do not overlap.
+/// Returns the telegrams with a valid checksum in `bytes`, in either direction, with their positions. They do not
+/// overlap.
 fn whole_telegrams(bytes: &[u8]) -> impl Iterator<Item = (usize, Telegram<'_>)> {
     let mut from = 0;
     std::iter::from_fn(move || {
@@ -128,8 +130,8 @@ fn whole_telegrams(bytes: &[u8]) -> impl Iterator<Item = (usize, Telegram<'_>)> 
     })
 }
 
-/// Reports bytes without a whole telegram. A byte counts as an acknowledgement directly after a request, directly before a
-/// reply, or alone. `neighbors` are whether a request is before the bytes, and a reply after them.
+/// Reports bytes without a complete telegram. A byte counts as an acknowledgement directly after a request, directly
+/// before a reply, or alone. `neighbors` are whether a request is before the bytes, and a reply after them.
 fn report_fragments(bytes: &[u8], base: u64, neighbors: (bool, bool), sink: &mut Sink<'_>) -> io::Result<()> {
     let (after_request, before_reply) = neighbors;
     let mut other = 0;
