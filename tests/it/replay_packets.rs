@@ -166,7 +166,10 @@ fn a_part_of_it_and_again() {
     let positions: Vec<_> =
         inner.iter().map(|scan| expected.iter().position(|ranges| *ranges == ranges_of(scan))).collect();
     let found: Vec<_> = positions.iter().flatten().collect();
-    assert!(!found.is_empty() && found.is_sorted_by(|a, b| a < b), "other scans, or another order: {positions:?}");
+    assert!(
+        !found.is_empty() && found.is_sorted_by(|a, b| a < b),
+        "other scans, or another order: {positions:?}"
+    );
     // On a busy machine, the recorder may have missed scans, which the replay computes from the telegrams.
     let is_complete = recorded.windows(2).all(|pair| pair[1].0.topic_seq == pair[0].0.topic_seq + 1);
     assert!(!is_complete || found.len() == inner.len(), "other scans: {positions:?}");

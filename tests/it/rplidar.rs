@@ -223,8 +223,7 @@ fn reports_line_that_damages_most_bytes() {
 
     let _hub = hub(&env, &["model=s2"]);
     let mut status = env.echo(&["front/status"]);
-    let reports_damage =
-        |line: &Value| text(line, "last_error").contains("bytes are damaged on the line");
+    let reports_damage = |line: &Value| text(line, "last_error").contains("bytes are damaged on the line");
     status.await_line("what the line does", reports_damage);
     let statuses = status.end(INT).of_class("status");
     assert!(!statuses.iter().any(|line| text(line, "last_error").contains("head")), "{statuses:#?}");

@@ -134,7 +134,7 @@ pub(crate) fn computed_values_c(header: &Header, scan: &Scan) -> String {
          sample.length = 64 + (sizeof bytes - 64) / 2;\n\
          if (scanhub_count(&sample) > {} / 2) return 2;\n\
          sample.length = sizeof bytes;\n\
-         printf(\"%u %u %d\\n\", scanhub_count(&sample), scanhub_collapsed(&sample), scanhub_is_incomplete(&sample));\n\
+         printf(\"%u %u %d\\n\", scanhub_count(&sample), scanhub_collisions(&sample), scanhub_is_incomplete(&sample));\n\
          for (unsigned i = 0; i < scanhub_count(&sample) + 3; i++) {{\n\
          const char *code = scanhub_code(&sample, i);\n\
          printf(\"%.17g %.17g %s %d %\" PRIu64 \"\\n\", scanhub_range_m(&sample, i), scanhub_angle(&sample, i),\n\

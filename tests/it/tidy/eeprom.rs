@@ -40,7 +40,10 @@ fn only_configure_may_write_the_eeprom() {
                 "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n",
             ),
             tree.with("hub/drivers/src/lms/explain.rs", "//! Writes.\nlet telegram = Writer::new(0, SET);\n"),
-            tree.with("hub/drivers/src/lms/protocol_state.rs", "//! Talks.\nuse crate::eeprom::EepromWrite;\n"),
+            tree.with(
+                "hub/drivers/src/lms/protocol_state.rs",
+                "//! Talks.\nuse crate::eeprom::EepromWrite;\n",
+            ),
             tree.with("hub/drivers/src/lms/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
             tree.with(
                 "hub/drivers/src/lms/request_channel.rs",

@@ -816,7 +816,7 @@ static inline int32_t scanhub_intensity(const struct scanhub_sample *scan, unsig
 }
 
 /* Points that were dropped because another point has the same beam. Points without a return count, too. */
-static inline unsigned scanhub_collapsed(const struct scanhub_sample *scan)
+static inline unsigned scanhub_collisions(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
     return head == NULL ? 0 : head->collisions;
