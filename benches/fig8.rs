@@ -81,7 +81,7 @@ impl WarningRun {
         let mut cutter = Segmenter::new(Pose::default(), beams);
         let mut foreground = Foreground::of(beams);
         let mut background = Background::zeroed(Background::len(beams));
-        let room = Room::new(&"fig8".parse().expect("a world that the program brings along"), options.seed);
+        let room = Room::new(&"fig8".parse().expect("a built-in world"), options.seed);
         for end_ns in (1..=SCAN_COUNT).map(|number| number * SCAN_PERIOD_NS) {
             let scan = scan(&room, end_ns);
             model.update(&scan, &mut foreground);

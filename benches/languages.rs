@@ -118,7 +118,8 @@ fn measure_reading(environment: &BenchEnvironment, options: &Options) -> Outcome
     words.extend([script.display().to_string(), file.clone()]);
     let run = |child: Child| -> Outcome<f64> {
         let lines = child.lines_until("end", STEP_TIMEOUT + Duration::from_secs(60))?;
-        let read_line = lines.iter().find(|line| line.text.starts_with("took")).ok_or("it did not read")?;
+        let read_line =
+            lines.iter().find(|line| line.text.starts_with("took")).ok_or("the program printed no time")?;
         Ok(read_line.number(1)? as f64 / 1e6)
     };
     let (mut pythons, mut rusts) = (Vec::new(), Vec::new());

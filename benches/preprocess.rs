@@ -27,7 +27,7 @@ const SCAN_COUNT: u64 = 64;
 
 /// Returns the first `count` scans of a world.
 fn scans(world: &str, count: u64) -> Vec<Box<Scan>> {
-    let room = Room::new(&world.parse().expect("a world that the program brings along"), 1);
+    let room = Room::new(&world.parse().expect("a built-in world"), 1);
     let scan = |number| {
         let end_ns = number * Variant::HALF.revolutions() * MIRROR_PERIOD;
         decoded_scan::scan(&room.scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, end_ns), Unit::Mm)
@@ -47,7 +47,7 @@ fn model(method: Method, scans: &[Box<Scan>]) -> (BackgroundModel, &[Box<Scan>])
 /// Times `update` over `scans` in turn.
 fn time_scans(c: &mut Criterion, name: &str, scans: &[Box<Scan>], mut update: impl FnMut(&Scan)) {
     let mut next = scans.iter().cycle();
-    c.bench_function(name, |b| b.iter(|| update(black_box(next.next().expect("a cycle")))));
+    c.bench_function(name, |b| b.iter(|| update(black_box(next.next().expect("an endless sequence")))));
 }
 
 fn bench_zones(c: &mut Criterion) {

@@ -45,7 +45,7 @@ fn framing(c: &mut Criterion) {
         let mut next = telegrams.iter().cycle();
         group.bench_function(name, |b| {
             b.iter(|| {
-                let mut bytes = next.next().expect("a cycle").as_slice();
+                let mut bytes = next.next().expect("an endless sequence").as_slice();
                 let mut found = 0;
                 for &len in reads {
                     let (read, rest) = bytes.split_at(len);
@@ -63,7 +63,7 @@ fn framing(c: &mut Criterion) {
     }
     let mut next = telegrams.iter().cycle();
     group.bench_function("crc", |b| {
-        b.iter(|| crc(black_box(&next.next().expect("a cycle")[..730])));
+        b.iter(|| crc(black_box(&next.next().expect("an endless sequence")[..730])));
     });
     group.finish();
 }

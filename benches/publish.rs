@@ -42,7 +42,7 @@ fn publish(c: &mut Criterion) {
         ("asleep at the event", WaitMethod::Event),
     ] {
         for count in SUBSCRIBER_COUNTS.into_iter().filter(|count| *count > 0 || rest == WaitMethod::Awake) {
-            let environment = BenchEnvironment::new().expect("a domain");
+            let environment = BenchEnvironment::new().expect("a bench environment");
             let mut source = ScanSource::open(&environment.domain).expect("a publisher");
             let node = scanhub_shm::client_node(&environment.domain).expect("a node");
             let crowd = SubscriberThreads::default();
@@ -57,7 +57,7 @@ fn publish(c: &mut Criterion) {
                     wait_until(|| crowd.ready.load(Ordering::Acquire) == count);
                 }
                 let awake: Vec<_> = (0..if rest == WaitMethod::Awake { count } else { 0 })
-                    .map(|_| subscriber(&node).expect("a place"))
+                    .map(|_| subscriber(&node).expect("a free slot"))
                     .collect();
                 let mut sent = 0;
                 group.bench_function(BenchmarkId::new(name, count), |b| {
@@ -65,7 +65,7 @@ fn publish(c: &mut Criterion) {
                         let mut busy = Duration::ZERO;
                         for _ in 0..times {
                             let before = cpu_time();
-                            source.publish(0).expect("is sent");
+                            source.publish(0).expect("a published sample");
                             busy += cpu_time() - before;
                             sent += 1;
                             for subscriber in &awake {
@@ -106,7 +106,7 @@ impl Drop for EndOnDrop<'_> {
 
 fn run_subscriber(node: &Node, wait_method: WaitMethod, threads: &SubscriberThreads) -> Outcome<()> {
     let subscriber = subscriber(node)?;
-    let doorbell = Doorbell::open(node, SENSOR)?.ok_or("no bell")?;
+    let doorbell = Doorbell::open(node, SENSOR)?.ok_or("no doorbell")?;
     let listener = match wait_method {
         WaitMethod::Event => {
             Some(scanhub_shm::listener(node, &scanhub_shm::open_wake(node, SENSOR)?.ok_or("no event")?)?)
@@ -128,7 +128,7 @@ fn run_subscriber(node: &Node, wait_method: WaitMethod, threads: &SubscriberThre
                 &[(&doorbell, DoorbellWord::First, rung)],
                 clock::now() + END_POLL_INTERVAL.as_nanos() as u64,
             )
-            .map_err(|_| "no bells on this system")?,
+            .map_err(|_| "no doorbells on this system")?,
         }
     }
     Ok(())
@@ -142,7 +142,7 @@ fn subscriber(node: &Node) -> Outcome<scanhub_shm::Subscriber<Scan>> {
 fn wait_until(is_true: impl Fn() -> bool) {
     let give_up_at = Instant::now() + 6 * STEP_TIMEOUT;
     while !is_true() {
-        assert!(Instant::now() < give_up_at, "the consumers do not come on");
+        assert!(Instant::now() < give_up_at, "the subscribers do not continue");
         thread::sleep(Duration::from_micros(100));
     }
 }
@@ -171,16 +171,16 @@ where
     let mut buffer = [0; MTU_ETHERNET];
     group.bench_function(format!("{}, pack and seal", topic.name()), |b| {
         b.iter(|| {
-            let len = black_box(sent).pack(&mut buffer[HEADER_LEN..]).expect("fits");
-            black_box(head.seal(&mut buffer, len).expect("fits"));
+            let len = black_box(sent).pack(&mut buffer[HEADER_LEN..]).expect("a buffer that is large enough");
+            black_box(head.seal(&mut buffer, len).expect("a buffer that is large enough"));
         });
     });
-    let len = sent.pack(&mut buffer[HEADER_LEN..]).expect("fits");
-    let sealed = head.seal(&mut buffer, len).expect("fits").to_vec();
+    let len = sent.pack(&mut buffer[HEADER_LEN..]).expect("a buffer that is large enough");
+    let sealed = head.seal(&mut buffer, len).expect("a buffer that is large enough").to_vec();
     let mut received = Box::default();
     group.bench_function(format!("{}, read, check and unpack", topic.name()), |b| {
         b.iter(|| {
-            let datagram = Datagram::read(black_box(&sealed)).expect("is whole");
+            let datagram = Datagram::read(black_box(&sealed)).expect("an intact datagram");
             assert!(P::unpack_into(&mut received, datagram.payload));
             black_box(&mut received);
         });

@@ -161,7 +161,7 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
 
 /// Waits for the boot message of the sensor, and returns the time at which its last byte was written.
 fn wait_for_boot_message(environment: &BenchEnvironment) -> Outcome<u64> {
-    let banner = Reply::PowerOn(b"LMS200;301063;V02.30").encode(0, 0x10).ok_or("no banner")?;
+    let banner = Reply::PowerOn(b"LMS200;301063;V02.30").encode(0, 0x10).ok_or("no boot message")?;
     let banner = hash(banner.bytes());
     let give_up_at = support::clock::now() + STEP_TIMEOUT.as_nanos() as u64;
     loop {

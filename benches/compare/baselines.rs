@@ -65,7 +65,7 @@ pub(crate) struct FutexReader {
 impl FutexReader {
     pub(crate) fn new(task: &RunParameters) -> Outcome<FutexReader> {
         let node = scanhub_shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
-        let doorbell = Doorbell::open(&node, SENSOR)?.ok_or("no bell")?;
+        let doorbell = Doorbell::open(&node, SENSOR)?.ok_or("no doorbell")?;
         let last_count = doorbell.ring_count(DoorbellWord::First);
         Ok(FutexReader {
             doorbell,
@@ -175,7 +175,7 @@ fn received_descriptor(stream: &UnixStream) -> Outcome<OwnedFd> {
         RecvAncillaryMessage::ScmRights(mut fds) => fds.next(),
         _ => None,
     });
-    Ok(received_descriptor.ok_or("no eventfd came")?)
+    Ok(received_descriptor.ok_or("no eventfd arrived")?)
 }
 
 /// Determines the message to which each wake-up belongs, because only a count arrives.

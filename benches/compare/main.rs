@@ -82,7 +82,7 @@ fn main() -> ExitCode {
 /// Runs a process of a run, which is selected by its command line.
 fn run_part(words: &[&str]) -> Outcome<()> {
     let [part, way, payload, receivers, domain, place, ref rest @ ..] = *words else {
-        return Err(format!("no part {words:?}").into());
+        return Err(format!("unknown part {words:?}").into());
     };
     let mechanism = Mechanism::from_name(way)?;
     let task = RunParameters {
@@ -95,7 +95,7 @@ fn run_part(words: &[&str]) -> Outcome<()> {
     match (part, rest) {
         ("send", []) => process::send_all(&task),
         ("receive", [number, address]) => process::receive_all(&task, number.parse()?, address),
-        _ => Err(format!("no part {words:?}").into()),
+        _ => Err(format!("unknown part {words:?}").into()),
     }
 }
 
@@ -144,7 +144,7 @@ fn compare(
             let measured = case.measure(stage).map_err(|error| format!("{case:?}: {error}"))?;
             for (phase, measured) in measured {
                 let cell = cells.iter_mut().find(|cell| cell.case == *case && cell.phase == phase);
-                cell.ok_or("no such phase")?.runs.push(measured);
+                cell.ok_or("unknown phase")?.runs.push(measured);
             }
         }
         cases.rotate_left(1);

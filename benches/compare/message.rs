@@ -76,7 +76,7 @@ impl Mechanism {
         Ok(Mechanism::ALL
             .into_iter()
             .find(|mechanism| mechanism.name() == name)
-            .ok_or_else(|| format!("no way {name}"))?)
+            .ok_or_else(|| format!("unknown mechanism {name}"))?)
     }
 
     /// Returns whether users would take this mechanism instead of topics.

@@ -97,7 +97,7 @@ impl Report {
     fn wait_for(child: &Child, word: &str) -> Outcome<Report> {
         let OutputLine { text, .. } = child.wait_for_line(word, STEP_TIMEOUT)?;
         let mut numbers = text.split_whitespace().skip(1).map(str::parse);
-        let busy_ns = numbers.next().ok_or("no account")??;
+        let busy_ns = numbers.next().ok_or("no CPU time")??;
         Ok(Report { busy_ns, numbers: numbers.collect::<Result<_, _>>()? })
     }
 }
@@ -109,7 +109,8 @@ fn figures(sent: &Report, receivers: &[Report]) -> Outcome<PhaseFigures> {
     for report in receivers {
         for message in report.numbers.chunks_exact(2) {
             let number = message[0] as usize;
-            let sent_ns = *sent.numbers.get(number).ok_or_else(|| format!("nobody sent {number}"))?;
+            let sent_ns =
+                *sent.numbers.get(number).ok_or_else(|| format!("message {number} was not sent"))?;
             let latency = message[1].saturating_sub(sent_ns);
             all.push(latency);
             last[number] = (last[number].0 + 1, last[number].1.max(latency));

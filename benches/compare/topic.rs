@@ -124,7 +124,7 @@ impl BytesReceiver {
             let event = scanhub_shm::open_wake(&node, SENSOR)?.ok_or("no event")?;
             WaitMethod::Event(Box::new(scanhub_shm::listener(&node, &event)?), false)
         } else {
-            let doorbell = Doorbell::open(&node, SENSOR)?.ok_or("no bell")?;
+            let doorbell = Doorbell::open(&node, SENSOR)?.ok_or("no doorbell")?;
             let rung = doorbell.ring_count(DoorbellWord::First);
             WaitMethod::Doorbell(doorbell, rung, task.mechanism == Mechanism::Doorbell)
         };

@@ -50,7 +50,7 @@ pub(crate) fn port() -> u16 {
 
 /// Returns the telegrams of ten seconds.
 fn telegrams(sensor: u64) -> Vec<Vec<u8>> {
-    let room = Room::of_port(&"room".parse().expect("a world that the program brings along"), 1, sensor);
+    let room = Room::of_port(&"room".parse().expect("a built-in world"), 1, sensor);
     let telegram = |number: u64| {
         let words = room.scan(Variant::HALF, Unit::Mm, MODE, number * SCAN_PERIOD_NS);
         lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()

@@ -88,7 +88,7 @@ fn baseline_run() -> Outcome<Run> {
     stdout.ok_or("no pipe")?.read_exact(&mut [0; 1])?;
     let mut next = stamps.iter();
     paced(|| {
-        next.next().ok_or("one too many")?.store(wall_ns(), Ordering::Release);
+        next.next().ok_or("more samples than stamps")?.store(wall_ns(), Ordering::Release);
         rustix::io::write(&wake, &1u64.to_ne_bytes())?;
         Ok(())
     })?;

@@ -112,7 +112,8 @@ impl Program {
     /// Returns the next line of this class, and drops the lines before it.
     pub(crate) fn wait_for_class(&self, class: &str) -> Outcome<Value> {
         loop {
-            let (_, line) = self.lines.recv_timeout(STEP_TIMEOUT).map_err(|_| format!("no {class} came"))?;
+            let (_, line) =
+                self.lines.recv_timeout(STEP_TIMEOUT).map_err(|_| format!("no {class} arrived"))?;
             if line["class"] == class {
                 return Ok(line);
             }
@@ -124,7 +125,7 @@ impl Program {
     pub(crate) fn wait_for_class_after(&self, since_ns: u64, class: &str) -> Outcome<u64> {
         loop {
             let (at_ns, line) =
-                self.lines.recv_timeout(STEP_TIMEOUT).map_err(|_| format!("no {class} came"))?;
+                self.lines.recv_timeout(STEP_TIMEOUT).map_err(|_| format!("no {class} arrived"))?;
             if at_ns > since_ns && line["class"] == class {
                 return Ok(at_ns);
             }

@@ -250,7 +250,7 @@ pub(crate) fn drive(
     telegrams: usize,
     has_subscribers: bool,
 ) -> Outcome<()> {
-    let variant = Variant::of_beams(beams).ok_or("no variant has so many beams")?;
+    let variant = Variant::of_beams(beams).ok_or("no variant has this number of beams")?;
     let environment = BenchEnvironment::new()?;
     let config = config(sensors, variant)?;
     virtual_hub(&config, &environment.domain, |links| {
@@ -309,7 +309,7 @@ struct SensorStreams {
 
 impl SensorStreams {
     fn new(variant: Variant) -> SensorStreams {
-        let room = Room::new(&"fig8".parse().expect("a world that the program brings along"), 1);
+        let room = Room::new(&"fig8".parse().expect("a built-in world"), 1);
         let period = variant.revolutions() * MIRROR_PERIOD;
         let telegram = |number| {
             let words = room.scan(variant, Unit::Mm, MODE, number * period);

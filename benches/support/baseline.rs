@@ -225,7 +225,7 @@ impl LmsHost {
                 return Ok(());
             }
         }
-        Err(format!("no answer to {request:?}").into())
+        Err(format!("no reply to {request:?}").into())
     }
 
     /// Returns whether a telegram with `command` arrives before `until`.
@@ -285,7 +285,7 @@ impl SerialLine {
     /// Reads the bytes that have arrived; returns 0 if there are none.
     pub(crate) fn read(&self, buffer: &mut [u8]) -> Outcome<usize> {
         match rustix::io::read(&self.0, buffer) {
-            Ok(0) => Err("the line is gone".into()),
+            Ok(0) => Err("the line was closed".into()),
             Err(Errno::AGAIN | Errno::INTR) => Ok(0),
             other => Ok(other?),
         }

@@ -304,14 +304,14 @@ impl Child {
             match self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
                 Ok(line) if line.text.starts_with(word) => return Ok(line),
                 Ok(_) => {}
-                Err(_) => return Err(format!("no line {word:?} came").into()),
+                Err(_) => return Err(format!("no line {word:?} arrived").into()),
             }
         }
     }
 
     /// Returns the next line.
     pub(crate) fn next_line(&self, timeout: Duration) -> Outcome<OutputLine> {
-        self.lines.recv_timeout(timeout).map_err(|_| "no line came".into())
+        self.lines.recv_timeout(timeout).map_err(|_| "no line arrived".into())
     }
 
     /// Waits for the line that equals `word`, and returns all lines before it.
@@ -322,7 +322,7 @@ impl Child {
             match self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
                 Ok(line) if line.text == word => return Ok(lines),
                 Ok(line) => lines.push(line),
-                Err(_) => return Err(format!("no line {word:?} came after {} lines", lines.len()).into()),
+                Err(_) => return Err(format!("no line {word:?} arrived after {} lines", lines.len()).into()),
             }
         }
     }

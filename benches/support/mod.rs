@@ -71,7 +71,7 @@ pub(crate) fn run_part(words: &[&str]) -> Outcome<()> {
         ["sleeper", number, count] => baseline::run_sleeper(number, count.parse()?),
         ["host", "blindly", port, rate] => baseline::start_scanner_unchecked(port.as_ref(), rate.parse()?),
         ["host", port, rate] => baseline::start_scanner(port.as_ref(), rate.parse()?),
-        _ => Err(format!("no part {words:?}").into()),
+        _ => Err(format!("unknown part {words:?}").into()),
     }
 }
 

@@ -146,10 +146,10 @@ fn too_little_to_learn_from_is_refused() {
 
     // Interrupt it, and then kill the hub while it runs.
     let looking = env.start(&["zones", "front", "mask", "--for=1h", "--json"]);
-    testkit::wait_until("it looks", || env.subscribers("front/scan") == 1);
+    testkit::wait_until("a subscriber to scans", || env.subscribers("front/scan") == 1);
     assert_eq!(looking.end(INT).exit_code, Some(130));
     let looking = env.start(&["zones", "front", "mask", "--for=1h", "--json"]);
-    testkit::wait_until("it looks", || env.subscribers("front/scan") == 1);
+    testkit::wait_until("a subscriber to scans", || env.subscribers("front/scan") == 1);
     drop(hub.end(KILL));
     let left = looking.wait();
     assert_eq!(left.exit_code, Some(1), "{left}");

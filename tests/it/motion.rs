@@ -32,7 +32,7 @@ fn standing_robot_has_no_motion_and_learns_background() {
     }
     rear.await_lines(20, "a foreground", is_class("foreground"));
     let known = |line: &Value| line["class"] == "background" && number(line, "known_beams") > 0;
-    rear.await_line("what stands", known);
+    rear.await_line("a known background", known);
     let refused = env.run(&["background", "rear", "load", "none.json"]);
     assert_ne!(refused.exit_code, Some(0), "{refused}");
     let outcome = front.end(INT);

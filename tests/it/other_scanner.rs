@@ -107,13 +107,13 @@ fn doctor_and_configure_suggest_scanhub_probe() {
         let outcome = env.run(&["doctor", &port, &link, "--json", "--no-system-config"]);
         assert_eq!(outcome.exit_code, Some(5), "{outcome}");
         let findings = outcome.of_class("check");
-        let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("is checked");
-        let remedy = sensor["remedy"].as_str().expect("a text");
+        let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("the check of the sensor");
+        let remedy = sensor["remedy"].as_str().expect("a string");
         assert!(sensor["state"] == "failed" && remedy.starts_with(&try_this(&port)), "{sensor}");
         if family == "lms" {
             let outcome = env.run(&["configure", &port, "unit=mm", "--json"]);
             let failure = &outcome.of_class("error")[0];
-            let hint = failure["hint"].as_str().expect("a text");
+            let hint = failure["hint"].as_str().expect("a string");
             assert!(outcome.exit_code == Some(3) && hint.starts_with(&try_this(&port)), "{outcome}");
         }
         // The suggested command finds the scanner.
@@ -138,7 +138,7 @@ fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
         let outcome = env.run(&[verb, &["--json"]].concat());
         let failure = &outcome.of_class("error")[0];
         assert_eq!((outcome.exit_code, &failure["kind"]), (Some(4), &"port_busy".into()), "{outcome}");
-        ["message", "hint"].map(|key| failure[key].as_str().expect("a text").to_owned())
+        ["message", "hint"].map(|key| failure[key].as_str().expect("a string").to_owned())
     };
     for verb in [&["probe", &port][..], &["configure", &port, "unit=mm"]] {
         let [message, hint] = refused(&env, verb);
@@ -245,14 +245,14 @@ type ReportedStatus = (Nanos, Option<Family>, String);
 /// published statuses.
 fn replace_scanner(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<ReportedStatus>) {
     let env = TestEnv::new();
-    let (name, mut first) = scanners().into_iter().nth(number).expect("three");
-    let (_, mut second) = scanners().into_iter().nth((number + 1) % 3).expect("three");
+    let (name, mut first) = scanners().into_iter().nth(number).expect("one of three scanners");
+    let (_, mut second) = scanners().into_iter().nth((number + 1) % 3).expect("one of three scanners");
     let sources = Sources { links: vec![format!("a=/dev/none{keys}")], ..Sources::default() };
     let config = Config::load(&sources).expect("a configuration");
     let domain = env.domain();
     let driven = virtual_hub(&config, &domain, |links| {
         let node = scanhub_shm::client_node(&domain).expect("a node");
-        let topic = Status::open(&node, "a").expect("a topic").expect("is there");
+        let topic = Status::open(&node, "a").expect("a topic").expect("an existing topic");
         let statuses = Status::subscriber(&node, &topic).expect("a subscriber");
         let mut reported = Vec::new();
         let mut note = |now: Nanos| {
@@ -286,13 +286,13 @@ fn replaced_scanner_is_not_reported_as_damaged_line() {
         let (name, reported) = replace_scanner("", number, 35 * ONE_SECOND);
         check_replacement(name, "The search begins after 10 s without it", &reported);
         let before = reported.iter().rfind(|(now, ..)| *now < REPLACED_AT).and_then(|(_, family, _)| *family);
-        let (_, family, error) = reported.last().expect("statuses");
+        let (_, family, error) = reported.last().expect("a status");
         assert!(before.is_some() && family.is_some() && before != *family, "{name}: {reported:#?}");
         assert_eq!(error, "", "{name}: {reported:#?}");
     }
     for key in ["family=ld", "model=ld19"] {
         let (name, reported) = replace_scanner(&format!(",{key}"), 0, 16 * ONE_SECOND);
-        let key = key.split('=').next().expect("a key");
+        let key = key.split('=').next().expect("the name of a key");
         let remedy = format!("Remove {key} from link a and restart the hub: it finds the scanner");
         check_replacement(name, &remedy, &reported);
     }
@@ -304,7 +304,7 @@ fn doctor_reports_each_link_of_the_running_hub() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room"]);
     let server = std::net::TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr());
-    let server = format!("tcp:{}", server.expect("a port that was free a moment ago"));
+    let server = format!("tcp:{}", server.expect("a free port"));
     let scan = format!("FLASER 181{} 0 0 0 0 0 0 1.5 host 1.5\n", " 1.5".repeat(181));
     let log = env.file("walk.log", scan);
     let links = [

@@ -74,7 +74,7 @@ impl ExampleScene {
             |description: &str| Err(format!("{}, {self:?}: {description}\n{outcome}", example.location));
         // An example either ends by itself or runs until the test ends it.
         if !matches!(outcome.exit_code, None | Some(0)) || !outcome.stderr.is_empty() {
-            return wrong("it failed");
+            return wrong("the example failed");
         }
         let text = String::from_utf8_lossy(&outcome.stdout);
         for (line, distance) in text.lines().filter_map(|line| Some((line, distance_m(line)?))) {
@@ -83,13 +83,13 @@ impl ExampleScene {
                 None => !distance.is_finite(),
             };
             if !is_right {
-                return wrong(&format!("it says {line:?}"));
+                return wrong(&format!("wrong distance in {line:?}"));
             }
         }
         let has_result =
             |line: &str| distance_m(line).is_some() || VERDICTS.iter().any(|word| line.contains(word));
         if self.needs_distance(example) && !text.lines().any(has_result) {
-            return wrong("it says no distance with its unit, and no verdict");
+            return wrong("the output has no distance with its unit, and no verdict");
         }
         Ok(())
     }
@@ -122,7 +122,7 @@ fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, must_print: boo
         let maps = std::fs::read_to_string(&maps).unwrap_or_default();
         maps.lines().any(|map| map.contains("/dev/shm/sh_") && map.ends_with(".data"))
     };
-    wait_until("it follows the hub", || follows() || program.has_ended());
+    wait_until("a subscription to the hub", || follows() || program.has_ended());
     let now_ns = monotonic_ns();
     verdicts.await_lines(10, "a scan that began after that", |line| line["stamp_ns"].as_u64() > Some(now_ns));
     if must_print && !program.has_ended() {
@@ -171,7 +171,7 @@ pub(crate) fn examples_on(page: &str, words: &str, env: &TestEnv) -> Vec<Example
     });
     let programs: Vec<Block> = blocks.filter(is_program).collect();
     assert!(!programs.is_empty(), "{page} has no program with {words}");
-    programs.iter().filter_map(|block| Example::build(block, env).expect("it is built")).collect()
+    programs.iter().filter_map(|block| Example::build(block, env).expect("a compiled example")).collect()
 }
 
 #[test]
@@ -212,9 +212,12 @@ fn a_program_that_takes_codes_for_distances_is_found() {
     let planted = [
         (
             block("python", &format!("{follow}print(scan.ranges.min() * (scan.unit_um / 1000), 'mm')\n")),
-            "it says",
+            "wrong distance in",
         ),
-        (block("python", &format!("{follow}print(scan.ranges_m[scan.valid].min(), 'm')\n")), "it failed"),
+        (
+            block("python", &format!("{follow}print(scan.ranges_m[scan.valid].min(), 'm')\n")),
+            "the example failed",
+        ),
         (block("python", &format!("{follow}print(scan.ranges[180])\n")), "no distance with its unit"),
         (
             block("rust", "scanhub_client::subscribe::<scanhub_client::Scan>(\"front\").unwrap();\n"),

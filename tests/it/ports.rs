@@ -72,12 +72,13 @@ fn hub_waits_for_a_port_without_permission() {
     let device = env.path("front").canonicalize().expect("a pty");
     let is_root = geteuid().is_root();
     let mode = if is_root { 0o600 } else { 0o000 };
-    std::fs::set_permissions(&device, PermissionsExt::from_mode(mode)).expect("it is ours");
+    std::fs::set_permissions(&device, PermissionsExt::from_mode(mode))
+        .expect("permission to change the mode");
     let home = env.path("home");
     std::fs::create_dir(&home).expect("a directory");
     let mut command = env.command_at(&home, &["run", "--json", &env.link("front")]);
     if is_root {
-        chown(&home, Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID)).expect("root may");
+        chown(&home, Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID)).expect("permission of root");
         if !command_can_run(UNPRIVILEGED_UID) {
             skip("open-directory", "the program lies where only root may run it");
             return;
@@ -90,7 +91,7 @@ fn hub_waits_for_a_port_without_permission() {
     let outcome = hub.end(TERM);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let lines: Vec<_> = outcome.stderr.lines().filter(|line| line.contains("front: absent")).collect();
-    let [text] = lines[..] else { panic!("not one line for one reason: {outcome}") };
+    let [text] = lines[..] else { panic!("not exactly one line for one reason: {outcome}") };
     let user = if is_root { "nobody" } else { "user" };
     let remedy = if is_root { "udev rule" } else { "chmod u+rw" };
     for part in [&env.path_argument("front"), "no permission", user, &format!("mode {mode:03o}"), remedy] {
@@ -134,7 +135,7 @@ fn hub_waits_for_a_port_held_by_another_hub() {
     let outcome = second.end(TERM);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let lines = outcome.stderr.lines().filter(|line| line.contains("front: absent")).count();
-    assert_eq!(lines, 1, "not one line for one reason: {outcome}");
+    assert_eq!(lines, 1, "not exactly one line for one reason: {outcome}");
 }
 
 #[test]
@@ -144,7 +145,7 @@ fn ready_text_names_ports_the_hub_waits_for() {
     let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
     let mute = TcpListener::bind("127.0.0.1:0").expect("a port");
     rustix::net::listen(&mute, 0).expect("a socket");
-    let _waiting = mute.local_addr().and_then(TcpStream::connect).expect("room for one");
+    let _waiting = mute.local_addr().and_then(TcpStream::connect).expect("room for one connection");
     let servers = [("refused", free), ("mute", mute.local_addr().expect("an address"))];
     let servers = servers.map(|(name, address)| format!("--link={name}=tcp:{address}"));
     let links = [&[env.link("front"), env.link("rear")], &servers[..]].concat();

@@ -112,7 +112,7 @@ fn resumes_an_abandoned_stream() {
     let found = env.search(&["probe", &env.path_argument("front"), "--json"]);
     assert_eq!((found.exit_code, number(&found.lines()[0], "operating_mode")), (Some(0), 0x24), "{found}");
     let sent = env.truth("front").len();
-    testkit::wait_until("it streams on", || env.truth("front").len() > sent + 20);
+    testkit::wait_until("a continued stream", || env.truth("front").len() > sent + 20);
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     assert_eq!(env.simulator_totals("front").1, 0);
 }
@@ -129,7 +129,7 @@ fn reports_silent_and_unusable_ports() {
         assert_eq!((outcome.exit_code, &outcome.of_class("error")[0]["kind"]), (Some(code), &kind.into()));
         assert!(
             !outcome.of_class("error")[0].to_string().contains("file:"),
-            "no recording is asked: {outcome}"
+            "no recording is requested: {outcome}"
         );
     }
     let outcome = env.run(&["probe", "file:/etc/hostname", "--json"]);
@@ -154,7 +154,8 @@ fn count_requests(mut sent: &[u8]) -> [usize; 4] {
     while !sent.is_empty() {
         // If the next byte of a request would be late, the search starts the request again.
         let len_of = |request: &[u8]| request.iter().zip(sent).take_while(|(a, b)| a == b).count();
-        let (len, number) = (0..4).map(|number| (len_of(REQUESTS[number]), number)).max().expect("four");
+        let (len, number) =
+            (0..4).map(|number| (len_of(REQUESTS[number]), number)).max().expect("one of four requests");
         assert!(len > 0, "{sent:02X?}");
         counts[number] += usize::from(len == REQUESTS[number].len());
         sent = &sent[len..];
@@ -169,7 +170,7 @@ fn sends_only_search_requests_to_unknown_scanner() {
         let line = TestLine::create(&env.path("front"));
         let program = env.start(&[verb, &[&env.path_argument("front"), "--json"]].concat());
         let mut sent = Vec::new();
-        testkit::wait_until("it ends", || {
+        testkit::wait_until("the end of the program", || {
             sent.extend(line.received());
             program.has_ended()
         });
@@ -202,7 +203,7 @@ fn finds_streaming_scanner_with_search_requests_only() {
     for (verb, _) in SEARCH_COMMANDS {
         let program = env.start(&[verb, &[&env.path_argument("front"), "--json"]].concat());
         let (mut sent, mut packets) = (Vec::new(), [0; 4096]);
-        testkit::wait_until("it ends", || {
+        testkit::wait_until("the end of the program", || {
             if let Ok(len) = scanner.read(&mut packets) {
                 line.offer(&packets[..len]);
             }
@@ -243,7 +244,7 @@ fn an_interrupt_ends_it() {
     let mut probe = env.command(&["probe", &env.path_argument("front"), "--json"]);
     probe.env("SCANHUB_LOG", "off");
     let program = testkit::Program::start(probe);
-    testkit::wait_until("it has the port", || {
+    testkit::wait_until("an opened port", || {
         let device = env.path("front").canonicalize().unwrap();
         let open = std::fs::read_dir(format!("/proc/{}/fd", program.pid())).into_iter().flatten().flatten();
         open.filter_map(|fd| std::fs::read_link(fd.path()).ok()).any(|target| target == device)
@@ -297,6 +298,6 @@ fn reports_busy_serial_server_with_remedy() {
     assert!(message.starts_with(&begin) && hint.starts_with("scanhub info front; "), "{message} {hint}");
     assert_eq!(other.info("front")["state"], "streaming", "the hub does not notice");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
-    testkit::wait_until("the server has no client", || env.run(&["probe", port]).exit_code == Some(0));
+    testkit::wait_until("a server without a client", || env.run(&["probe", port]).exit_code == Some(0));
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }

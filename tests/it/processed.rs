@@ -38,7 +38,7 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     let topics = ["scan", "marks", "zones", "foreground"];
     let mut subscribers = topics.map(|topic| env.echo(&[&format!("front/{topic}")]));
     // Before any scan, the verdict is unknown, and the radii are those of the configuration.
-    let first = subscribers[2].await_line("the first word", is_class("zones"));
+    let first = subscribers[2].await_line("the first sample", is_class("zones"));
     assert_eq!((&first["verdict"], number(&first, "topic_seq")), (&"unknown".into(), 0), "{first}");
     assert_eq!(
         (number(&first["zones"][0], "radius_mm"), number(&first["zones"][1], "radius_mm")),
@@ -76,7 +76,7 @@ fn each_scan_has_its_marks_zones_and_foreground() {
 /// Waits until a late joiner's sample of topic `zones` is the `unknown` of a silence, and returns it.
 fn await_silence_sample(env: &TestEnv) -> Value {
     let mut last = Value::Null;
-    wait_until("the hub says that nothing is known", || {
+    wait_until("an unknown verdict of the hub", || {
         let late = env.run(&["echo", "--json", "front/zones", "-n", "1", "--timeout", "60s"]);
         assert_eq!(late.exit_code, Some(0), "{late}");
         last = late.lines()[0].clone();
@@ -103,12 +103,12 @@ fn silence_is_published_once_also_for_late_joiners() {
     // A subscriber that attaches meanwhile receives no scan, which is not an error.
     assert!(statuses.iter().all(|status| status["last_error"] == ""), "{statuses:?}");
     assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
-    let next = zones.await_line("what comes after it", |line| {
+    let next = zones.await_line("the next verdict", |line| {
         // When the client itself detects a silence, the line has no `topic_seq`.
         line["class"] == "zones" && line["topic_seq"].as_u64() > unknown["topic_seq"].as_u64()
     });
     assert_eq!(number(&next, "topic_seq"), number(&unknown, "topic_seq") + 1);
-    assert!(number(&next, "seq") > number(&unknown, "seq"), "it is of a scan: {next}");
+    assert!(number(&next, "seq") > number(&unknown, "seq"), "it must belong to a scan: {next}");
     scans.await_lines(20, "a scan", is_class("scan"));
     env.kill_port_simulator(simulator, "front");
     let absent = env.await_info("front", |info| info["state"] == "absent");
@@ -131,7 +131,7 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
     let first = generations.await_line("the first generation", is_class("background"));
     assert_eq!((number(&first, "generation"), number(&first, "count")), (0, 361), "{first}");
     assert!(number(&first, "known_beams") == 0 || number(&first, "topic_seq") > 0, "{first}");
-    wait_until("it is learned", || number(&model(&env), "known_beams") > 300);
+    wait_until("a learned background", || number(&model(&env), "known_beams") > 300);
     let file = env.path_argument("model.json");
     background_accepted(&env, &["save", &file]);
     let saved: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
@@ -258,7 +258,7 @@ fn the_scans_of_a_slow_recording_follow_each_other() {
     // At its end the sensor is silent, like any other. Before that, there were only the first sample and twelve
     // verdicts.
     let mut last = Value::Null;
-    wait_until("the hub's word", || {
+    wait_until("an unknown verdict", || {
         last = env.run(&["echo", "--json", "front/zones", "-n", "1"]).lines()[0].clone();
         is_unknown(&last)
     });

@@ -29,15 +29,15 @@ impl TestPublisher {
     /// Starts `command` and waits until it publishes.
     pub(crate) fn start_and_publish(command: Command) -> TestPublisher {
         let mut mount = TestPublisher::start(command);
-        mount.program.await_line("it publishes", is_class("open"));
+        mount.program.await_line("an open publisher", is_class("open"));
         mount
     }
 
     /// Sends an angle with its stamp to the program, and waits until it has published it.
     pub(crate) fn send(&mut self, tilt: &Tilt, stamp_ns: u64) {
         let Tilt { angle_rad, rate_rad_s } = tilt;
-        writeln!(self.commands, "{angle_rad} {rate_rad_s} {stamp_ns}").expect("it reads");
-        self.program.await_line("it was sent", is_class("sent"));
+        writeln!(self.commands, "{angle_rad} {rate_rad_s} {stamp_ns}").expect("an open pipe");
+        self.program.await_line("a sent sample", is_class("sent"));
     }
 
     /// Closes the program's standard input and waits until it ends.
@@ -55,11 +55,11 @@ pub(crate) fn languages(env: &TestEnv) -> Vec<impl Fn(&str) -> Command + use<'_>
     let starts = python.into_iter().chain(c).map(move |compiled| {
         move |name: &str| {
             let mut command = match &compiled {
-                None => check_on(env, "publish").expect("it was there"),
+                None => check_on(env, "publish").expect("the script"),
                 Some(program) => Command::new(program),
             };
             command.arg(name).env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
-            command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
+            command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("a parent directory"));
             command
         }
     });
@@ -68,7 +68,7 @@ pub(crate) fn languages(env: &TestEnv) -> Vec<impl Fn(&str) -> Command + use<'_>
 
 /// Takes the domain's place of a listener, so that the domain stays in use.
 fn listener(env: &TestEnv) -> PublishSession {
-    PublishSession::open(&env.domain(), &[Topic::Marks], TopicLimits::default()).expect("nobody else")
+    PublishSession::open(&env.domain(), &[Topic::Marks], TopicLimits::default()).expect("the only publisher")
 }
 
 fn subscribe(env: &TestEnv) -> Subscriber<Tilt> {
@@ -82,14 +82,14 @@ fn angles_arrive_with_their_stamps_and_wake_waiters() {
         let _listener = listener(&env);
         let mut mount = TestPublisher::start_and_publish(start("mount"));
         let mut subscriber = subscribe(&env);
-        wait_until("it follows the mount", || {
-            assert!(subscriber.try_next().expect("a domain").is_none());
+        wait_until("a subscription to the mount", || {
+            assert!(subscriber.try_next().expect("a working subscriber").is_none());
             env.subscribers("mount/tilt") == 1
         });
-        let node = scanhub_shm::client_node(&env.domain()).expect("a domain");
-        let doorbell = Doorbell::open(&node, "mount").expect("it is ours").expect("it has one");
-        let wake = scanhub_shm::open_wake(&node, "mount").expect("it is ours").expect("it has one");
-        let wake_listener = scanhub_shm::listener(&node, &wake).expect("room for one more");
+        let node = scanhub_shm::client_node(&env.domain()).expect("a node in the domain");
+        let doorbell = Doorbell::open(&node, "mount").expect("a readable doorbell").expect("a doorbell");
+        let wake = scanhub_shm::open_wake(&node, "mount").expect("a readable event").expect("an event");
+        let wake_listener = scanhub_shm::listener(&node, &wake).expect("a free slot");
         let mut boots = Vec::new();
         let begin_ns = clock::now_ns();
         for (number, rate_rad_s) in [0.25, f64::NAN, -1.5].into_iter().enumerate() {
@@ -102,7 +102,7 @@ fn angles_arrive_with_their_stamps_and_wake_waiters() {
             };
             assert_eq!([Topic::Tilt, Topic::Scan, Topic::Early].map(ring), [1, 0, 0]);
             assert_eq!(scanhub_shm::take_wakeups(&[&wake_listener]), Ok(true));
-            let sample = subscriber.next().expect("a domain").expect("it was sent");
+            let sample = subscriber.next().expect("a working subscriber").expect("a sent sample");
             assert_eq!((sample.angle_rad, sample.rate_rad_s()), (tilt.angle_rad, tilt.rate_rad_s()));
             let header = *sample.header();
             assert_eq!(header.stamp_first_ns, header.stamp_last_ns);
@@ -124,7 +124,7 @@ fn angles_arrive_with_their_stamps_and_wake_waiters() {
         assert!(exists_or_is_symlink(&bell_file) && !doorbell.is_closed());
         let outcome = mount.end();
         assert_eq!((outcome.exit_code, outcome.stderr.as_str()), (Some(0), ""), "{outcome}");
-        assert!(!exists_or_is_symlink(&bell_file) && doorbell.is_closed(), "nobody waits at it any more");
+        assert!(!exists_or_is_symlink(&bell_file) && doorbell.is_closed(), "the doorbell still exists");
     }
 }
 
@@ -142,7 +142,8 @@ fn a_name_has_one_publisher_in_all_languages() {
         )
     };
     let held = |name: &str, pid: u32| {
-        let program = std::fs::read_to_string(format!("/proc/{pid}/comm")).expect("it runs");
+        let program =
+            std::fs::read_to_string(format!("/proc/{pid}/comm")).expect("the name of a running process");
         let process = format!("process {pid} ({})", program.trim_end());
         format!("the name {name} is published by {process}\n  end it, or choose another name")
     };
@@ -156,7 +157,7 @@ fn a_name_has_one_publisher_in_all_languages() {
                 "{outcome}"
             );
         }
-        let failure = other_publisher().map(drop).expect_err("it is taken");
+        let failure = other_publisher().map(drop).expect_err("a name that is taken");
         assert_eq!(
             (failure.kind(), failure.to_string()),
             (ErrorKind::NameHeld, refused(mount.program.pid()))
@@ -191,8 +192,9 @@ fn publisher_is_visible_while_another_one_leaves() {
                 for round in 0..100 {
                     let topics = PublisherKind::Mount.topics();
                     let sensor = PublishSession::open_named(place, name, topics, TopicLimits::default());
-                    let mount = sensor.expect("the name is free").topic::<Tilt>().expect("it is alone");
-                    let published = scanhub_shm::published_topics(place).expect("a domain");
+                    let mount =
+                        sensor.expect("the name is free").topic::<Tilt>().expect("the only publisher");
+                    let published = scanhub_shm::published_topics(place).expect("a readable domain");
                     assert!(published.contains(&(name.to_owned(), Topic::Tilt)), "{name} in {round}");
                     drop(mount);
                 }
@@ -211,15 +213,15 @@ fn subscribers_survive_a_killed_publisher() {
         let mut boots = Vec::new();
         for run in 0..3 {
             let mut mount = TestPublisher::start_and_publish(start("mount"));
-            wait_until("it is followed", || {
-                let _ = subscriber.try_next().expect("a domain");
+            wait_until("a subscriber", || {
+                let _ = subscriber.try_next().expect("a working subscriber");
                 env.subscribers("mount/tilt") == 1
             });
             mount.send(&Tilt { angle_rad: f64::from(run), ..Tilt::default() }, 0);
-            let sample = subscriber.next().expect("a domain").expect("it was sent");
+            let sample = subscriber.next().expect("a working subscriber").expect("a sent sample");
             assert_eq!((sample.angle_rad, sample.header().topic_seq), (f64::from(run), 0));
             assert_eq!((sample.missed, sample.restarted), (0, run > 0));
-            assert!(!boots.contains(&sample.header().boot), "another life");
+            assert!(!boots.contains(&sample.header().boot), "the boot ID is not new");
             boots.push(sample.header().boot);
             drop(sample);
             assert_eq!(mount.program.end(KILL).exit_code, None);

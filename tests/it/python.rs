@@ -30,7 +30,7 @@ fn check(name: &str) -> Option<Command> {
 pub(crate) fn check_on(env: &TestEnv, name: &str) -> Option<Command> {
     let mut command = check(name)?;
     let domain = env.domain();
-    let root = domain.root().parent().expect("a domain is below its base");
+    let root = domain.root().parent().expect("a parent directory");
     command.arg(domain.name()).arg(root);
     Some(command)
 }
@@ -85,7 +85,7 @@ fn refuses_impossible_subscriptions() {
 fn hub_without_sensors(env: &TestEnv) -> (HubLock, Node, WakeSender) {
     let lock = HubLock::acquire(env.domain().root()).expect("no hub runs");
     let node = scanhub_shm::hub_node(&env.domain()).expect("a node");
-    let waker = WakeSender::new(&node, "front").expect("memory");
+    let waker = WakeSender::new(&node, "front").expect("shared memory");
     (lock, node, waker)
 }
 
@@ -112,16 +112,16 @@ fn notice_that_raises_loses_no_sample() {
     let (stdin, mut lines) = std::io::pipe().expect("a pipe");
     let mut script = Program::start_with(command, stdin);
     wait_until("the subscriber", || service.dynamic_config().number_of_subscribers() == 1);
-    lines.write_all(b"\n").expect("it reads");
-    script.await_line("it waits", is_class("waits"));
+    lines.write_all(b"\n").expect("an open pipe");
+    script.await_line("a waiting subscriber", is_class("waits"));
     // The sample does not wake the subscriber. The check that detects the end of the hub therefore also finds the
     // sample.
-    let mut sample = publisher.loan().expect("memory");
+    let mut sample = publisher.loan().expect("a loan");
     *sample.user_header_mut() = Header { topic_seq: 7, ..Header::default() };
     *sample.payload_mut() = Status::default();
     sample.send().expect("a connection");
     drop(lock);
-    lines.write_all(b"\n").expect("it reads");
+    lines.write_all(b"\n").expect("an open pipe");
     let outcome = script.wait();
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
 }
@@ -151,7 +151,7 @@ fn wheel_installs_without_compiler_and_network() {
     let env = TestEnv::new();
     let run = |mut command: Command| {
         let output =
-            output(command.env("PATH", "/usr/bin:/bin").env_remove("PYTHONPATH")).expect("it starts");
+            output(command.env("PATH", "/usr/bin:/bin").env_remove("PYTHONPATH")).expect("a started program");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     };
     let place = env.path("empty");
@@ -174,7 +174,7 @@ fn wheel_installs_without_compiler_and_network() {
     let mut command = Command::new(empty);
     command.args(["-u", "-c", example.expect("an example")]).env("SCANHUB_DOMAIN", env.domain().name());
     command
-        .env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("a base"))
+        .env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("a parent directory"))
         .env_remove("XDG_RUNTIME_DIR");
     command.env("PATH", "/usr/bin:/bin");
     let mut example = Program::start(command);
@@ -198,8 +198,9 @@ fn types_are_those_of_the_stubs() {
         &["mypy", "--strict", "-p", "scanhub"],
         &["mypy.stubtest", "scanhub"],
     ] {
-        let mut command = client_python().expect("as before");
-        let output = output(command.arg("-m").args(words).current_dir(env.path(""))).expect("it starts");
+        let mut command = client_python().expect("the same Python as before");
+        let output =
+            output(command.arg("-m").args(words).current_dir(env.path(""))).expect("a started program");
         assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stdout));
     }
 }
@@ -237,7 +238,7 @@ fn samples_equal_those_of_echo() {
         let printed = echo.of_class(topic);
         let same = subscriber.of_class(topic).iter().filter(|sample| is_printed_by(&printed, sample)).count();
         let expected = if ["background", "status"].contains(&topic) { 1 } else { 20 };
-        assert!(same >= expected, "{topic}: {same} of {} are what echo said", printed.len());
+        assert!(same >= expected, "{topic}: {same} of {} are equal to the lines of echo", printed.len());
     }
 }
 
@@ -309,7 +310,7 @@ fn a_subscription_outlives_several_hubs() {
     for topic in ["scan", "telegram"] {
         let mut runs = BTreeMap::<String, Vec<Value>>::new();
         for line in outcome.of_class(topic) {
-            let boot = line["boot"].as_str().expect("a life").to_owned();
+            let boot = line["boot"].as_str().expect("a boot ID").to_owned();
             let lines_of_run = runs.entry(boot).or_default();
             let python = &line["python"];
             // A subscriber that waits for a hub receives its samples from the first one on.
@@ -350,21 +351,23 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
         }
     };
     for subscriber in &mut subscribers {
-        let line = subscriber.await_line("all is clear", are("clear", "clear", "clear"));
+        let line = subscriber.await_line("clear verdicts", are("clear", "clear", "clear"));
         // Both sensors are equally clear. A subscriber of all sensors may find either one first.
         let is_sensor = |key: &str| ["front", "rear"].contains(&line[key].as_str().unwrap_or_default());
         assert!(is_sensor("worst") && is_sensor("nearest_sensor") && line["nearest_mm"].is_u64(), "{line}");
         subscriber
-            .await_line("by now, too", |line| line["class"] == "now" && are("clear", "clear", "clear")(line));
+            .await_line("a reply", |line| line["class"] == "now" && are("clear", "clear", "clear")(line));
     }
     env.kill_port_simulator(rear, "rear");
     for subscriber in &mut subscribers {
-        let line = subscriber.await_line("the rear is gone", are("unknown", "clear", "unknown"));
+        let line =
+            subscriber.await_line("an unknown verdict of the rear", are("unknown", "clear", "unknown"));
         assert_eq!(line["worst"], "rear", "{line}");
     }
     assert_eq!(hub.end(KILL).exit_code, None);
     for subscriber in &mut subscribers {
-        subscriber.await_line("the hub is gone", are("unknown", "unknown", "unknown"));
+        subscriber
+            .await_line("unknown verdicts after the end of the hub", are("unknown", "unknown", "unknown"));
     }
     for subscriber in subscribers {
         ended_by_interrupt(subscriber);
@@ -385,7 +388,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
         let are = |verdict: &'static str, sensor: &'static str| {
             move |line: &Value| line["verdict"] == verdict && line["sensors"] == json!({ sensor: verdict })
         };
-        robot.await_line("nobody was heard", are("unknown", "robot1.front"));
+        robot.await_line("an unknown verdict", are("unknown", "robot1.front"));
         // A client reports `unknown` for a verdict that it reads too late.
         wait_until("clear", || {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
@@ -396,29 +399,29 @@ fn robot_without_a_hub_uses_remote_sensors() {
             last.is_some_and(|line| are("unknown", "robot1.front")(&line))
         });
         // A second subscriber queries the current verdict on request and also has to find the remote sensor.
-        let mut command = check_on(&env, "robot").expect("as before");
+        let mut command = check_on(&env, "robot").expect("the same Python as before");
         command.arg("--asked");
         let (stdin, mut ask) = std::io::pipe().expect("a pipe");
         let mut busy = Program::start_with(command, stdin);
         let mut query_sensors = |busy: &mut Program| {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
-            ask.write_all(b"\n").expect("it reads");
-            busy.await_line("what it knows", is_class("now"))["sensors"].clone()
+            ask.write_all(b"\n").expect("an open pipe");
+            busy.await_line("the current verdict", is_class("now"))["sensors"].clone()
         };
-        wait_until("the other machine's", || query_sensors(&mut busy).get("robot1.front").is_some());
+        wait_until("the remote sensor", || query_sensors(&mut busy).get("robot1.front").is_some());
         // A hub has its own sensors. When it exits, remote sensors do not replace them.
         let _simulator = env.simulator(&["front"], &["--seed=65", "--baud=500000"]);
         let hub = env.hub(&[&env.link("front"), "--set=zones.radii=[0.02,0.01]"]);
-        wait_until("the hub's own", || query_sensors(&mut busy) == json!({"front": "clear"}));
-        robot.await_line("all is forgotten", |line| {
+        wait_until("only the sensors of the hub", || query_sensors(&mut busy) == json!({"front": "clear"}));
+        robot.await_line("no remote sensor", |line| {
             line["sensors"] == json!({}) && line["verdict"] == "unknown"
         });
-        robot.await_line("the hub's own", are("clear", "front"));
+        robot.await_line("only the sensors of the hub", are("clear", "front"));
         assert_eq!(hub.end(KILL).exit_code, None);
-        robot.await_line("the hub is gone", are("unknown", "front"));
+        robot.await_line("unknown verdicts after the end of the hub", are("unknown", "front"));
         let mut named = env.start(&["echo", "--json", "robot1.front/zones"]);
         // A client reports `unknown` for a verdict that it reads too late.
-        wait_until("whom one names is heard", || {
+        wait_until("a verdict of the named remote sensor", || {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             named.prints(|line| line["verdict"] == "clear")
         });

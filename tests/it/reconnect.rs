@@ -52,7 +52,7 @@ fn reopens_a_port_by_name_on_each_new_device() {
         // that.
         line.wait_for_request();
         stream(&line, &mut subscriber, plugged);
-        std::fs::remove_file(&port).expect("the name is there");
+        std::fs::remove_file(&port).expect("an existing link");
         line = {
             let next = TestLine::create(&port);
             drop(line);
@@ -78,7 +78,7 @@ fn a_name_that_moves_while_its_old_device_lives() {
     let _hub = env.hub(&[env.lms_link("front")]);
     let mut subscriber = env.echo(&["front/telegram", "front/status"]);
     stream(&old, &mut subscriber, 1);
-    std::fs::remove_file(&port).expect("the name is there");
+    std::fs::remove_file(&port).expect("an existing link");
     let new = TestLine::create(&port);
     // The hub keeps a port that streams, even though its name belongs to another device.
     stream(&old, &mut subscriber, 2);

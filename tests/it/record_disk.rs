@@ -104,7 +104,7 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
     };
     let removed = [1, 2, 3].map(|_| {
         let mut recorder = env.start(&[&words[..], &["--json"]].concat());
-        let first = recorder.await_line("its first line", is_class("recording"));
+        let first = recorder.await_line("the first line", is_class("recording"));
         await_samples(&mut recorder, 10);
         files(&recorder.end(INT));
         number(&first, "older_removed")
@@ -193,11 +193,11 @@ fn a_full_disk_is_waited_for() {
     // Path of the file system in the recorder's mount namespace.
     let path_in_namespace = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
     let full = Recording::read_interrupted(&path_in_namespace.join("walk.mcap"));
-    assert!(!full.of("front/telegram").is_empty(), "it ends behind a whole chunk");
+    assert!(!full.of("front/telegram").is_empty(), "no complete chunk in the file");
     fs::remove_file(path_in_namespace.join("filler")).unwrap();
     recorder.await_line("the resumed write", is_kind("write_resumed"));
     let before = Recording::read_interrupted(&path_in_namespace.join("walk.mcap")).messages.len();
-    wait_until("it goes on", || {
+    wait_until("a continued recording", || {
         Recording::read_interrupted(&path_in_namespace.join("walk.mcap")).messages.len() > before
     });
     // The file system ends with its namespace, so open the file before the recorder ends.
@@ -223,7 +223,7 @@ fn counts_samples_dropped_because_of_a_slow_output() {
     let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
     let topics = ["record", "--json", "-o", "-", "front/telegram", "front/scan", "front/status"];
     let mut recorder = start_in(&env, &["sh", "-c", &shell, "sh"], &topics);
-    recorder.await_line("its begin", is_class("recording"));
+    recorder.await_line("the first line", is_class("recording"));
     let mut reader = fs::File::open(&pipe).unwrap();
     drop(open);
     // Replay in a loop, because a busy machine may lose most samples before the recorder can receive them.
@@ -235,7 +235,7 @@ fn counts_samples_dropped_because_of_a_slow_output() {
         let mut bytes = Vec::new();
         reader.read_to_end(&mut bytes).map(|_| bytes)
     });
-    let gap = recorder.await_line("its end", is_kind("gap_ends"));
+    let gap = recorder.await_line("the end of the gap", is_kind("gap_ends"));
     let outcome = recorder.end(INT);
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
     let recording = Recording::read(&read.join().unwrap().unwrap(), &pipe);
@@ -260,15 +260,15 @@ fn signals_that_come_together_are_one() {
     rustix::pipe::fcntl_setpipe_size(&open, 4096).unwrap();
     let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
     let mut recorder = start_in(&env, &["sh", "-c", &shell, "sh"], &["record", "--json", "-o", "-"]);
-    recorder.await_line("its begin", is_class("recording"));
+    recorder.await_line("the first line", is_class("recording"));
     let mut reader = fs::File::open(&pipe).unwrap();
     drop(open);
-    wait_until("it receives", || env.subscribers("front/status") > 0);
-    recorder.await_lines(2, "its progress", is_class("recording"));
+    wait_until("a subscriber to status", || env.subscribers("front/status") > 0);
+    recorder.await_lines(2, "progress", is_class("recording"));
     // The recorder cannot handle the first signal before the last one was sent. The crate `verbs` tests without a clock
     // how far apart signals of one request may be.
     recorder.signal(Signal::STOP);
-    wait_until("it is stopped", || recorder.is_stopped());
+    wait_until("a stopped process", || recorder.is_stopped());
     [INT, TERM, HUP, Signal::QUIT].into_iter().for_each(|signal| recorder.signal(signal));
     recorder.signal(Signal::CONT);
     recorder.await_line("the last summary", |line| line["class"] == "summary" && line["topic"] == "status");

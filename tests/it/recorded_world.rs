@@ -29,7 +29,7 @@ pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], sec
     let file = env.path_argument("world.mcap");
     let rooms: Vec<Room> = (0..sensors.len() as u64).map(|port| Room::of_port(world, 5, port)).collect();
     let mut writer =
-        Writer::begin(File::create(&file).expect("a file"), "", BTreeMap::new()).expect("begins");
+        Writer::begin(File::create(&file).expect("a file"), "", BTreeMap::new()).expect("a new recording");
     let period = Variant::HALF.revolutions() * MIRROR_PERIOD;
     let reports = (0..).map_while(|number| world.mount(0)?.report(number));
     let mut reports = reports.skip_while(|report| report.stamp_ns < 1_000_000_000).peekable();
@@ -61,7 +61,7 @@ pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], sec
             header.set_sent_at(end_ns + 100_000);
             writer
                 .write_sample(sensors[number], Topic::Telegram, &header, telegram.bytes())
-                .expect("is written");
+                .expect("a written sample");
         }
         let now_ns = 1_000_000_000 + seq * period;
         while let Some(report) = reports.next_if(|report| report.arrival_ns <= now_ns) {
@@ -79,14 +79,14 @@ pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], sec
             };
             let tilt = Tilt { angle_rad: report.angle_rad, rate_rad_s: report.rate_rad_s };
             let mut room = [0; 64];
-            let len = tilt.pack(&mut room).expect("there is room");
-            writer.write_sample("mount", Topic::Tilt, &header, &room[..len]).expect("is written");
+            let len = tilt.pack(&mut room).expect("a buffer that is large enough");
+            writer.write_sample("mount", Topic::Tilt, &header, &room[..len]).expect("a written sample");
             angles += 1;
         }
         if seq % 40 == 0 {
-            writer.close_chunk().expect("is written");
+            writer.close_chunk().expect("a closed chunk");
         }
     }
-    writer.finish().expect("ends");
+    writer.finish().expect("a complete recording");
     file
 }

@@ -61,7 +61,7 @@ fn check(outcome: &Outcome, expected: &[Vec<u8>]) {
     assert_eq!(outcome.exit_code, Some(0), "{}", outcome.stderr);
     let telegrams = outcome.of_class("telegram");
     let received: Vec<_> = telegrams.iter().map(bytes_of).collect();
-    assert!(received == expected, "{} telegrams, not the {} that are there", received.len(), expected.len());
+    assert!(received == expected, "{} telegrams instead of {}", received.len(), expected.len());
     assert_eq!(
         (contiguous_numbers(&telegrams, "seq")[0], contiguous_numbers(&telegrams, "topic_seq")[0]),
         (0, 0)

@@ -295,10 +295,10 @@ fn reports_a_full_disk() {
         &["doctor", "--json", "--no-system-config", "/dev/null"],
         &["replay", "--no-system-config", "--rate", "max", &log],
     ] {
-        let full = std::fs::File::options().write(true).open("/dev/full").expect("there is one");
+        let full = std::fs::File::options().write(true).open("/dev/full").expect("the device /dev/full");
         let mut command = env.command(verb);
         command.stdin(Stdio::null()).stdout(full).stderr(Stdio::piped());
-        let done = spawn(command).and_then(Child::wait_with_output).expect("it starts");
+        let done = spawn(command).and_then(Child::wait_with_output).expect("a started program");
         let errors = String::from_utf8_lossy(&done.stderr);
         assert!(
             done.status.code() == Some(1) && errors.contains("cannot write: No space"),
@@ -398,7 +398,7 @@ fn ports_that_cannot_be_used() {
     env.await_info("front", |info| info["state"] == "streaming");
     let (port, pid) = (env.path_argument("front"), format!("process {}", hub.pid()));
     assert_refused(&TestEnv::new(), &["probe", &port], 4, "port_busy", &[&port, &pid, "stop the hub: kill"]);
-    assert_eq!(env.info("front")["state"], "streaming", "was disturbed");
+    assert_eq!(env.info("front")["state"], "streaming", "the hub was disturbed");
 }
 
 #[test]

@@ -53,7 +53,7 @@ fn circles_change_in_a_stream_without_a_gap() {
         hub.signal(HUP);
         supervisor.wait_for_message("RELOADING=1");
         supervisor.wait_for_message("READY=1");
-        zones.await_lines(10, "a verdict of the new circles", has_radii(expected));
+        zones.await_lines(10, "a verdict with the new radii", has_radii(expected));
     }
     let times = supervisor.messages.iter().filter(|line| line.starts_with("MONOTONIC_USEC="));
     assert_eq!(times.count(), 4);
@@ -90,13 +90,13 @@ fn circles_change_in_a_stream_without_a_gap() {
     assert!(ended.stderr.contains("front: pose, zones changed as configured"), "{ended}");
     assert!(ended.stderr.contains("front: zones, marks, background changed as configured"), "{ended}");
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
-    assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
+    assert_eq!(env.simulator_totals("front").1, 0, "EEPROM writes");
     // Every scan between the first and the last one that was received was received.
     let received = telegrams.of_class("telegram");
     let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED_VALUES).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
     let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
-    let first = truth.iter().position(|sent| sent.hash == received[0]).expect("it was sent");
+    let first = truth.iter().position(|sent| sent.hash == received[0]).expect("a telegram that was sent");
     let sent: Vec<String> =
         truth[first..].iter().map(|sent| sent.hash.clone()).take(received.len()).collect();
     assert_eq!(received, sent);
@@ -124,7 +124,7 @@ fn reload_reports_refused_and_restart_only_changes() {
     configure(&env, more);
     hub.signal(HUP);
     let first =
-        zones.await_line("the new circles", |line| line["class"] == "zones" && radii(line) != [1000, 600]);
+        zones.await_line("the new radii", |line| line["class"] == "zones" && radii(line) != [1000, 600]);
     assert_eq!((radii(&first), &first["verdict"]), (vec![2000], &"unknown".into()));
     env.await_info("front", |info| info["pose"]["x_m"] == 0.5);
     assert!(!env.run(&["list", "--json"]).to_string().contains("side"));

@@ -32,7 +32,7 @@ fn wall_times_ms(outcome: &Outcome) -> Vec<u64> {
 
 fn replay_summary(outcome: &Outcome) -> Value {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
-    outcome.of_class("replayed").pop().unwrap_or_else(|| panic!("no word of what was played: {outcome}"))
+    outcome.of_class("replayed").pop().unwrap_or_else(|| panic!("no summary of the replay: {outcome}"))
 }
 
 fn resume(env: &TestEnv) {
@@ -51,7 +51,7 @@ fn plays_whole_recording_with_its_times_after_resume() {
     assert_eq!((number(&end, "telegrams"), number(&end, "laps")), (12, 0));
     assert_eq!(end["position_s"], 0.88);
     assert!(end["paused_s"].as_f64() > Some(0.0), "{end}");
-    subscriber.await_line("its end", |line| line["kind"] == "hub_gone");
+    subscriber.await_line("the end", |line| line["kind"] == "hub_gone");
     let outcome = subscriber.end(INT);
     assert_eq!(wall_times_ms(&outcome), (0..12).map(|scan| scan * 80).collect::<Vec<_>>());
     let stamps: Vec<_> = outcome.of_class("scan").iter().map(|scan| number(scan, "stamp_ns")).collect();
@@ -152,7 +152,7 @@ fn hold_keeps_the_hub_running_and_pause_stops_it() {
 /// encoded. `format_versions` gives the `seq` of each run from which marks were published.
 fn recording_of_two_runs(env: &TestEnv, format_versions: [u64; 2]) -> String {
     let file = std::fs::File::create(env.path("lives.mcap")).expect("a file");
-    let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
+    let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("a new recording");
     for (run, understood) in format_versions.into_iter().enumerate() {
         for seq in 0..10 {
             let reply = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10);
@@ -171,22 +171,22 @@ fn recording_of_two_runs(env: &TestEnv, format_versions: [u64; 2]) -> String {
                 ..Header::default()
             };
             header.set_sent_at(stamp_last_ns + 1000);
-            writer.write_sample("front", Topic::Telegram, &header, &telegram).expect("is written");
+            writer.write_sample("front", Topic::Telegram, &header, &telegram).expect("a written sample");
             if seq != 5 && seq >= understood {
                 let mut room = [0; 4096];
-                let len = Marks::default().pack(&mut room).expect("fits");
-                writer.write_sample("front", Topic::Marks, &header, &room[..len]).expect("is written");
+                let len = Marks::default().pack(&mut room).expect("a buffer that is large enough");
+                writer.write_sample("front", Topic::Marks, &header, &room[..len]).expect("a written sample");
             }
         }
     }
-    writer.finish().expect("is written");
+    writer.finish().expect("a complete recording");
     env.path("lives.mcap").display().to_string()
 }
 
 /// Writes a recording of 20 s from a line that loses six of ten scans and is silent for two seconds in the middle.
 fn recording_with_gaps(env: &TestEnv) -> String {
     let file = std::fs::File::create(env.path("lossy.mcap")).expect("a file");
-    let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
+    let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("a new recording");
     let is_lost = |scan: &u64| scan % 10 > 3 || (300..375).contains(scan);
     for (seq, scan) in (0..750).filter(|scan| !is_lost(scan)).enumerate() {
         let at = scan * 26_640_000;
@@ -205,9 +205,9 @@ fn recording_with_gaps(env: &TestEnv) -> String {
         header.set_sent_at(header.stamp_last_ns + 1000);
         writer
             .write_sample("front", Topic::Telegram, &header, &testkit::scan(seq as u16))
-            .expect("is written");
+            .expect("a written sample");
     }
-    writer.finish().expect("is written");
+    writer.finish().expect("a complete recording");
     env.path("lossy.mcap").display().to_string()
 }
 
@@ -329,6 +329,6 @@ fn it_ends_with_its_terminal() {
     let sitting = TerminalSession::start_for_hang_up(&env.command(&words), (100, 30), true, file);
     sitting.wait_for_text("ready ");
     sitting.hang_up();
-    let errors = std::fs::read_to_string(errors).expect("its errors");
+    let errors = std::fs::read_to_string(errors).expect("the error output");
     assert!(!errors.contains("panicked"), "{errors}");
 }

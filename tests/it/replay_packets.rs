@@ -49,7 +49,7 @@ pub(crate) fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
     let outcome = player.wait();
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert_eq!(recorder.end(INT).exit_code, Some(0));
-    outcome.of_class("replayed").pop().expect("what was played")
+    outcome.of_class("replayed").pop().expect("a summary")
 }
 
 /// Returns the headers and payloads of a topic in a file.
@@ -256,10 +256,10 @@ fn refuses_recordings_of_another_family() {
     // A family that this version does not have.
     let later = env.path("later.mcap");
     let mut writer = Writer::begin(std::fs::File::create(&later).expect("a file"), "", BTreeMap::new())
-        .expect("is written");
+        .expect("a new recording");
     let header = Header { family: 99, hub_pid: 1, ..Header::default() };
-    writer.write_sample("front", Topic::Telegram, &header, &[2; 47]).expect("is written");
-    writer.finish().expect("is written");
+    writer.write_sample("front", Topic::Telegram, &header, &[2; 47]).expect("a written sample");
+    writer.finish().expect("a complete recording");
     let later = env.path_argument("later.mcap");
     refused(&["replay", &later], 66, "family number 99");
     let outcome = env.run(&["convert", &later, &env.path_argument("later.csv")]);
@@ -278,7 +278,7 @@ fn other_programs_get_the_same_scans_of_packets() {
         let (file, out) = (env.path_argument(name), env.path_argument("out.csv"));
         let outcome = env.run(&["convert", &file, &out, "--force"]);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
-        let text = std::fs::read_to_string(env.path("out.csv")).expect("rows");
+        let text = std::fs::read_to_string(env.path("out.csv")).expect("a CSV file");
         text.lines().skip(1).map(|row| row.split(',').map(str::to_owned).collect()).collect()
     };
     let (published, computed) = (rows("all.mcap"), rows("telegrams.mcap"));

@@ -71,16 +71,16 @@ pub(crate) fn step_through<T>(
         let replay = &replay;
         let hub = scope.spawn(move || {
             let result = scanhub_daemon::replay(replay, domain, |_, player| {
-                sender.send(player.clone()).expect("waits")
+                sender.send(player.clone()).expect("a waiting test")
             });
             result.inspect_err(|failure| eprintln!("{failure}"))
         });
-        let player: Arc<Player> = ready.recv_timeout(WAIT_TIMEOUT).expect("is up");
+        let player: Arc<Player> = ready.recv_timeout(WAIT_TIMEOUT).expect("a started player");
         let node = scanhub_shm::client_node(domain).expect("a node");
         let subscribers = attach(&node);
         let give_up_at = Instant::now() + 3 * WAIT_TIMEOUT;
         while !player.progress().is_over {
-            assert!(Instant::now() < give_up_at, "it does not come to an end");
+            assert!(Instant::now() < give_up_at, "the recording does not end");
             let before = take(&subscribers);
             player.step();
             // A step that is a silence publishes no telegram, so continue after a short time.
@@ -97,7 +97,7 @@ pub(crate) fn step_through<T>(
         }
         take(&subscribers);
         player.end();
-        hub.join().expect("ends").expect("ends well");
+        hub.join().expect("a thread that does not panic").expect("a run without an error");
     });
 }
 
@@ -128,8 +128,8 @@ fn replay_equals_recording_with_the_same_parameters() {
                 assert_eq!(replayed, recorded, "{name}/{}", topic.name());
             }
             let [_, zones] = count(Topic::Zones);
-            assert_eq!(zones, SCAN_COUNT as usize + 1, "one says that scans stayed out");
-            assert!(count(Topic::Background)[1] > 5, "models change");
+            assert_eq!(zones, SCAN_COUNT as usize + 1, "one sample must report that no scans arrived");
+            assert!(count(Topic::Background)[1] > 5, "the background did not change");
             assert!(sorted_samples(recorded) == sorted_samples(replayed), "{name} differs");
             assert!(replayed.iter().all(|it| it.header.flags & Flags::REPLAYED != 0));
             let walls = |published: &[PublishedSample]| -> Vec<u64> {

@@ -64,7 +64,7 @@ fn subscribers_outlive_several_hubs() {
     // The first hub found the rate and set it.
     assert_eq!((&info["state"], &info["baud"]), (&"streaming".into(), &500_000.into()));
     let states: Vec<_> = scans.of_class("status").iter().map(|line| line["state"].clone()).collect();
-    let first = states.iter().position(|state| state == "streaming").expect("streams");
+    let first = states.iter().position(|state| state == "streaming").expect("an intact scan");
     let later: HashSet<_> = states[first..].iter().filter_map(Value::as_str).collect();
     // Virtual time tests that a hub leaves a stream as it is. Here, the simulator may be late enough to seem silent.
     assert!(later.is_superset(&HashSet::from(["probing", "streaming"])), "{later:?}");

@@ -40,23 +40,24 @@ fn dead_sensor_or_hub_makes_the_robot_unknown() {
     let first = hub(&env);
     let mut echo = env.start(&["echo", "--json", "robot/zones"]);
     let are = |expected: [&'static str; 3]| move |line: &Value| verdicts(line) == expected;
-    let line = echo.await_line("all is clear", are(["clear", "clear", "clear"]));
+    let line = echo.await_line("clear verdicts", are(["clear", "clear", "clear"]));
     assert_eq!((&line["class"], &line["sensor"]), (&"zones".into(), &"robot".into()), "{line}");
     assert!(line.get("stale").is_none() && line["nearest_mm"].is_u64(), "{line}");
 
     env.kill_port_simulator(rear, "rear");
     // Either the hub or the client reports it first. The samples of `front` itself are not stale.
-    echo.await_line("the front goes on without the rear", |line| {
+    echo.await_line("a clear front without the rear", |line| {
         verdicts(line) == ["unknown", "clear", "unknown"] && line.get("stale").is_none()
     });
 
     assert_eq!(first.end(KILL).exit_code, None);
-    let line = echo.await_line("the hub is gone", are(["unknown", "unknown", "unknown"]));
+    let line =
+        echo.await_line("unknown verdicts after the end of the hub", are(["unknown", "unknown", "unknown"]));
     assert_eq!(line["nearest_mm"], Value::Null, "{line}");
 
     let _rear = sensor(&env, "rear");
     let _second = hub(&env);
-    echo.await_line("all is clear again", are(["clear", "clear", "clear"]));
+    echo.await_line("clear verdicts again", are(["clear", "clear", "clear"]));
     let outcome = echo.end(INT);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let summaries = outcome.of_class("summary");
@@ -67,20 +68,24 @@ fn dead_sensor_or_hub_makes_the_robot_unknown() {
 fn a_program_that_follows_the_robot() {
     let env = TestEnv::new();
     let mut robot =
-        RobotSubscriber::builder(&["front", "rear"]).in_domain(&env.domain()).open().expect("possible names");
-    let first = robot.next().expect("no hub is no failure");
+        RobotSubscriber::builder(&["front", "rear"]).in_domain(&env.domain()).open().expect("valid names");
+    let first = robot.next().expect("a verdict without a hub");
     assert_eq!((first.verdict(), first.worst()), (Verdict::Unknown, Some("front")));
     let _front = sensor(&env, "front");
     let hub = hub(&env);
-    wait_until("the front is heard", || {
+    wait_until("a verdict of the front", || {
         let verdicts: Vec<_> = robot.next().expect("a hub").sensors().map(|(_, verdict)| verdict).collect();
         verdicts == [Verdict::Clear, Verdict::Unknown]
     });
     let _rear = sensor(&env, "rear");
-    wait_until("the rear is heard", || robot.next().expect("a hub").verdict() == Verdict::Clear);
+    wait_until("a verdict of the rear", || robot.next().expect("a hub").verdict() == Verdict::Clear);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
-    wait_until("nobody is heard", || {
-        robot.now().expect("no hub is no failure").sensors().all(|(_, verdict)| verdict == Verdict::Unknown)
+    wait_until("all verdicts are unknown", || {
+        robot
+            .now()
+            .expect("a verdict without a hub")
+            .sensors()
+            .all(|(_, verdict)| verdict == Verdict::Unknown)
     });
 }
 
@@ -106,7 +111,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
             let sensors = json!([{"sensor": sensor, "verdict": verdict}]);
             line["class"] == "zones" && line["verdict"] == verdict && line["sensors"] == sensors
         };
-        echo.await_line("nobody was heard", |line| own(line, "unknown", "robot1.front"));
+        echo.await_line("an unknown verdict", |line| own(line, "unknown", "robot1.front"));
         for (verdict, word) in [(Verdict::Slow, "slow"), (Verdict::Clear, "clear")] {
             front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
             echo.await_line(word, |line| own(line, word, "robot1.front"));
@@ -118,26 +123,28 @@ fn robot_without_a_hub_uses_remote_sensors() {
         // A hub has its own sensors. When it exits, remote sensors do not replace them.
         let _sensor = sensor(&env, "front");
         // A second subscriber queries the current verdict and also has to find the remote sensor.
-        let mut busy = RobotSubscriber::builder(&[]).in_domain(&env.domain()).open().expect("no names");
+        let mut busy =
+            RobotSubscriber::builder(&[]).in_domain(&env.domain()).open().expect("a robot without names");
         let names = |robot: &Robot| robot.sensors().map(|(name, _)| name.to_owned()).collect::<Vec<_>>();
         let mut query_names = |busy: &mut RobotSubscriber| {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
-            wait_until("it is heard", || busy.try_next().expect("a domain").is_some());
-            names(busy.now().expect("a domain"))
+            wait_until("a verdict", || busy.try_next().expect("a working subscriber").is_some());
+            names(busy.now().expect("a working subscriber"))
         };
-        wait_until("the other machine's", || query_names(&mut busy) == ["robot1.front"]);
+        wait_until("the remote sensor", || query_names(&mut busy) == ["robot1.front"]);
         let own_hub = env.hub(&[&env.link("front"), SMALL_ZONES]);
-        wait_until("the hub's own", || query_names(&mut busy) == ["front"]);
+        wait_until("only the sensors of the hub", || query_names(&mut busy) == ["front"]);
         drop(busy);
-        echo.await_line("the hub's own", |line| own(line, "clear", "front"));
+        echo.await_line("only the sensors of the hub", |line| own(line, "clear", "front"));
         assert_eq!(own_hub.end(KILL).exit_code, None);
-        echo.await_line("the hub is gone", |line| own(line, "unknown", "front"));
+        echo.await_line("unknown verdicts after the end of the hub", |line| own(line, "unknown", "front"));
         front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
         let mut named = env.start(&["echo", "--json", "robot1.front/zones"]);
-        named.await_line("whom one names is heard", |line| line["verdict"] == "clear");
+        named.await_line("a verdict of the named remote sensor", |line| line["verdict"] == "clear");
         let outcome = echo.end(INT);
         let lines = outcome.of_class("zones");
-        let first_own = lines.iter().position(|line| own(line, "clear", "front")).expect("it was seen");
+        let first_own =
+            lines.iter().position(|line| own(line, "clear", "front")).expect("a verdict of the local hub");
         let is_own = |line: &Value| line["sensors"] == json!([]) || line["sensors"][0]["sensor"] == "front";
         assert!(lines[first_own..].iter().all(is_own), "{outcome}");
         assert_eq!(lines[lines.len() - 1]["verdict"], "unknown", "{outcome}");

@@ -64,7 +64,7 @@ fn check_scan(message: &Value, (header, scan): &(Header, Box<Scan>)) {
     assert_eq!(message["frame"].as_str(), sensor);
     assert_eq!(
         number(message, "stamp_ns"),
-        header.wall_ns.checked_add_signed(scan.beam_ns(0)).expect("after 1970")
+        header.wall_ns.checked_add_signed(scan.beam_ns(0)).expect("a time after 1970")
     );
     let near =
         |key: &str, expected: f64| assert!((real(message, key) - expected).abs() < 1e-6, "{key}: {message}");
@@ -106,7 +106,7 @@ fn rotate(transform: &Value, angle_deg: f64) -> [f64; 3] {
 /// Asserts that the last message on `/tf_static` has both sensors with their poses.
 fn check_transforms(messages: &[Value]) {
     let of_frames: Vec<_> = messages.iter().filter(|line| line["topic"] == "/tf_static").collect();
-    let last = of_frames.last().expect("where the sensors sit");
+    let last = of_frames.last().expect("a message with the poses");
     let known = last["transforms"].as_array().expect("transforms");
     assert_eq!(known.len(), 2, "{last}");
     for transform in known {
@@ -148,7 +148,7 @@ fn others_read_every_message_made_live_and_later() {
     assert_eq!(recorder_of_all.end(INT).exit_code, Some(0));
     let outcome = env.run(&["convert", &all, &later, "--ros2", "--json"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
-    let converted = outcome.of_class("converted").pop().expect("an account");
+    let converted = outcome.of_class("converted").pop().expect("a summary");
     assert_eq!(
         (&converted["to"], &converted["sensors"]),
         (&"ROS 2".into(), &Value::from(vec!["front", "rear"]))
@@ -187,7 +187,7 @@ fn others_read_every_message_made_live_and_later() {
                     Some(scan) => check_scan(line, scan),
                     // The recording may have a telegram without its scan at either end, because the recorder attaches
                     // to one topic after the other.
-                    None => assert!(is_at_an_end(&key), "{verb} of {name}: nobody published {key:?}"),
+                    None => assert!(is_at_an_end(&key), "{verb} of {name}: {key:?} was not published"),
                 }
                 checked += usize::from(published.contains_key(&key));
             }
@@ -197,7 +197,7 @@ fn others_read_every_message_made_live_and_later() {
                 let of_frames = |line: &&Value| line["topic"] == "/tf_static";
                 let all_latched =
                     messages.iter().filter(of_frames).all(|line| line["durability"] == "TRANSIENT_LOCAL");
-                assert!(all_latched, "listeners to frames would not hear them");
+                assert!(all_latched, "frames are not latched");
             }
         }
     }
@@ -262,7 +262,7 @@ fn stream_file_converts_to_ros_and_csv_with_its_mode() {
             .iter()
             .all(|message| message.topic == "/front/scan" && message.schema == "sensor_msgs/msg/LaserScan")
     );
-    let text = std::fs::read_to_string(&rows).expect("rows");
+    let text = std::fs::read_to_string(&rows).expect("a CSV file");
     let lines: Vec<Vec<&str>> = text.lines().map(|line| line.split(',').collect()).collect();
     assert_eq!((lines.len(), lines[0].len()), (21, 8 + 361));
     assert_eq!(lines[0][..2], ["seq", "topic_seq"]);

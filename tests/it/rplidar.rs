@@ -49,7 +49,7 @@ fn identifies_scanner_and_publishes_its_revolutions() {
     assert!(kinds("reply") > 3 && kinds("data") > 50, "{} and {}", kinds("reply"), kinds("data"));
     assert_eq!(hub.end(TERM).exit_code, Some(0));
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
-    assert_eq!(env.simulator_totals("front").1, 0, "nothing that it keeps was changed");
+    assert_eq!(env.simulator_totals("front").1, 0, "stored settings were changed");
 }
 
 #[test]
@@ -114,7 +114,7 @@ fn probe_identifies_scanner_and_checks_its_line() {
         assert!(number(found, "packets") > 20 && found["damaged"].as_f64() == Some(0.0), "{found}");
         assert!(found["problem"].is_null(), "{found}");
         let sent = env.truth("front");
-        assert!(sent[..2].iter().all(|sent| sent.is_reply), "first what it is, and how");
+        assert!(sent[..2].iter().all(|sent| sent.is_reply), "the first replies must be identity and health");
     }
 }
 
@@ -135,7 +135,7 @@ fn a_model_that_is_not_known_is_shown_with_its_number() {
     assert_eq!((number(&info, "angle_deg"), text(&info, "last_error")), (360, ""), "{info}");
     let mut scans = env.echo(&["front/scan"]);
     for scan in scans.await_lines(5, "a scan", is_class("scan")) {
-        assert!(number(&scan, "count").abs_diff(3_200) < 100, "as many as it measures: {scan}");
+        assert!(number(&scan, "count").abs_diff(3_200) < 100, "not the number of measured points: {scan}");
     }
     let info = env.run(&["info", "front"]).to_string();
     assert!(info.contains("0x95 (unknown)") && info.contains("denseboost 1.02"), "{info}");
@@ -224,7 +224,7 @@ fn reports_line_that_damages_most_bytes() {
     let _hub = hub(&env, &["model=s2"]);
     let mut status = env.echo(&["front/status"]);
     let reports_damage = |line: &Value| text(line, "last_error").contains("bytes are damaged on the line");
-    status.await_line("what the line does", reports_damage);
+    status.await_line("the report of damage on the line", reports_damage);
     let statuses = status.end(INT).of_class("status");
     assert!(!statuses.iter().any(|line| text(line, "last_error").contains("head")), "{statuses:#?}");
 }
@@ -243,7 +243,7 @@ fn counts_and_reports_restarts_of_the_scanner() {
     let restart_messages: Vec<_> =
         log.lines().map(|line| line.split_once("the scanner restarted").map(|(_, end)| end)).collect();
     let is_repeated = restart_messages.windows(2).any(|pair| pair[0].is_some() && pair[0] == pair[1]);
-    assert!(!is_repeated, "once for each count: {log}");
+    assert!(!is_repeated, "a count was logged twice: {log}");
 }
 
 #[test]

@@ -42,9 +42,9 @@ impl Scanner {
             simulate_with(
                 &options,
                 &stopped,
-                |_| say_ready.send(()).expect("the test waits"),
+                |_| say_ready.send(()).expect("a waiting test"),
                 |_| {},
-                |_| next.lock().expect("whole").try_recv().ok(),
+                |_| next.lock().expect("an intact mutex").try_recv().ok(),
                 |_, _| {},
             )
         });
@@ -58,7 +58,9 @@ impl Scanner {
 
     fn end(self) {
         drop(self.stop);
-        let [summary] = &self.thread.join().expect("no panic").expect("ends well")[..] else {
+        let [summary] =
+            &self.thread.join().expect("a thread that does not panic").expect("a run without an error")[..]
+        else {
             panic!("one port")
         };
         assert_eq!(summary.eeprom_writes, 0);

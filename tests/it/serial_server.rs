@@ -29,7 +29,7 @@ impl Server {
     /// Starts a server whose serial port is the line at `path` and is set to `rate`.
     fn new(env: &TestEnv, path: &str, rate: u32) -> Server {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
-        let address = listener.local_addr().expect("it has an address").to_string();
+        let address = listener.local_addr().expect("a bound address").to_string();
         listener.set_nonblocking(true).expect("a socket");
         let (hang_up, end) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
         let line = open_line(&env.path(path), rate);
@@ -71,7 +71,7 @@ fn forward(line: &std::fs::File, socket: &TcpStream, is_over: &dyn Fn() -> bool)
         let from_host = socket.read(&mut buffer);
         match from_host {
             Ok(0) => return,
-            Ok(len) => line.write_all(&buffer[..len]).expect("the simulator lives"),
+            Ok(len) => line.write_all(&buffer[..len]).expect("a running simulator"),
             Err(_) => {}
         }
         match line.read(&mut buffer) {
@@ -135,7 +135,7 @@ fn finds_scanner_of_any_family_behind_a_server() {
         drop(server);
         assert_eq!(simulator.end(TERM).exit_code, Some(0));
         if family == "lms" {
-            assert_eq!(env.simulator_totals("line").1, 0, "EEPROM");
+            assert_eq!(env.simulator_totals("line").1, 0, "EEPROM writes");
         }
     }
 }
@@ -221,8 +221,8 @@ fn interrupt_ends_connecting_to_a_mute_serial_server() {
     // No process accepts, and the backlog is full, so the kernel drops further connections.
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     rustix::net::listen(&listener, 0).expect("a socket");
-    let address = listener.local_addr().expect("it has an address");
-    let _waiting = TcpStream::connect(address).expect("room for one");
+    let address = listener.local_addr().expect("a bound address");
+    let _waiting = TcpStream::connect(address).expect("room for one connection");
     let port = format!("tcp:{address}");
     for arguments in [["probe", &port, "--json"], ["doctor", &port, "--json"]] {
         let program = env.start(&arguments);
@@ -230,7 +230,7 @@ fn interrupt_ends_connecting_to_a_mute_serial_server() {
         let is_socket = |entry: std::fs::DirEntry| {
             entry.path().read_link().is_ok_and(|target| target.to_string_lossy().starts_with("socket:"))
         };
-        testkit::wait_until("it dials", || {
+        testkit::wait_until("a connection attempt", || {
             std::fs::read_dir(&descriptors).is_ok_and(|entries| entries.flatten().any(is_socket))
         });
         assert_eq!(program.end(INT).exit_code, Some(130));
@@ -241,10 +241,10 @@ fn interrupt_ends_connecting_to_a_mute_serial_server() {
 fn busy_serial_server_is_reported_once() {
     let env = TestEnv::new();
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
-    let address = listener.local_addr().expect("it has an address");
+    let address = listener.local_addr().expect("a bound address");
     let hub = env.hub(&[format!("--link=front=tcp:{address}")]);
     for _ in 0..6 {
-        drop(listener.accept().expect("the hub comes again"));
+        drop(listener.accept().expect("another connection of the hub"));
     }
     let info = env.await_info("front", |info| info["counters"]["reconnects"] == 6);
     assert_eq!(info["state"], "absent", "{info}");
@@ -268,7 +268,7 @@ fn probe_and_doctor_ask_there_too() {
     let outcome = env.run(&["doctor", &port, "--no-system-config", "--json"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let findings = outcome.of_class("check");
-    let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("it is asked");
+    let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("the check of the sensor");
     assert!(sensor["finding"].as_str().is_some_and(|text| text.contains("38400 Bd")), "{sensor}");
     drop(server);
     let outcome = env.search(&["probe", &port, "--json"]);
@@ -282,17 +282,17 @@ fn run_and_confirm(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let mut command = env.command(arguments);
     let screens = [0; 3].map(|_| Stdio::from(screen.try_clone().unwrap()));
     let [stdin, stdout, stderr] = screens;
-    let mut process = spawn(command.stdin(stdin).stdout(stdout).stderr(stderr)).expect("it starts");
+    let mut process = spawn(command.stdin(stdin).stdout(stdout).stderr(stderr)).expect("a started program");
     drop((command, screen));
     let (mut output, mut byte) = (Vec::new(), [0]);
     // Reading fails once no process has the terminal open.
     while keys.read(&mut byte).is_ok_and(|len| len > 0) {
         output.push(byte[0]);
         if output.ends_with(b"Type yes: ") {
-            keys.write_all(b"yes\n").expect("it listens");
+            keys.write_all(b"yes\n").expect("an open terminal");
         }
     }
-    (String::from_utf8_lossy(&output).into_owned(), process.wait().expect("it ends").code())
+    (String::from_utf8_lossy(&output).into_owned(), process.wait().expect("the exit status").code())
 }
 
 #[test]

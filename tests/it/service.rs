@@ -36,7 +36,7 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
     let other = elsewhere.hub(&flags);
     assert!(
         other.has_printed(|line| line["waiting"] == serde_json::json!(["front"])),
-        "it found the line free"
+        "the program found the line free"
     );
     assert_eq!(other.end(TERM).exit_code, Some(0));
     hub = env.service(&mut supervisor, &flags, None).ready();
@@ -65,7 +65,8 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
     let received: Vec<_> = lines.iter().filter(|line| line["command"] == MEASURED_VALUES).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
     let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
-    let at = |hash: &String| truth.iter().position(|sent| &sent.hash == hash).expect("it was sent");
+    let at =
+        |hash: &String| truth.iter().position(|sent| &sent.hash == hash).expect("a telegram that was sent");
     let span = &truth[at(&received[0])..=at(&received[received.len() - 1])];
     // A killed hub loses the telegram that it has partly read, and no other.
     let last_of = |run: &Vec<Value>| {
@@ -80,9 +81,9 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
     let mut sorted: Vec<_> = received.iter().map(at).collect();
     assert!(sorted.is_sorted(), "out of order");
     sorted.dedup();
-    assert_eq!(sorted.len(), received.len(), "twice");
+    assert_eq!(sorted.len(), received.len(), "a telegram was received twice");
     println!("{} of {} telegrams lost by {} kills", lost.len(), span.len(), KILL_COUNT + 1);
-    assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
+    assert_eq!(env.simulator_totals("front").1, 0, "EEPROM writes");
 }
 
 /// Stops `simulator` until `telegrams` has printed everything that the line has carried, kills `hub`, and lets the

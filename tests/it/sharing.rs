@@ -45,7 +45,7 @@ fn in_namespace(name: &str, test: impl FnOnce()) {
 /// Creates a directory at `path` that only `user` can access.
 fn create_directory_of(user: u32, path: &str) {
     fs::DirBuilder::new().recursive(true).mode(0o700).create(path).expect("a directory");
-    chown(path, Some(user), Some(user)).expect("root gives it away");
+    chown(path, Some(user), Some(user)).expect("permission of root");
 }
 
 /// Returns the program with the environment of a login session of `user`. The user of the hub also has that of its
@@ -102,7 +102,7 @@ fn commands_of_the_page_work_for_another_user() {
         assert_ne!(alone.exit_code, Some(0), "{alone}");
 
         let mut gateway = start(HUB_UID, &[&arguments_on_page("scanhub gateway")[..], &["--json"]].concat());
-        let begin = gateway.await_line("its begin", is_class("gateway"));
+        let begin = gateway.await_line("the first line", is_class("gateway"));
         let hub = begin["hub"].as_str().unwrap_or_default().to_owned();
         let mut listener =
             start(OTHER_UID, &words(&arguments_with_hub("scanhub listen --publish --interface lo", &hub)))
@@ -115,8 +115,8 @@ fn commands_of_the_page_work_for_another_user() {
         let mut there = start(HUB_UID, &["echo", "front/scan", "--json"]);
         there.await_line("a scan", is_class("scan"));
         let mut echo = start(OTHER_UID, &words(&arguments_with_hub("scanhub echo 5f3a", &hub)));
-        let scan = echo.await_lines(40, "scans", is_class("scan")).pop().expect("forty");
-        let same = there.await_line("the same one", |line| line["seq"] == scan["seq"]);
+        let scan = echo.await_lines(40, "scans", is_class("scan")).pop().expect("forty scans");
+        let same = there.await_line("the same scan", |line| line["seq"] == scan["seq"]);
         assert_eq!((&scan["ranges"], &scan["wall_ns"]), (&same["ranges"], &same["wall_ns"]));
         drop(there.end(INT));
         let echoed = echo.end(INT);

@@ -63,7 +63,7 @@ fn ld_scanner_streams_at_once_and_rejects_bad_flags() {
     });
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     assert_eq!(env.simulator_totals("front").1, 0);
-    let truth = std::fs::read_to_string(env.path("truth")).expect("a truth");
+    let truth = std::fs::read_to_string(env.path("truth")).expect("the truth file");
     assert!(truth.lines().next().is_some_and(|line| line.contains(r#""length":47"#)), "{truth}");
     let refused = |flags: &[&str], message: &str| {
         let port = format!("--port={}", env.path_argument("none"));
@@ -104,9 +104,9 @@ fn rplidar_streams_in_the_requested_mode_and_replies() {
     };
     let is_packet = |packet: &[u8]| packet[0] >> 4 == 0xA && packet[1] >> 4 == 5 && packet[132] >> 4 == 0xA;
     read("a stream", &mut port, &|bytes| bytes.windows(133).any(is_packet));
-    port.write_all(&[0xA5, 0x25]).expect("room");
+    port.write_all(&[0xA5, 0x25]).expect("a written request");
     // A request for the recommended mode (parameter 7Ch), whose reply is the number of the mode.
-    port.write_all(&[0xA5, 0x84, 4, 0x7C, 0, 0, 0, 0xA5 ^ 0x84 ^ 4 ^ 0x7C]).expect("room");
+    port.write_all(&[0xA5, 0x84, 4, 0x7C, 0, 0, 0, 0xA5 ^ 0x84 ^ 4 ^ 0x7C]).expect("a written request");
     let answer = [0xA5, 0x5A, 6, 0, 0, 0, 0x20, 0x7C, 0, 0, 0, 4, 0];
     read("an answer", &mut port, &|bytes| bytes.ends_with(&answer));
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
@@ -167,13 +167,13 @@ fn dropped_request_is_reported_with_its_reason() {
     let simulator = env.simulator(&["front"], &["--seed=3"]);
     let mut port = open_line(&env.path("front"), 9_600);
     // A status request (Telegram listing, 31h), whose second half arrives far too late.
-    port.write_all(&[0x02, 0x00, 0x01]).expect("room");
+    port.write_all(&[0x02, 0x00, 0x01]).expect("a written request");
     wait_at_least(Duration::from_secs(1));
-    port.write_all(&[0x00, 0x31, 0x15, 0x12]).expect("room");
+    port.write_all(&[0x00, 0x31, 0x15, 0x12]).expect("a written request");
     // A complete request. Its ACK shows that the simulator has handled all earlier bytes.
-    port.write_all(&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12]).expect("room");
+    port.write_all(&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12]).expect("a written request");
     let mut acknowledge = [0];
-    wait_until("an answer", || port.read(&mut acknowledge).is_ok_and(|len| len > 0));
+    wait_until("a reply", || port.read(&mut acknowledge).is_ok_and(|len| len > 0));
     assert_eq!(acknowledge, [0x06]);
     let outcome = simulator.end(TERM);
     let message = format!(

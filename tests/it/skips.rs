@@ -34,7 +34,7 @@ fn a_test_that_is_left_out_says_so_or_fails() {
         // Without `--nocapture`, the harness hides the output of passed tests.
         command.args(&single_test_args("skips::a_test_that_is_left_out_says_so_or_fails")[..2]);
         command.env(RERUN_VARIABLE, "1").env("SCANHUB_REQUIRE", required).env_remove("RUST_TEST_NOCAPTURE");
-        output(command).expect("it runs")
+        output(command).expect("the output of the program")
     };
     let left_out = again("cc");
     assert!(left_out.status.success(), "{left_out:?}");

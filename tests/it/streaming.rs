@@ -56,7 +56,7 @@ fn everything_sent_arrives_bit_for_bit_and_in_order() {
 /// Asserts that a line of class `scan` has the values of a telegram in measuring mode 1 (13 bits of range, 3 of
 /// reflector level).
 fn check_scan(scan: &Value, telegram: &[u8]) {
-    let telegram = Telegram::check(telegram).expect("was checked");
+    let telegram = Telegram::check(telegram).expect("an intact telegram");
     let measured = MeasuredValues::decode(telegram).expect("a measured telegram");
     let values = |key: &str| scan[key].as_array().unwrap_or_else(|| panic!("no {key}: {scan}")).clone();
     let (ranges, levels, mut codes) = (values("ranges"), values("intensities"), values("codes").into_iter());

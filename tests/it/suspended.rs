@@ -34,17 +34,18 @@ fn a_hub_that_was_stopped() {
     let lines = outcome.of_class("telegram");
     let got: Vec<String> = lines.iter().map(|line| hash(&bytes_of(line))).collect();
     let truth = env.truth("front");
-    let at = |hash: &String| truth.iter().position(|sent| sent.hash == *hash).expect("it was sent");
+    let at =
+        |hash: &String| truth.iter().position(|sent| sent.hash == *hash).expect("a telegram that was sent");
     let places: Vec<usize> = got.iter().map(at).collect();
-    let (Some(&first), Some(&last)) = (places.first(), places.last()) else { panic!("nothing came") };
+    let (Some(&first), Some(&last)) = (places.first(), places.last()) else { panic!("no telegram arrived") };
     assert!(places.is_sorted(), "out of order");
-    assert!(places.iter().all(|&place| truth[place].fault.is_none()), "made up");
+    assert!(places.iter().all(|&place| truth[place].fault.is_none()), "a telegram was not sent intact");
     // The burst may be too fast for a subscriber, which then reports how many samples it missed.
     let notices = outcome.of_class("notice");
     let of_telegrams = notices.iter().filter(|line| line["kind"] == "missed" && line["topic"] == "telegram");
     let missed: u64 = of_telegrams.map(|line| number(line, "missed")).sum();
     let intact = truth[first..=last].iter().filter(|sent| sent.fault.is_none()).count();
-    assert_eq!(got.len() as u64 + missed, intact as u64, "lost");
+    assert_eq!(got.len() as u64 + missed, intact as u64, "telegrams are missing");
 
     let stamps: Vec<u64> = lines.iter().map(|line| number(line, "stamp_ns")).collect();
     assert!(stamps.is_sorted(), "stamps run backwards: {stamps:?}");
@@ -71,7 +72,7 @@ fn a_hub_that_was_stopped() {
         is_verdict.then(|| number(&line, "topic_seq") - number(scan, "topic_seq"))
     });
     let ahead: Vec<u64> = ahead.collect();
-    let (Some(first), Some(last)) = (ahead.first(), ahead.last()) else { panic!("no verdict came") };
+    let (Some(first), Some(last)) = (ahead.first(), ahead.last()) else { panic!("no verdict arrived") };
     assert!(last - first < waited.len() as u64 / 2, "{ahead:?} with {} that waited", waited.len());
 }
 
@@ -95,14 +96,14 @@ fn datagram_for_a_stopped_listener_keeps_arrival_time() {
             let before = now_ns();
             sender.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             let after = now_ns();
-            wait_until("a stamp of later would be wrong", || now_ns() > after + 200_000_000);
+            wait_until("enough time to make a later stamp wrong", || now_ns() > after + 200_000_000);
             listener.signal(Signal::CONT);
             let line = listener.await_line("zones", is_class("zones"));
             // The kernel stamps with another clock, so allow for a small difference.
             (line, before - 1_000_000..after + 100_000_000)
         };
         // The kernel starts to stamp datagrams some time after the first socket of the machine requests it.
-        wait_until("the kernel stamps what comes", || {
+        wait_until("a stamp of the kernel", || {
             let (line, possible) = stop();
             possible.contains(&number(&line, "stamp_ns"))
         });

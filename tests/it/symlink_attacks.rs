@@ -62,7 +62,7 @@ fn links_at_the_name_of_an_output_are_refused() {
                 assert!(outcome.stderr.contains(message) || is_format, "{words:?}: {outcome}");
             }
         }
-        assert_eq!(fs::read_to_string(TARGET_FILE).expect("it is there"), TARGET_CONTENT);
+        assert_eq!(fs::read_to_string(TARGET_FILE).expect("a readable file"), TARGET_CONTENT);
         assert!(!fs::exists("/mnt/new").unwrap() && !fs::exists("/mnt/new.mcap").unwrap());
     });
 }
@@ -81,7 +81,7 @@ fn directories_are_not_created_behind_links_of_others() {
                 assert!(outcome.stderr.contains(" is a link of user 65533"), "{path}: {outcome}");
             }
         }
-        assert_eq!(fs::read_dir("/mnt/prey").expect("it is ours").count(), 0);
+        assert_eq!(fs::read_dir("/mnt/prey").expect("a readable directory").count(), 0);
         assert!(!fs::exists("/mnt/new").unwrap());
         // Directories in a shared directory are created as usual.
         let outcome = run(&["man", "/tmp/pages/deep"]);
@@ -108,9 +108,9 @@ fn names_of_temporary_files_cannot_be_guessed() {
         };
         planted("out.mcap", "convert /mnt/walk.log");
         planted("plan.svg", "site check /mnt/site.toml --svg");
-        assert_eq!(fs::read_to_string(TARGET_FILE).expect("it is there"), TARGET_CONTENT);
+        assert_eq!(fs::read_to_string(TARGET_FILE).expect("a readable file"), TARGET_CONTENT);
         for file in ["/tmp/out.mcap", "/tmp/plan.svg"] {
-            let file = fs::symlink_metadata(file).expect("it is there");
+            let file = fs::symlink_metadata(file).expect("an output file");
             assert!(file.is_file() && file.uid() == 0);
         }
     });
@@ -146,8 +146,8 @@ fn a_state_directory_of_another_user_is_not_used() {
             assert!(hub.stderr.contains("nothing is kept across restarts: "), "{script}: {hub}");
             assert!(hub.stderr.contains("65533") && hub.stderr.contains("XDG_STATE_HOME"), "{script}: {hub}");
         }
-        assert_eq!(fs::read_to_string(TARGET_FILE).expect("it is there"), TARGET_CONTENT);
-        assert_eq!(fs::read_dir("/mnt/prey").expect("it is ours").count(), 0);
+        assert_eq!(fs::read_to_string(TARGET_FILE).expect("a readable file"), TARGET_CONTENT);
+        assert_eq!(fs::read_dir("/mnt/prey").expect("a readable directory").count(), 0);
     });
 }
 
@@ -158,12 +158,12 @@ fn files_of_a_gateway_are_private() {
         let file = "/mnt/state/scanhub/gateway-scanhub-lo-1";
         // An earlier version left the file with this mode.
         fs::write(file, "").expect("a file");
-        fs::set_permissions(file, Permissions::from_mode(0o666)).expect("it is ours");
+        fs::set_permissions(file, Permissions::from_mode(0o666)).expect("permission to change the mode");
         let mut command = scanhub(0, &["gateway", "--json", "--no-system-config", "--interface=lo"]);
         command.env("XDG_STATE_HOME", "/mnt/state");
         let mut gateway = Program::start(command);
-        gateway.await_line("its begin", is_class("gateway"));
-        assert_eq!(fs::metadata(file).expect("it is there").mode() & 0o777, 0o600);
+        gateway.await_line("the first line", is_class("gateway"));
+        assert_eq!(fs::metadata(file).expect("a state file").mode() & 0o777, 0o600);
         gateway.end(INT);
     });
 }

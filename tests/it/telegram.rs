@@ -27,14 +27,14 @@ fn telegram(words: &[&str], input: &[u8]) -> Output {
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped());
-    let mut program = spawn(command).expect("it starts");
+    let mut program = spawn(command).expect("a started program");
     let mut stdin = program.stdin.take().expect("a pipe");
     let input = input.to_vec();
     // The program may write before it has read everything.
     let writer = std::thread::spawn(move || stdin.write_all(&input));
-    let output = program.wait_with_output().expect("it ends");
+    let output = program.wait_with_output().expect("the output of the program");
     // A program that reads nothing closes its end of the pipe.
-    let _ = writer.join().expect("no panic");
+    let _ = writer.join().expect("a thread that does not panic");
     output
 }
 
@@ -49,7 +49,7 @@ fn lines(output: &Output) -> Vec<Value> {
 /// Returns every request and the simpler replies, each with a part of its explanation.
 fn telegrams() -> Vec<(EncodedTelegram, &'static str)> {
     let span = |first, last| SubRange { first, last };
-    let spans = |spans: &[SubRange]| SubRanges::new(spans).expect("one to five");
+    let spans = |spans: &[SubRange]| SubRanges::new(spans).expect("one to five sub-ranges");
     let raw = |bytes: &[u8]| RawParameters::new(bytes).expect("at most 16 bytes");
     let requests = [
         (Request::Reset, "10h reset"),
@@ -124,7 +124,7 @@ fn telegrams() -> Vec<(EncodedTelegram, &'static str)> {
         (Reply::Mode { done: true }, "change of operating mode, from sensor 0: done; ok"),
         (Reply::Mode { done: false }, "not done"),
         (Reply::Errors(Errors::new(&[0x84, 22, 1, 49]).expect("pairs")), "1 present, 1 past"),
-        (Reply::Errors(Errors::new(&[]).expect("none")), "errors, from sensor 0: none"),
+        (Reply::Errors(Errors::new(&[]).expect("an empty list")), "errors, from sensor 0: none"),
         (Reply::Counters { hours_by_2: 2000, power_ons: 12 }, "operating data counters"),
         (Reply::Type(b"LMS291;S05063;V02.30"), "LMS291;S05063;V02.30"),
         (
@@ -141,9 +141,9 @@ fn telegrams() -> Vec<(EncodedTelegram, &'static str)> {
         .chain(modes.map(operate))
         .map(|(request, headline)| (request.encode(0), headline))
         .collect();
-    telegrams.extend(writes.map(|(write, headline)| (write.encode(0).expect("short enough"), headline)));
+    telegrams.extend(writes.map(|(write, headline)| (write.encode(0).expect("a short telegram"), headline)));
     telegrams.extend(
-        replies.map(|(reply, headline)| (reply.encode(0, STATUS_OK).expect("short enough"), headline)),
+        replies.map(|(reply, headline)| (reply.encode(0, STATUS_OK).expect("a short telegram"), headline)),
     );
     telegrams.push((measured::encode(0, Unit::Cm, &[100, 8191], STATUS_OK), "2 in cm"));
     telegrams.push((reply::status_reply(0, &health, STATUS_OK), "V02.30, values on request"));
@@ -207,13 +207,13 @@ fn values_are_read_as_the_telegrams_tell() {
     let unknown = lines(&telegram(&["decode", "--json"], &bytes));
     let values = |line: &Value| line["fields"].as_array().expect("fields")[5].clone();
     assert_eq!(values(&unknown[0])["mm"], serde_json::json!([1000, 200]));
-    assert!(values(&unknown[0])["words"].as_str().expect("words").contains("mode unknown"));
+    assert!(values(&unknown[0])["words"].as_str().expect("a string").contains("mode unknown"));
     let with_mode = lines(&telegram(&["decode", "--json", "--mode", "0x0F"], &bytes));
-    assert!(values(&with_mode[0])["words"].as_str().expect("words").ends_with("15 bits"));
+    assert!(values(&with_mode[0])["words"].as_str().expect("a string").ends_with("15 bits"));
     bytes.splice(0..0, reply::configuration_reply(0, Mode(5), Unit::Mm, STATUS_OK).bytes().iter().copied());
     let learned = lines(&telegram(&["decode", "--json"], &bytes));
     assert!(
-        values(&learned[1])["words"].as_str().expect("words").contains("15 bits and 1 of reflector level")
+        values(&learned[1])["words"].as_str().expect("a string").contains("15 bits and 1 of reflector level")
     );
     let all = text(&telegram(&["decode", "--all"], &bytes).stdout);
     assert!(all.contains("   0  83E8  1000 mm, bits above 1\n"), "{all}");
@@ -222,7 +222,7 @@ fn values_are_read_as_the_telegrams_tell() {
 #[test]
 fn the_telegrams_inside_a_recording_are_decoded() {
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
-    let bytes = std::fs::read(golden).expect("it is there");
+    let bytes = std::fs::read(golden).expect("a golden recording");
     let output = telegram(&["decode", "--json", golden], &[]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     let (decoded, summary) = (lines(&output), lines(&output).pop().expect("a summary"));
@@ -267,7 +267,7 @@ fn refusals_have_a_remedy() {
     }
     let garbled = telegram(&["decode", "--json"], b"02 00 0q");
     assert_eq!(garbled.status.code(), Some(66));
-    assert!(lines(&garbled)[0]["message"].as_str().expect("words").contains("line 1: \"0q\" is no byte"));
+    assert!(lines(&garbled)[0]["message"].as_str().expect("a message").contains("line 1: \"0q\" is no byte"));
 }
 
 /// Status byte of a scanner without a fault.

@@ -31,7 +31,7 @@ fn a_configuration_commands_no_terminal() {
     let value = env.file("value.toml", "[[link]]\nname = \"\u{9b}31m\"\nport = \"x\"\n");
     let key = env.file("key.toml", "[[link]]\n\"\u{9b}31m\\u001b\" = 1\n");
     let name = env.path_argument(&format!("{CONTROL_CHARACTERS}.toml"));
-    fs::write(&name, "nothing = 1\n").expect("a file of any name");
+    fs::write(&name, "nothing = 1\n").expect("a file with an unusual name");
     for json in [&[][..], &["--json"]] {
         let with = |words: &[&str]| env.run(&[words, json].concat());
         for (code, outcome) in [

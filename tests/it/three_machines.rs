@@ -24,7 +24,7 @@ fn bridge_program() -> Option<PathBuf> {
 fn command(env: &TestEnv, flags: &[&str]) -> Command {
     let inner = env.command(flags);
     let own = OsStr::new(env!("CARGO_BIN_EXE_scanhub"));
-    let bridge = bridge_program().expect("it was there");
+    let bridge = bridge_program().expect("the bridge");
     let words: Vec<_> = std::iter::once(inner.get_program()).chain(inner.get_args()).collect();
     let words = words.into_iter().map(|word| if word == own { bridge.as_os_str() } else { word });
     let words: Vec<_> = words.collect();
@@ -42,7 +42,7 @@ fn command(env: &TestEnv, flags: &[&str]) -> Command {
 /// Starts a bridge and waits until it is ready. Returns it with its hub ID.
 fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut program = Program::start(command(env, &[&["--json"], flags].concat()));
-    let begin = program.await_line("its begin", is_class("bridge_ready"));
+    let begin = program.await_line("the first line", is_class("bridge_ready"));
     (program, begin["hub"].as_str().unwrap_or_default().to_owned())
 }
 
@@ -92,7 +92,7 @@ fn two_rooms_are_watched_from_a_third_machine() {
             );
         }
         let (mut near, mut far) = (rooms[1].echo(&["front/scan"]), watcher.echo(&["room1.front/scan"]));
-        let scan = near.await_lines(10, "a scan", is_class("scan")).pop().expect("ten");
+        let scan = near.await_lines(10, "a scan", is_class("scan")).pop().expect("ten scans");
         let is_it =
             |line: &serde_json::Value| line["class"] == "scan" && number(line, "seq") >= number(&scan, "seq");
         let same = far.await_line("the same or a newer scan", is_it);
@@ -107,14 +107,14 @@ fn two_rooms_are_watched_from_a_third_machine() {
         assert!(bridges.iter().all(|(_, hub)| found[0].1.contains(hub)), "{found:?}");
 
         // The slots of `watch` become free only after the publishers have cleaned up.
-        wait_until("the picture is gone", || watcher.subscribers("room0.front/zones") == 0);
+        wait_until("the end of the subscription", || watcher.subscribers("room0.front/zones") == 0);
 
         // Without the router, the rooms continue on their own, and no other machine keeps an old verdict.
         let mut zones = watcher.echo(&["room0.front/zones"]);
         zones.await_line("a verdict", |line| line["class"] == "zones" && line["verdict"] != "unknown");
         let mut local = rooms[0].start(&["hz", "--json", "front/scan"]);
         drop(first.end(KILL));
-        zones.await_line("nothing is known", |line| line["class"] == "zones" && line["verdict"] == "unknown");
+        zones.await_line("unknown verdict", |line| line["class"] == "zones" && line["verdict"] == "unknown");
         let (code, found) = run_check(&watcher, &[&to[2]]);
         assert!(code == Some(5) && found[0].0 == "failed" && found[0].1.contains("no router"), "{found:?}");
         let second = router();
@@ -131,7 +131,7 @@ fn two_rooms_are_watched_from_a_third_machine() {
             assert_eq!(hub.end(INT).exit_code, Some(0));
         }
         drop(sensors);
-        wait_until("nothing is left", || {
+        wait_until("no files are left", || {
             rooms.iter().chain([&watcher]).all(|env| env.leftover_files().is_empty())
         });
     });

@@ -159,7 +159,11 @@ fn the_programs_of_the_page_say_how_a_mount_stands() {
         let lines = echo.await_lines(50, &example.location, is_class("tilt"));
         let is_right = |line: &Value| (0.0..28.7).contains(&angle_deg(line)) && line["rate_deg_s"].is_null();
         assert!(lines.iter().all(is_right), "{}: {lines:?}", example.location);
-        assert!(angle_deg(&lines[0]) != angle_deg(&lines[49]), "{}: it stands", example.location);
+        assert!(
+            angle_deg(&lines[0]) != angle_deg(&lines[49]),
+            "{}: the angle does not change",
+            example.location
+        );
         let outcome = mount.end(INT);
         // An interrupt ends a Python program with a traceback.
         assert!(outcome.stderr.is_empty() || outcome.stderr.contains("KeyboardInterrupt"), "{outcome}");
@@ -178,9 +182,9 @@ fn tilt_accepts_angles_of_programs_in_all_languages() {
             Subscriber::<Tilt>::builder("encoder").in_domain(&hall.env.domain()).open().expect("a name");
         let mut sent = 0;
         let found = loop {
-            assert!(sent < 10_000, "no obstacle in so many angles");
+            assert!(sent < 10_000, "no obstacle at this number of angles");
             sent += 1;
-            let angle = encoder.next().expect("a domain").expect("without a timeout");
+            let angle = encoder.next().expect("a working subscriber").expect("an angle");
             mount.send(&angle, angle.header().stamp_first_ns);
             drop(angle);
             if tilt.prints(has_obstacles) {
@@ -311,7 +315,7 @@ fn reports_missing_angles_and_bad_arguments() {
     drop(hall.simulator.take().map(|simulator| simulator.end(INT)));
     hall.simulator = Some(hall.env.simulator(&["front"], &["--world=room", "--baud=500000"]));
     let report = tilt.await_line("no angles", |line| is_class("angles")(line) && line["problem"] == "silent");
-    assert_eq!(report["sensor"], "tilted", "it publishes nothing");
+    assert_eq!(report["sensor"], "tilted", "wrong sensor in the report");
     let outcome = tilt.end(INT);
     let sum = &outcome.of_class("summary")[0];
     assert!(outcome.exit_code == Some(0) && number(&sum["points_dropped"], "silent") > 0, "{outcome}");

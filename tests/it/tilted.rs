@@ -87,7 +87,7 @@ impl TiltedPublisher {
     fn publish_until_received(&mut self, programs: &mut [&mut Program]) {
         for since in [0, 1] {
             let since = since * u64::from(self.round_count);
-            wait_until("all say all classes", || {
+            wait_until("all classes in all outputs", || {
                 self.publish_round();
                 let is_new = |line: &Value, class| line["class"] == class && round_of(line) >= since;
                 programs
@@ -137,7 +137,7 @@ fn echo_python_and_a_recording_say_the_same() {
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python/tests");
     let mut subscriber = client_python().map(|mut command| {
         let domain = env.domain();
-        let root = domain.root().parent().expect("a domain is below its base");
+        let root = domain.root().parent().expect("a parent directory");
         command.arg(scripts.join("follow.py")).arg(domain.name()).arg(root).args(TOPICS);
         command.env_remove("SCANHUB_DOMAIN");
         Program::start(command)
@@ -145,7 +145,7 @@ fn echo_python_and_a_recording_say_the_same() {
     let file = env.path_argument("tilted.mcap");
     let record = env.start(&[&["record", "--json", "-o", &file][..], &TOPICS].concat());
     let subscribers = 2 + u64::from(subscriber.is_some());
-    wait_until("all follow", || TOPICS.iter().all(|topic| env.subscribers(topic) == subscribers));
+    wait_until("all subscribers", || TOPICS.iter().all(|topic| env.subscribers(topic) == subscribers));
     made.publish_until_received(&mut std::iter::once(&mut echo).chain(&mut subscriber).collect::<Vec<_>>());
     let (echo, record) = (echo.end(INT), record.end(INT));
     assert_eq!(record.exit_code, Some(0), "{record}");
@@ -197,7 +197,7 @@ fn another_machine_says_the_same() {
         let names = TOPICS.map(|topic| {
             let (name, topic) = topic.split_once('/').expect("a topic");
             let published = RefCell::default();
-            wait_until("it is published", || {
+            wait_until("a published sample", || {
                 made.publish_round();
                 let is_it = |sensor: &str| sensor.ends_with(&format!(".{name}"));
                 listen.prints(|line| {

@@ -81,7 +81,7 @@ fn person_is_tracked_between_rooms_and_counted_once() {
     let (mut track, _record) = track_and_record(&env, &site, &env.path_argument("tracks.mcap"));
     let program = examples_on("docs/tracks.md", "house/tracks", &env).pop();
     let program = program.map(|example| Program::start(example.command(&env)));
-    wait_until("the counts are followed", || {
+    wait_until("a subscriber to counts", || {
         let listed = env.run(&["list", "--json"]).of_class("topic");
         let scans = listed.iter().filter(|line| line["topic"] == "scan" || line["topic"] == "foreground");
         scans.map(|line| number(line, "subscribers")).all(|subscribers| subscribers == 2)
@@ -94,9 +94,9 @@ fn person_is_tracked_between_rooms_and_counted_once() {
     env.run(&["control", "hall", "resume"]);
     let event =
         |kind: &'static str| move |line: &serde_json::Value| line["class"] == "event" && line["kind"] == kind;
-    let appeared = track.await_line("somebody", event("appeared"));
+    let appeared = track.await_line("a person", event("appeared"));
     assert_eq!((&appeared["room"], &appeared["sensor"]), (&"hall".into(), &"house".into()));
-    let door = track.await_line("who goes through the door", event("door"));
+    let door = track.await_line("a person who goes through the door", event("door"));
     assert_eq!(door["id"], appeared["id"], "the same person: {door}");
     assert_eq!((&door["from"], &door["to"]), (&"hall".into(), &"kitchen".into()));
     assert_eq!(door["door"], "middle");
@@ -107,7 +107,7 @@ fn person_is_tracked_between_rooms_and_counted_once() {
         let near = |key: &str, at: f64| one[key].as_f64().is_some_and(|value| (value - at).abs() < 0.15);
         one["id"] == door["id"] && one["state"] == "confirmed" && near("x_m", 9.5) && near("y_m", 2.0)
     };
-    let last = track.await_line("where he stands", stands);
+    let last = track.await_line("the place where the person stands", stands);
     assert_eq!((&last["class"], &last["sensor"]), (&"tracks".into(), &"house".into()));
     if let Some(mut program) = program {
         while !program.next_text().contains("1 confirmed kitchen") {}
@@ -118,7 +118,7 @@ fn person_is_tracked_between_rooms_and_counted_once() {
     assert_eq!((number(summary, "appeared"), number(summary, "invalid")), (1, 0), "{summary}");
     assert!(number(summary, "scans") > 500, "{summary}");
     assert_eq!(summary["doors"][0]["forth"], 1);
-    assert!(counts.end(INT).of_class("tracks").is_empty(), "counts alone");
+    assert!(counts.end(INT).of_class("tracks").is_empty(), "only counts must be printed");
 }
 
 /// Starts a tracker named `house`, and a recorder that writes telegrams and tracks to `file`. Waits until both are
@@ -129,7 +129,7 @@ fn track_and_record(env: &TestEnv, site: &str, file: &str) -> (Program, Program)
     let topics = ["hall/telegram", "kitchen/telegram", "house/tracks", "house/events"];
     let record = env.start(&[&["record", "--json", "-o", file][..], &topics].concat());
     for topic in topics {
-        wait_until("it is recorded", || env.subscribers(topic) > 0);
+        wait_until("a subscriber to each topic", || env.subscribers(topic) > 0);
     }
     (track, record)
 }
@@ -141,7 +141,7 @@ fn await_tracker(env: &TestEnv) {
         listed.iter().any(|line| line["sensor"] == "house" && line["topic"] == "events")
     });
     for topic in ["hall/scan", "kitchen/scan", "hall/foreground", "kitchen/foreground"] {
-        wait_until("it follows the sensors", || env.subscribers(topic) > 0);
+        wait_until("subscriptions to the sensors", || env.subscribers(topic) > 0);
     }
 }
 
@@ -166,9 +166,9 @@ fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [Publish
     let (sender, ready) = channel();
     thread::scope(|scope| {
         let hub = scope.spawn(|| {
-            scanhub_daemon::replay(&replay, &domain, |_, player| sender.send(player.clone()).expect("waits"))
+            scanhub_daemon::replay(&replay, &domain, |_, player| sender.send(player.clone()).expect("a test"))
         });
-        let player = StopPlayerOnDrop(ready.recv_timeout(WAIT_TIMEOUT).expect("is up"));
+        let player = StopPlayerOnDrop(ready.recv_timeout(WAIT_TIMEOUT).expect("a started player"));
         let delay = format!("--delay={}ms", DELAY_NS / 1_000_000);
         let track = env.start(&["track", "--site", site, "--as=house", &delay, "--json"]);
         await_tracker(env);
@@ -194,7 +194,7 @@ fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [Publish
         let summary = &outcome.of_class("summary")[0];
         assert!(["missed", "late", "failed"].iter().all(|key| number(summary, key) == 0), "{summary}");
         drop(player);
-        hub.join().expect("ends").expect("ends well");
+        hub.join().expect("a thread that does not panic").expect("a run without an error");
         published.iter_mut().for_each(|samples| samples.retain(|(wall_ns, _)| *wall_ns <= START_NS + END_NS));
         published
     })
@@ -221,19 +221,19 @@ impl Drop for StopPlayerOnDrop {
 }
 
 fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
-    let topic = P::open(node, sensor).expect("a topic").expect("is there");
-    P::subscriber(node, &topic).expect("a place")
+    let topic = P::open(node, sensor).expect("a topic").expect("an existing topic");
+    P::subscriber(node, &topic).expect("a free slot")
 }
 
 fn take<P: Payload + ?Sized>(from: &Subscriber<P>, mut each: impl FnMut(u64, &P)) {
-    while let Some(sample) = P::receive(from).expect("works") {
+    while let Some(sample) = P::receive(from).expect("a working subscriber") {
         each(sample.user_header().wall_ns, P::read(&sample));
     }
 }
 
 fn packed(payload: &impl DatagramPayload) -> Vec<u8> {
     let mut room = vec![0; 100_000];
-    let len = payload.pack(&mut room).expect("there is room");
+    let len = payload.pack(&mut room).expect("a buffer that is large enough");
     room.truncate(len);
     room
 }
@@ -276,12 +276,12 @@ fn python_program_gets_all_events_live_and_in_order() {
     let _replay = replay(&env, &record_world(&env, &to_and_fro, 45));
     let (mut track, record) = track_and_record(&env, &site, &env.path_argument("tracks.mcap"));
     let mut program = Program::start(example.command(&env));
-    wait_until("both follow the events", || env.subscribers("house/events") == 2);
+    wait_until("two subscribers to events", || env.subscribers("house/events") == 2);
     env.run(&["control", "hall", "resume"]);
     let mut doors = 0;
     while doors < 3 {
         let event = track.await_line("an event", is_class("event"));
-        let word = |key: &str| event[key].as_str().expect("a word").to_owned();
+        let word = |key: &str| event[key].as_str().expect("a string").to_owned();
         let (id, kind, room) = (&event["id"], word("kind"), event["room"].as_str().unwrap_or("None"));
         let door = match kind.as_str() {
             "door" => format!(" from {} through {}", word("from"), word("door")),

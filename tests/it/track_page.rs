@@ -57,15 +57,15 @@ fn commands_of_the_page_print_its_output() {
         let key = format!("--key-file={}", robot.path_argument("key"));
         let mut gateway =
             kitchen.start_gateway(&["--interface=lo", "--topic=*/scan", "--topic=*/foreground", &key]);
-        let hub = gateway.await_line("its begin", is_class("gateway"))["hub"].clone();
-        let name = format!("--name=kitchen={}", hub.as_str().expect("the number of a hub"));
+        let hub = gateway.await_line("the first line", is_class("gateway"))["hub"].clone();
+        let name = format!("--name=kitchen={}", hub.as_str().expect("the ID of a hub"));
         let mut listen = robot.start(&["listen", "--publish", "--json", &name, &key]).ready();
         listen.await_line("the sensor in the kitchen", |line| line["sensor"] == "kitchen.rear");
 
         // Two of the commands on the page. Both wait longer than the page says, because the machine may be busy.
         let mut track = robot.start(&["track", "--site", &site, "--delay=2s"]);
         let count = robot.start(&["track", "--site", &site, "--count", "left", "--delay=2s"]);
-        wait_until("they follow all sensors", || {
+        wait_until("subscriptions to all sensors", || {
             let listed = robot.run(&["list", "--json"]).of_class("topic");
             let subscribed = listed
                 .iter()

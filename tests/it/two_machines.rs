@@ -118,7 +118,7 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
         });
         let smooth = relay.forwarded().len();
         relay.set_faulty(true);
-        wait_until("half of what is rough", || relay.forwarded().len() > smooth + ROUGH_DATAGRAMS / 2);
+        wait_until("half of the faulty datagrams", || relay.forwarded().len() > smooth + ROUGH_DATAGRAMS / 2);
         let env = TestEnv::on(&third);
         let late = listener(&env, &["--stats"]);
         let before_late = relay.connect(&third);
@@ -131,7 +131,7 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
             .iter()
             .map(|line| (stream(line, &announced_names(&relay.forwarded())), number(line, "sent")))
             .collect();
-        wait_until("all that was sent", || relay.received().len() as u64 == sent.values().sum::<u64>());
+        wait_until("all sent datagrams", || relay.received().len() as u64 == sent.values().sum::<u64>());
         let (log, names) = (relay.forwarded(), announced_names(&relay.forwarded()));
         let (early, late) = (early.end(INT), late.end(INT));
         let said_early = reported_counters(&early, &names);
@@ -139,7 +139,7 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
         assert_eq!(
             reported_counters(&late, &names),
             expected_counters(&log[before_late..]),
-            "counted from when it joined"
+            "losses must be counted from the first datagram"
         );
         // A listener that ran from the start can account for all that was sent.
         assert_eq!(said_early.len(), sent.len());
@@ -200,10 +200,10 @@ fn remote_sensor_works_like_a_local_one() {
         // The hub and then the gateway end. Subscribers of the remote sensor receive a notice.
         drop(there.end(INT));
         assert_eq!(robot.take_hub().end(TERM).exit_code, Some(0));
-        here.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
+        here.await_line("an unknown verdict", |line| line["verdict"] == "unknown");
         assert_eq!(gateway.end(TERM).exit_code, Some(0));
         assert_eq!(listener.end(TERM).exit_code, Some(0));
-        here.await_line("the news", |line| line["kind"] == "hub_gone");
+        here.await_line("the notice", |line| line["kind"] == "hub_gone");
         drop((here.end(INT), hz.end(INT)));
         assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
     });

@@ -59,9 +59,9 @@ fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
         {
             unread = chunk.bytes;
         }
-        unread.drain(..pty.write(&unread).expect("the pty is there"));
+        unread.drain(..pty.write(&unread).expect("an open pty"));
         let mut written = [0; 64];
-        let written_len = pty.read(&mut written).expect("the pty is there");
+        let written_len = pty.read(&mut written).expect("an open pty");
         let rates_match = pty.rate() == unit.rate();
         written[..written_len]
             .iter()
@@ -78,7 +78,7 @@ fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
                 let expected = if unread.is_empty() { PollFlags::IN } else { PollFlags::IN | PollFlags::OUT };
                 let mut line = [PollFd::from_borrowed_fd(pty.wait_fd(), expected)];
                 // An interrupted wait only is a short one.
-                let _ = poll(&mut line, Some(&Timespec::try_from(POLL_INTERVAL).expect("a time")));
+                let _ = poll(&mut line, Some(&Timespec::try_from(POLL_INTERVAL).expect("a valid time")));
             }
         }
     }
@@ -110,7 +110,12 @@ fn vendor_driver_reads_the_room_in_all_packet_forms() {
         let scans = result["scans"].as_array().expect("scans");
         assert_eq!(scans.len(), 12, "{}", model.name());
         let numbers = |value: &Value| -> Vec<f64> {
-            value.as_array().expect("numbers").iter().map(|number| number.as_f64().expect("one")).collect()
+            value
+                .as_array()
+                .expect("numbers")
+                .iter()
+                .map(|number| number.as_f64().expect("a number"))
+                .collect()
         };
         // The first scan may have begun in the middle of a revolution.
         for scan in &scans[1..] {

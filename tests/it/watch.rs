@@ -77,9 +77,9 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     // lists the counters.
     assert_eq!(env.subscribers("front/lines"), 0);
     watch.press("e");
-    testkit::wait_until("lines are followed", || env.subscribers("front/lines") == 1);
+    testkit::wait_until("a subscriber to lines", || env.subscribers("front/lines") == 1);
     watch.press("e");
-    testkit::wait_until("nobody follows them", || env.subscribers("front/lines") == 0);
+    testkit::wait_until("no subscriber", || env.subscribers("front/lines") == 0);
     watch.press("x\x1b[A");
     watch.wait_for_text(" m from the robot, x ");
     watch.press("x");
@@ -187,8 +187,12 @@ fn a_demonstration_shows_it() {
     let (code, below, is_whole) = demo.finish();
     assert!(code == Some(0) && is_whole, "{code:?} {below:?}");
     assert_eq!(below.matches(" 0 lost in ").count(), 2, "{below:?}");
-    assert_eq!(std::fs::read_dir(&temporary).expect("it is there").count(), 0, "its directory is left");
-    assert!(testkit::shared_memory(&format!("sh_{name}_")).is_empty(), "its domain is left");
+    assert_eq!(
+        std::fs::read_dir(&temporary).expect("a readable directory").count(),
+        0,
+        "the directory was not removed"
+    );
+    assert!(testkit::shared_memory(&format!("sh_{name}_")).is_empty(), "the domain was not removed");
 }
 
 #[test]
@@ -212,7 +216,7 @@ fn a_terminal_that_is_closed_is_a_quiet_end() {
             );
             watch.wait_for_text(if streams { "1 front    streaming" } else { "no hub: waiting for it" });
             let code = watch.hang_up();
-            let errors = fs::read_to_string(errors).expect("its errors");
+            let errors = fs::read_to_string(errors).expect("the error output");
             assert_eq!(
                 (code, errors.as_str()),
                 (Some(0), ""),
@@ -253,6 +257,6 @@ fn tmux_shows_picture_help_and_narrow_windows() {
     tmux.press(&["q"]);
     // The exit code shows that it was interrupted before its time elapsed.
     let rows = tmux.await_rows("end", |rows| rows.iter().any(|row| row == "ended with 130"));
-    assert!(!is_picture(&rows), "the picture is left:\n{}", rows.join("\n"));
+    assert!(!is_picture(&rows), "the terminal still shows the picture:\n{}", rows.join("\n"));
     assert_eq!(rows.iter().filter(|row| row.contains(" 0 lost in ")).count(), 2, "{}", rows.join("\n"));
 }

@@ -13,7 +13,7 @@ use tungstenite::{Message, WebSocket};
 /// Starts a server with these flags, and returns it with its `HOST:PORT`.
 pub(crate) fn web(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut server = env.start(&[&["web", "--json", "--listen", "127.0.0.1:0"], flags].concat());
-    let ready = server.await_line("its address", is_class("ready"));
+    let ready = server.await_line("the address of the page", is_class("ready"));
     let url = ready["url"].as_str().expect("an address");
     let host = url.trim_start_matches("http://").split('/').next().expect("a host").to_owned();
     (server, host)
@@ -28,7 +28,7 @@ pub(crate) fn connect(host: &str) -> TcpStream {
 /// Returns the server's response to `head`, or an empty string if it sends none.
 pub(crate) fn send_request(host: &str, head: &str) -> String {
     let mut stream = connect(host);
-    stream.write_all(head.as_bytes()).expect("it reads");
+    stream.write_all(head.as_bytes()).expect("a sent request");
     let mut answer = Vec::new();
     let _ = stream.read_to_end(&mut answer);
     String::from_utf8_lossy(&answer).into_owned()
@@ -71,7 +71,7 @@ pub(crate) fn connect_viewer_with(
 
 pub(crate) fn text(socket: &mut WebSocket<TcpStream>) -> Value {
     loop {
-        if let Message::Text(text) = socket.read().expect("the server lives") {
+        if let Message::Text(text) = socket.read().expect("an open connection") {
             return serde_json::from_str(&text).expect("JSON");
         }
     }
@@ -88,7 +88,7 @@ pub(crate) fn channels<const N: usize>(viewer: &mut WebSocket<TcpStream>, topics
         assert!(Instant::now() < give_up_at, "{topics:?} are not all in {advertised:?}");
         advertised.extend(text(viewer)["channels"].as_array().into_iter().flatten().cloned());
     }
-    topics.map(|topic| of(&advertised, topic).expect("it is there"))
+    topics.map(|topic| of(&advertised, topic).expect("an advertised channel"))
 }
 
 /// Subscribes to the channels with these IDs, with these numbers of subscriptions.
@@ -96,7 +96,7 @@ pub(crate) fn subscribe(viewer: &mut WebSocket<TcpStream>, requested: &[(u32, &V
     let expected: Vec<_> =
         requested.iter().map(|(number, id)| json!({ "id": number, "channelId": id })).collect();
     let wish = json!({ "op": "subscribe", "subscriptions": expected });
-    viewer.send(Message::text(wish.to_string())).expect("it reads");
+    viewer.send(Message::text(wish.to_string())).expect("a sent message");
 }
 
 #[test]
@@ -143,13 +143,13 @@ fn viewer_gets_foxglove_messages_despite_hostile_one() {
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (mut server, host) = web(&env, &[]);
-    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
-    server.await_line("who came", |line| line["class"] == "viewer" && line["connected"] == true);
+    let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
+    server.await_line("a connected viewer", |line| line["class"] == "viewer" && line["connected"] == true);
     assert_eq!(text(&mut viewer)["op"], "serverInfo");
     // The next viewer sends hostile frames, which must not affect this one.
-    let mut hostile = connect_viewer(&host, "/", None).expect("let in");
-    hostile.send(Message::text("[".repeat(60_000))).expect("it reads");
-    hostile.send(Message::binary(vec![1; 60_000])).expect("it reads");
+    let mut hostile = connect_viewer(&host, "/", None).expect("an accepted viewer");
+    hostile.send(Message::text("[".repeat(60_000))).expect("a sent message");
+    hostile.send(Message::binary(vec![1; 60_000])).expect("a sent message");
     let _ = hostile.send(Message::binary(vec![1; 1 << 20]));
 
     let [scan, zones, _] = channels(&mut viewer, ["/front/scan", "/zones", "/front/status"]);
@@ -163,7 +163,7 @@ fn viewer_gets_foxglove_messages_despite_hostile_one() {
     let mut received = [0_u32; 2];
     while received.iter().any(|count| *count < 5) {
         assert!(Instant::now() < give_up_at, "{received:?}");
-        let Message::Binary(frame) = viewer.read().expect("the server lives") else { continue };
+        let Message::Binary(frame) = viewer.read().expect("an open connection") else { continue };
         let subscription = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
         assert_eq!(frame[0], 1);
         let body = &frame[13..];
@@ -178,11 +178,12 @@ fn viewer_gets_foxglove_messages_despite_hostile_one() {
                 let message: Value = serde_json::from_slice(body).expect("a SceneUpdate");
                 received[1] += u32::from(message["entities"].as_array().is_some_and(|all| all.len() >= 2));
             }
-            other => panic!("nobody subscribed to {other}"),
+            other => panic!("no subscription {other}"),
         }
     }
     drop(viewer);
-    server.await_line("who went", |line| line["class"] == "viewer" && line["connected"] == false);
+    server
+        .await_line("a disconnected viewer", |line| line["class"] == "viewer" && line["connected"] == false);
     assert_eq!(server.end(INT).exit_code, Some(0));
 }
 
@@ -190,14 +191,15 @@ fn viewer_gets_foxglove_messages_despite_hostile_one() {
 fn as_many_come_in_as_there_is_room_for() {
     let env = TestEnv::new();
     let (server, host) = web(&env, &[]);
-    let mut viewers: Vec<_> = (0..32).map(|_| connect_viewer(&host, "/", None).expect("let in")).collect();
+    let mut viewers: Vec<_> =
+        (0..32).map(|_| connect_viewer(&host, "/", None).expect("an accepted viewer")).collect();
     assert_eq!(connect_viewer(&host, "/", None).err(), Some(503));
     // Connections without a request do not count as viewers, and the page is still served.
     let idle: Vec<_> = (0..20).map(|_| connect(&host)).collect();
     assert_eq!(status(&send_request(&host, &format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "200");
     drop(idle);
     let _ = viewers.pop().map(|mut one| one.close(None));
-    wait_until("the place of who went is free", || connect_viewer(&host, "/", None).is_ok());
+    wait_until("a free slot for a viewer", || connect_viewer(&host, "/", None).is_ok());
     assert_eq!(server.end(INT).exit_code, Some(0));
 }
 
@@ -206,7 +208,7 @@ fn a_port_that_is_taken_is_not_the_end() {
     let env = TestEnv::new();
     let (_first, host) = web(&env, &[]);
     let mut second = env.start(&["web", "--json", "--listen", &host]);
-    let ready = second.await_line("its address", is_class("ready"));
+    let ready = second.await_line("the address of the page", is_class("ready"));
     let port =
         |text: &str| text.trim_end_matches('/').rsplit(':').next().and_then(|port| port.parse::<u16>().ok());
     let (first, second) = (port(&host), port(ready["url"].as_str().expect("an address")));

@@ -39,7 +39,7 @@ fn the_keyboard_alone_is_enough() {
         let outline = "getComputedStyle(document.activeElement).outlineStyle";
         assert!(
             holder == "BODY" || page.ask(outline) != "none",
-            "{holder} does not show that it has the keyboard"
+            "{holder} does not show that it has the focus"
         );
         reached.push(holder);
     }

@@ -41,7 +41,7 @@ struct Viewer {
 
 impl Viewer {
     fn new(host: &str, protocol: &str) -> Viewer {
-        let mut socket = connect_viewer_with(host, "/", None, protocol).expect("let in");
+        let mut socket = connect_viewer_with(host, "/", None, protocol).expect("an accepted viewer");
         assert_eq!(text(&mut socket)["op"], "serverInfo");
         Viewer { socket, channels: Vec::new(), messages: HashMap::new() }
     }
@@ -51,7 +51,7 @@ impl Viewer {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while self.channels.len() < TOPICS.len() + 1 || self.min_count() < count {
             assert!(Instant::now() < give_up_at, "{count} of each: {:?}", self.counts());
-            match self.socket.read().expect("the server lives") {
+            match self.socket.read().expect("an open connection") {
                 Message::Text(text) => self.receive(&serde_json::from_str(&text).expect("JSON")),
                 Message::Binary(frame) => {
                     let subscription = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
@@ -69,7 +69,7 @@ impl Viewer {
         for channel in message["channels"].as_array().into_iter().flatten() {
             let one = json!({ "id": self.channels.len(), "channelId": channel["id"] });
             let wish = json!({ "op": "subscribe", "subscriptions": [one] });
-            self.socket.send(Message::text(wish.to_string())).expect("it reads");
+            self.socket.send(Message::text(wish.to_string())).expect("a sent message");
             self.channels.push(channel.clone());
         }
     }
@@ -172,7 +172,7 @@ fn check_each_equals_a_line(
         messages.len()
     );
     for (body, line) in matched {
-        assert!(is_same(body, line), "{topic}: not what this line says: {line}");
+        assert!(is_same(body, line), "{topic}: differs from this line: {line}");
     }
 }
 
@@ -246,11 +246,11 @@ fn check_each_equals_some_line(
     let (lines, summaries) = (outcome.of_class(class), outcome.of_class("summary"));
     let missed = summaries.iter().find(|line| line["topic"] == class).map(|line| number(line, "missed"));
     let messages: Vec<_> = messages.iter().map(|(_, body)| object(body)).filter(is_relevant).collect();
-    assert!(!messages.is_empty(), "{class}: nothing was said");
+    assert!(!messages.is_empty(), "{class}: no lines");
     let missing: Vec<_> =
         messages.iter().filter(|update| !lines.iter().any(|line| is_same(update, line))).collect();
     let may_miss = if missed == Some(0) { 0 } else { messages.len() / 2 };
-    assert!(missing.len() <= may_miss, "{class}: {missed:?} missed, and no line says {missing:?}");
+    assert!(missing.len() <= may_miss, "{class}: {missed:?} missed, and no line contains {missing:?}");
 }
 
 fn are_same_marks(message: &Value, line: &Value) -> bool {
@@ -283,7 +283,7 @@ fn are_same_lines(message: &Value, line: &Value) -> bool {
 fn are_same_zones(message: &Value, line: &Value) -> bool {
     let metadata = |entity: &Value, key: &str| {
         let mut all = entity["metadata"].as_array().expect("a list").iter();
-        all.find(|one| one["key"] == key).map(|one| one["value"].as_str().expect("text").to_owned())
+        all.find(|one| one["key"] == key).map(|one| one["value"].as_str().expect("a string").to_owned())
     };
     let entities = list(message, "entities")
         .filter(|entity| !entity["cylinders"].as_array().expect("a list").is_empty());
@@ -326,10 +326,10 @@ fn is_background(body: &[u8], line: &Value) -> bool {
 
 fn compare(viewer: &Viewer, outcome: &Outcome) {
     for channel in &viewer.channels {
-        let (topic, encoding) = (channel["topic"].as_str().expect("text"), &channel["encoding"]);
+        let (topic, encoding) = (channel["topic"].as_str().expect("a string"), &channel["encoding"]);
         if encoding == "json" {
             let schema: Value =
-                serde_json::from_str(channel["schema"].as_str().expect("text")).expect("JSON");
+                serde_json::from_str(channel["schema"].as_str().expect("a string")).expect("JSON");
             for (_, body) in viewer.messages_of(topic) {
                 assert!(matches_schema(&object(body), &schema), "{topic}: {}", object(body));
             }
@@ -375,7 +375,7 @@ fn compare(viewer: &Viewer, outcome: &Outcome) {
     );
     let models = outcome.of_class("background");
     for (_, body) in viewer.messages_of("/front/background") {
-        assert!(models.iter().any(|line| is_background(body, line)), "background: no line says the same");
+        assert!(models.iter().any(|line| is_background(body, line)), "background: no line is equal");
     }
     let verdicts = outcome.of_class("zones");
     let robot: Vec<_> = viewer.messages_of("/robot").iter().map(|(_, body)| object(body)).collect();
@@ -383,8 +383,8 @@ fn compare(viewer: &Viewer, outcome: &Outcome) {
     for update in robot.iter().filter(|update| update["verdict"] != "unknown") {
         assert!(verdicts.iter().any(|line| line["verdict"] == update["verdict"]), "{update}");
     }
-    let decoded =
-        read(&TF_MESSAGE, &viewer.messages_of("/tf_static").last().expect("one").1).expect("a TFMessage");
+    let decoded = read(&TF_MESSAGE, &viewer.messages_of("/tf_static").last().expect("a message").1)
+        .expect("a TFMessage");
     let number = |path: &str| decoded.number(&format!("transforms.0.transform.{path}")).expect("a number");
     assert!(close(number("translation.x"), SENSOR_POSE.0) && close(number("translation.y"), SENSOR_POSE.1));
     assert!(close(number("rotation.z"), (SENSOR_POSE.2 / 2.0).sin()));

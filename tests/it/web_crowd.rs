@@ -36,15 +36,16 @@ impl Drop for SetOnDrop<'_> {
 fn await_messages(viewer: &mut WebSocket<TcpStream>, count: u32) {
     for number in 1..=count {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
-        while !viewer.read().expect("the server lives").is_binary() {
-            assert!(Instant::now() < give_up_at, "waited in vain for message {number} of {count}");
+        while !viewer.read().expect("an open connection").is_binary() {
+            assert!(Instant::now() < give_up_at, "message {number} of {count} did not arrive in time");
         }
     }
 }
 
 /// Returns the resident memory of a process, in kB.
 fn memory(of: &Program) -> u64 {
-    let text = fs::read_to_string(format!("/proc/{}/status", of.pid())).expect("it lives");
+    let text =
+        fs::read_to_string(format!("/proc/{}/status", of.pid())).expect("the status of a running process");
     let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("a line");
     line.trim().trim_end_matches(" kB").parse().expect("a number")
 }
@@ -56,13 +57,14 @@ fn slow_viewer_and_full_server_do_not_block_others() {
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (server, host) = web(&env, &[]);
-    let mut reader = connect_viewer(&host, "/", None).expect("let in");
+    let mut reader = connect_viewer(&host, "/", None).expect("an accepted viewer");
     subscribe_to(&mut reader, "/front/scan");
-    let mut slow = connect_viewer(&host, "/", None).expect("let in");
-    set_socket_recv_buffer_size(slow.get_ref(), 4096).expect("a small one");
+    let mut slow = connect_viewer(&host, "/", None).expect("an accepted viewer");
+    set_socket_recv_buffer_size(slow.get_ref(), 4096).expect("a small receive buffer");
     subscribe_to(&mut slow, "/front/scan");
     let before = memory(&server);
-    let rest: Vec<_> = (0..30).map(|_| connect_viewer(&host, "/", None).expect("let in")).collect();
+    let rest: Vec<_> =
+        (0..30).map(|_| connect_viewer(&host, "/", None).expect("an accepted viewer")).collect();
     let refused = (0..20).map(|_| connect_viewer(&host, "/", None).err());
     assert!(refused.into_iter().all(|status| status == Some(503)));
     let idle: Vec<_> = (0..148).map(|_| connect(&host)).collect();
@@ -70,7 +72,7 @@ fn slow_viewer_and_full_server_do_not_block_others() {
     for _ in 0..8 {
         // Read 1 kB for every 12 messages, which are 15 kB.
         await_messages(&mut reader, 12);
-        read += slow.get_mut().read(&mut [0; 1000]).expect("it is not given up");
+        read += slow.get_mut().read(&mut [0; 1000]).expect("an open connection");
     }
     assert!(read > 4000, "{read} bytes");
     let grown = memory(&server).saturating_sub(before);
@@ -86,14 +88,14 @@ fn hostile_frames_do_not_disturb_other_viewers() {
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (server, host) = web(&env, &[]);
-    let mut reader = connect_viewer(&host, "/", None).expect("let in");
+    let mut reader = connect_viewer(&host, "/", None).expect("an accepted viewer");
     subscribe_to(&mut reader, "/front/scan");
     let before = memory(&server);
 
     // Frames of random bytes: with or without mask, complete or cut, of every opcode.
     let mut random = fastrand::Rng::with_seed(25);
     for _ in 0..60 {
-        let mut viewer = connect_viewer(&host, "/", None).expect("let in");
+        let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
         let mut bytes: Vec<u8> = (0..random.usize(1..4000)).map(|_| random.u8(..)).collect();
         if random.bool() {
             bytes[0] = 0x80 | random.u8(0..16);
@@ -101,17 +103,17 @@ fn hostile_frames_do_not_disturb_other_viewers() {
         let _ = viewer.get_mut().write_all(&bytes);
     }
     // More subscriptions than allowed, and a message that never ends.
-    let mut greedy = connect_viewer(&host, "/", None).expect("let in");
+    let mut greedy = connect_viewer(&host, "/", None).expect("an accepted viewer");
     let expected: Vec<_> = (0..400).map(|id| json!({ "id": id, "channelId": 1 })).collect();
     let wish = json!({ "op": "subscribe", "subscriptions": expected });
-    greedy.send(Message::text(wish.to_string())).expect("it reads");
+    greedy.send(Message::text(wish.to_string())).expect("a sent message");
     while greedy.read().is_ok() {}
-    let mut endless = connect_viewer(&host, "/", None).expect("let in");
+    let mut endless = connect_viewer(&host, "/", None).expect("an accepted viewer");
     let part = [&[0x01, 0xFE, 0x40, 0, 0, 0, 0, 0][..], &[b' '; 0x4000]].concat();
     while endless.get_mut().write_all(&part).is_ok() {}
 
     // A viewer that sends without pause must not starve the others.
-    let mut talker = connect_viewer(&host, "/", None).expect("let in");
+    let mut talker = connect_viewer(&host, "/", None).expect("an accepted viewer");
     talker.get_ref().set_write_timeout(Some(WAIT_TIMEOUT)).expect("a timeout");
     let (is_served, sent) = (AtomicBool::new(false), AtomicUsize::new(0));
     thread::scope(|scope| {
@@ -136,7 +138,7 @@ fn hostile_frames_do_not_disturb_other_viewers() {
 fn limit_descriptors(server: &Program, max: u64) {
     let pid = Pid::from_raw(i32::try_from(server.pid()).expect("a process"));
     let limit = Rlimit { current: Some(max), maximum: getrlimit(Resource::Nofile).maximum };
-    prlimit(pid, Resource::Nofile, limit).expect("its limit");
+    prlimit(pid, Resource::Nofile, limit).expect("permission to set the limit");
 }
 
 /// Topics that the server subscribes to without a request for lines.
@@ -146,12 +148,13 @@ const SERVER_TOPICS: [&str; 6] =
 /// Returns the lowest descriptor that is not open.
 fn next_descriptor(server: &Program) -> u64 {
     let open = |number: &u64| !Path::new(&format!("/proc/{}/fd/{number}", server.pid())).exists();
-    (0..).find(open).expect("not all are open")
+    (0..).find(open).expect("an unused descriptor")
 }
 
 /// Returns the CPU time that the server has used.
 fn cpu_time(server: &Program) -> Duration {
-    let text = fs::read_to_string(format!("/proc/{}/stat", server.pid())).expect("it lives");
+    let text = fs::read_to_string(format!("/proc/{}/stat", server.pid()))
+        .expect("the counters of a running process");
     let fields: Vec<&str> = text.rsplit_once(") ").expect("a name").1.split(' ').collect();
     let ticks: u64 = fields[11..13].iter().map(|field| field.parse::<u64>().expect("a number")).sum();
     // A hundred ticks per second (proc(5)) on all platforms of this project.
@@ -165,15 +168,16 @@ fn new_viewer_waits_while_descriptors_are_short() {
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (mut server, host) = web(&env, &[]);
-    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
+    let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
     subscribe_to(&mut viewer, "/front/scan");
     // Subscriptions take descriptors too, so wait for all of them first.
-    wait_until("it follows all topics", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
+    wait_until("all subscriptions", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
     let mut late = connect(&host);
-    late.write_all(format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n").as_bytes()).expect("a backlog");
-    let short = server.await_line("what it is short of", is_class("web_short"));
+    late.write_all(format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n").as_bytes())
+        .expect("room in the backlog");
+    let short = server.await_line("the report of a shortage", is_class("web_short"));
     assert!(short["message"].as_str().is_some_and(|text| text.contains("cannot accept viewers")), "{short}");
     assert!(short["hint"].as_str().is_some_and(|text| text.contains("ulimit -n")), "{short}");
     let (started, before) = (Instant::now(), cpu_time(&server));
@@ -195,15 +199,15 @@ fn lack_of_descriptors_for_a_topic_spares_the_others() {
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (mut server, host) = web(&env, &[]);
-    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
+    let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
     let [scan, lines] = channels(&mut viewer, ["/front/scan", "/lines"]);
     subscribe(&mut viewer, &[(1, &scan["id"])]);
-    wait_until("it follows all topics", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
+    wait_until("all subscriptions", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
     // The server subscribes to lines as soon as a viewer requests them.
     subscribe(&mut viewer, &[(2, &lines["id"])]);
-    let short = server.await_line("what it is short of", is_class("web_short"));
+    let short = server.await_line("the report of a shortage", is_class("web_short"));
     assert!(
         short["message"].as_str().is_some_and(|text| text.contains("front/lines is not served")),
         "{short}"
@@ -212,7 +216,7 @@ fn lack_of_descriptors_for_a_topic_spares_the_others() {
     await_messages(&mut viewer, 80);
     assert_eq!(env.subscribers("front/lines"), 0);
     limit_descriptors(&server, 1024);
-    wait_until("it follows lines, too", || env.subscribers("front/lines") > 0);
+    wait_until("a subscription to lines", || env.subscribers("front/lines") > 0);
     let outcome = server.end(INT);
     assert!(outcome.exit_code == Some(0) && outcome.stderr.is_empty(), "{outcome}");
 }
@@ -223,7 +227,7 @@ fn where_there_are_no_descriptors_the_server_ends() {
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     let (server, host) = web(&env, &[]);
-    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
+    let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
     subscribe_to(&mut viewer, "/front/scan");
     await_messages(&mut viewer, 5);
     // The server cannot even wait without descriptors, so it ends.

@@ -26,7 +26,7 @@ fn wait_for_reason(page: &mut Browser, description: &str, remedy: &str) {
     page.await_true(&format!("Boolean(window.scanhub) && !{reason}.hidden && {what} && {remedy}"));
     assert_eq!(page.ask("scanhub.verdict"), "unknown");
     let color_now = page.ask("getComputedStyle(document.querySelector('#verdict strong')).backgroundColor");
-    assert_eq!(color_now, color(page, "stop-fill"), "what is not known is as red as a stop");
+    assert_eq!(color_now, color(page, "stop-fill"), "an unknown verdict must have the color of a stop");
 }
 
 #[test]
@@ -68,7 +68,7 @@ fn the_hub_of_another_user_is_named() {
         let _hub = Program::start(scanhub(OTHER_UID, &arguments)).ready();
         let arguments = ["web", "--json", "--listen=127.0.0.1:0", "--root=/tmp/theirs"];
         let mut server = Program::start(scanhub(0, &arguments));
-        let ready = server.await_line("its address", is_class("ready"));
+        let ready = server.await_line("the address of the page", is_class("ready"));
         page.open(ready["url"].as_str().expect("an address"));
         wait_for_reason(&mut page, "belongs to user 65533", "listen --publish");
         assert_eq!(server.end(INT).exit_code, Some(0));

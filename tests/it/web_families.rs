@@ -74,7 +74,7 @@ fn every_form_is_drawn_where_it_sees() {
     ];
     for (sensor, pose) in poses {
         // On a busy machine, a scan may have gaps, and the page removes one that is too old.
-        wait_until(&format!("{sensor} stands where it sees"), || {
+        wait_until(&format!("the sensor {sensor} at its place"), || {
             let outcome = env.run(&["echo", "--json", "-n", "1", &format!("{sensor}/scan")]);
             let scan = outcome.of_class("scan").pop().unwrap_or_else(|| panic!("no scan: {outcome}"));
             let (measured_now, drawn_points) =
@@ -142,7 +142,7 @@ fn remote_sensors_are_listed_but_not_on_this_robot() {
             let pixels = pair(&page.ask(&format!("scanhub.screen({x}, {y}).map(Math.round)")));
             page.mouse("mouseMoved", pixels, false);
             let at_m = pair(&page.ask(&format!("scanhub.place({}, {})", pixels.0, pixels.1)));
-            let within_m = 14.0 / page.ask("scanhub.view.scale").as_f64().expect("pixels for a metre");
+            let within_m = 14.0 / page.ask("scanhub.view.scale").as_f64().expect("pixels per meter");
             let words = PointerPosition::of(scene.sensors.iter(), at_m, within_m).text_lines();
             let (lines, last) = words.split_at(words.len().min(3));
             let last: String = last.iter().map(|word| format!(", {word}")).collect();

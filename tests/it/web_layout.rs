@@ -52,7 +52,7 @@ fn check(page: &mut Browser, description: &str) {
         // A busy browser drops movements of the mouse, so keep moving it.
         let mut x = (0..).map(|step| 330.0 + f64::from(step % 2));
         wait_until("the read-out is shown", || {
-            page.mouse("mouseMoved", (x.next().expect("endless"), 330.0), false);
+            page.mouse("mouseMoved", (x.next().expect("an endless sequence"), 330.0), false);
             page.ask("document.querySelector('#readout').innerText !== ''") == true
         });
         // The page shows the report of skipped messages only for a moment, so set it here.

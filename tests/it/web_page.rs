@@ -47,7 +47,7 @@ pub(crate) fn freeze_page(page: &mut Browser, condition: &str) {
 /// Starts the server, and returns it with its address.
 fn web(env: &TestEnv, listen: &str) -> (Program, String) {
     let mut web = env.start(&["web", "--json", "--listen", listen]);
-    let ready = web.await_line("its address", |line| line["class"] == "ready");
+    let ready = web.await_line("the address of the page", |line| line["class"] == "ready");
     let url = ready["url"].as_str().expect("an address").to_owned();
     (web, url)
 }
@@ -171,7 +171,7 @@ fn keys_and_the_mouse_change_the_picture() {
     assert_eq!(env.subscribers("front/lines"), 1);
     page.press("e");
     page.await_true("scanhub.lines === 0");
-    wait_until("nobody follows them", || env.subscribers("front/lines") == 0);
+    wait_until("no subscriber", || env.subscribers("front/lines") == 0);
     let fits = "document.querySelector('[data-do=fit]').getAttribute('aria-pressed')";
     assert_eq!(page.ask(fits), "true");
     page.mouse("mousePressed", (180.0, 300.0), true);
@@ -183,7 +183,7 @@ fn keys_and_the_mouse_change_the_picture() {
     // A busy browser drops movements of the mouse, so keep moving it, as a person does.
     let mut steps = (0..).map(|step| 195.0 + f64::from(step % 2));
     wait_until("the place under the mouse is read out", || {
-        page.mouse("mouseMoved", (steps.next().expect("endless"), 300.0), false);
+        page.mouse("mouseMoved", (steps.next().expect("an endless sequence"), 300.0), false);
         page.ask("/from the robot/.test(document.querySelector('#readout').innerText)") == true
     });
     let paper = "getComputedStyle(document.body).backgroundColor";

@@ -9,7 +9,7 @@ use crate::web_page::browse;
 fn start_web(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
     let words = ["web", "--json", "--listen", "127.0.0.1:0", "--replay", file];
     let mut web = env.start(&[&words, flags].concat());
-    let ready = web.await_line("its address", is_class("ready"));
+    let ready = web.await_line("the address of the page", is_class("ready"));
     let url = ready["url"].as_str().expect("an address").to_owned();
     (web, url)
 }
@@ -46,7 +46,7 @@ fn the_keys_of_a_player_are_on_the_page() {
     let before = page.ask("scanhub.player.telegrams").as_u64().expect("a number");
     assert_eq!(page.ask("scanhub.beams"), 181);
     assert_eq!(page.ask("scanhub.reason"), serde_json::Value::Null);
-    assert_eq!(page.ask("scanhub.verdict"), "unknown", "what stands is not what is there");
+    assert_eq!(page.ask("scanhub.verdict"), "unknown", "a paused picture must not show a current verdict");
 
     // A key and a button each step by one telegram.
     page.press(".");
@@ -69,11 +69,11 @@ fn the_keys_of_a_player_are_on_the_page() {
     page.await_true(&format!(
         "document.querySelector('[data-order=step]').disabled && scanhub.player.telegrams === {SCAN_COUNT}"
     ));
-    assert_eq!(page.ask("scanhub.beams"), 181, "what was seen last stands");
+    assert_eq!(page.ask("scanhub.beams"), 181, "the last scan must stay visible");
     assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
     let outcome = server.end(INT);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
-    assert!(shared_memory(&own).is_empty(), "its domain is left");
+    assert!(shared_memory(&own).is_empty(), "the domain was not removed");
 }
 
 #[test]

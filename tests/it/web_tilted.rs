@@ -23,7 +23,7 @@ fn publish_round(publisher: &mut TiltedPublisher, viewer: &mut WebSocket<TcpStre
     publisher.publish_round();
     let mut messages: [Option<Vec<u8>>; 3] = Default::default();
     while messages.iter().any(Option::is_none) {
-        let Message::Binary(frame) = viewer.read().expect("the server lives") else { continue };
+        let Message::Binary(frame) = viewer.read().expect("an open connection") else { continue };
         let number = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
         messages[number as usize] = Some(frame[13..].to_vec());
     }
@@ -90,19 +90,19 @@ fn channels_of_mount_and_sweep_equal_output_of_echo() {
         let mut made = TiltedPublisher::start_publisher(&env);
         let mut echo = env.echo(&TOPICS);
         let (_server, host) = web(&env, &[]);
-        let mut viewer = connect_viewer_with(&host, "/", None, protocol).expect("let in");
+        let mut viewer = connect_viewer_with(&host, "/", None, protocol).expect("an accepted viewer");
         let advertised = channels(&mut viewer, ["/mount/tilt", "/room/cloud", "/room/obstacles"]);
-        wait_until("obstacles are followed at once", || env.subscribers("room/obstacles") == 2);
+        wait_until("a subscriber to obstacles", || env.subscribers("room/obstacles") == 2);
         let seldom = ["room/cloud", "mount/tilt"];
-        assert_eq!(seldom.map(|topic| env.subscribers(topic)), [1, 1], "nobody looks at them");
+        assert_eq!(seldom.map(|topic| env.subscribers(topic)), [1, 1], "only echo may have subscribed");
         let expected: Vec<(u32, &Value)> =
             (0..).zip(advertised.iter().map(|channel| &channel["id"])).collect();
         subscribe(&mut viewer, &expected);
-        wait_until("all are followed", || seldom.map(|topic| env.subscribers(topic)) == [2, 2]);
+        wait_until("subscribers to all classes", || seldom.map(|topic| env.subscribers(topic)) == [2, 2]);
         let rounds: Vec<_> = (0..4).map(|_| publish_round(&mut made, &mut viewer)).collect();
         let is_last =
             |line: &Value, class| line["class"] == class && line["first"] != true && round_of(line) == 3;
-        wait_until("echo says all of them, too", || {
+        wait_until("the same classes in echo", || {
             CLASSES.iter().all(|class| echo.prints(|line| is_last(line, *class)))
         });
         let echo = echo.end(INT);
@@ -111,7 +111,7 @@ fn channels_of_mount_and_sweep_equal_output_of_echo() {
         };
         let object = |body: &[u8], channel: &Value| {
             let object = serde_json::from_slice::<Value>(body).expect("JSON");
-            let schema = serde_json::from_str(channel["schema"].as_str().expect("text")).expect("JSON");
+            let schema = serde_json::from_str(channel["schema"].as_str().expect("a string")).expect("JSON");
             assert!(matches_schema(&object, &schema), "{object}");
             object
         };
@@ -129,7 +129,7 @@ fn channels_of_mount_and_sweep_equal_output_of_echo() {
         }
         // Without a viewer, the server drops its subscriptions.
         drop(viewer);
-        wait_until("nobody looks", || seldom.map(|topic| env.subscribers(topic)) == [0, 0]);
+        wait_until("no subscriber", || seldom.map(|topic| env.subscribers(topic)) == [0, 0]);
     }
 }
 
@@ -242,12 +242,12 @@ fn the_page_of_the_demonstration_has_sweeps() {
             break host.trim_end_matches('/').to_owned();
         }
     };
-    let mut viewer = connect_viewer(&host, "/", None).expect("let in");
+    let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
     let [cloud] = channels(&mut viewer, ["/hall/cloud"]);
     subscribe(&mut viewer, &[(0, &cloud["id"])]);
     // A busy machine may send only a part of a sweep.
     wait_until("a cloud", || {
-        let Message::Binary(frame) = viewer.read().expect("the server lives") else { return false };
+        let Message::Binary(frame) = viewer.read().expect("an open connection") else { return false };
         read(&POINT_CLOUD, &frame[13..]).expect("a PointCloud2").number("width") > Some(100.0)
     });
     assert_eq!(demo.end(INT).exit_code, Some(0));

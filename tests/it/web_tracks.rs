@@ -22,7 +22,7 @@ const GREEN_SCRIPT: &str = "(() => {
 })()";
 
 fn number(page: &mut Browser, script: &str) -> f64 {
-    page.ask(script).as_f64().unwrap_or_else(|| panic!("{script} is no number"))
+    page.ask(script).as_f64().unwrap_or_else(|| panic!("{script} is not a number"))
 }
 
 #[test]

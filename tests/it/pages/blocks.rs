@@ -25,7 +25,7 @@ pub(crate) fn blocks() -> Vec<Block> {
     pages.retain(|page| page.extension().is_some_and(|it| it == "md"));
     pages.sort();
     let read = |page: &PathBuf| {
-        let name = page.strip_prefix(top).expect("below the top").display().to_string();
+        let name = page.strip_prefix(top).expect("a path below the top").display().to_string();
         blocks_of_page(&name, &fs::read_to_string(page).expect("a page"))
     };
     pages.iter().flat_map(read).collect()

@@ -34,7 +34,7 @@ fn error_in_block(block: &Block) -> Option<String> {
             let is_named = |(page, begin, _): &(&str, &str, &str)| {
                 block.location.starts_with(page) && block.text.starts_with(begin)
             };
-            (!TEXT_BLOCKS.iter().any(is_named)).then(|| "a text that nobody checks".to_owned())
+            (!TEXT_BLOCKS.iter().any(is_named)).then(|| "no test checks this text".to_owned())
         }
         "sh" => None,
         // Lines of the examples' project, which `client_c.rs` builds.
@@ -52,7 +52,7 @@ fn error_in_block(block: &Block) -> Option<String> {
         // Uses a crate that clients do not depend on. That crate's doc tests run it.
         "rust,edition2024" if block.location.starts_with("docs/tilt.md") => None,
         _ if is_program(block) => None,
-        other => Some(format!("nobody knows what to do with {other:?}")),
+        other => Some(format!("unknown kind of block: {other:?}")),
     }
 }
 
@@ -123,8 +123,8 @@ fn detects_invalid_blocks() {
         ("json", "{\"class\":\"zones\",\"sensor\":\"front\",\"verdikt\":\"clear\"}\n", "no key verdikt"),
         ("json", "{\"class\":\"zone\"}\n", "no class \"zone\""),
         ("json", "{\"class\":\"zones\"\n", "no object"),
-        ("text", "8191 mm\n", "nobody checks"),
-        ("", "scanhub list\n", "nobody knows"),
+        ("text", "8191 mm\n", "no test checks"),
+        ("", "scanhub list\n", "unknown kind of block"),
     ] {
         let block =
             Block { location: "docs/planted.md:1".into(), language: language.into(), text: text.into() };
@@ -137,11 +137,11 @@ fn detects_invalid_blocks() {
 #[test]
 fn a_wrong_world_is_refused_as_the_page_says() {
     let is_it = |block: &Block| block.location.starts_with("docs/worlds.md") && block.language == "text";
-    let block = blocks().into_iter().find(is_it).expect("it is there");
+    let block = blocks().into_iter().find(is_it).expect("a block of text");
     let env = TestEnv::new();
     env.file("w.toml", "[[thing]]\nradius_m = 0.04\n");
     let mut command = env.command(&["simulate", "--world=w.toml", "--port=front"]);
-    let output = output(command.current_dir(env.path(""))).expect("it runs");
+    let output = output(command.current_dir(env.path(""))).expect("the output of the program");
     let errors = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(78), "{errors}");
     for line in block.text.lines() {

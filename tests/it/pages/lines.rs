@@ -124,9 +124,9 @@ impl ShellEnv {
         fs::copy(self.env.path("capture.bin"), here.join("capture.bin")).expect("a stream");
         if line.contains(" --key-file ") {
             let key = here.join("lan.key");
-            fs::write(&key, "5a".repeat(32)).expect("a key");
+            fs::write(&key, "5a".repeat(32)).expect("a key file");
             fs::set_permissions(key, std::os::unix::fs::PermissionsExt::from_mode(0o600))
-                .expect("it is ours");
+                .expect("permission to change the mode");
         }
         let typed = PORTS.iter().fold(line.to_owned(), |line, port| {
             let is_made = line.starts_with("scanhub simulate");

@@ -116,7 +116,7 @@ fn no_public_name_is_forbidden() {
     let output = of_output(&fs::read_to_string(page).expect("the page"));
     for (word, places) in FORBIDDEN {
         let is_used = |place: &&&str| output.iter().any(|(used, name)| used == *place && name == word);
-        assert_eq!(places.iter().find(|place| !is_used(place)), None, "{word} is not there any more");
+        assert_eq!(places.iter().find(|place| !is_used(place)), None, "{word} does not exist any more");
     }
     let (keys, flags) = (of_configuration(), of_help(&TestEnv::new()));
     for (used, name) in [(&output, "topic_seq"), (&keys, "body_mask"), (&flags, "subscribers")] {

@@ -35,7 +35,7 @@ impl Example {
             "rust" => Some(compile_rust(&source("rs", &with_main(block)), env)?),
             "c" => compile_c(&source("c", &with_main(block)), env)?,
             "cpp" => compile_cpp(&source("cpp", &with_main(block)), env)?,
-            other => return Err(format!("{}: {other} is no language of programs", block.location)),
+            other => return Err(format!("{}: {other} is not a programming language", block.location)),
         };
         let (location, text) = (block.location.clone(), block.text.clone());
         Ok(program.map(|program| Example { location, text, program, arguments: Vec::new() }))
@@ -47,7 +47,7 @@ impl Example {
         // Python warnings are errors, except the one for a hub that is still starting.
         command.args(&self.arguments).current_dir(env.path("")).env_remove("XDG_RUNTIME_DIR");
         command.env("SCANHUB_DOMAIN", env.domain().name()).env("PYTHONWARNINGS", "error,default:nothing yet");
-        command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("it has one"));
+        command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("a parent directory"));
         command.env("PYTHONUNBUFFERED", "1").env("PYTHONDONTWRITEBYTECODE", "1");
         command
     }

@@ -16,7 +16,7 @@ pub(crate) fn commands(line: &str) -> Vec<Vec<String>> {
             "|" | "&&" | ";" if !is_quoted => commands.push(Vec::new()),
             ">" | "<" if !is_quoted => is_redirected = true,
             _ if is_redirected => is_redirected = false,
-            _ => commands.last_mut().expect("there is one").push(word),
+            _ => commands.last_mut().expect("at least one command").push(word),
         }
     }
     commands

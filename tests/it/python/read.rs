@@ -54,7 +54,7 @@ macro_rules! subscribers {
             }
 
             fn take(&self, published: &mut PublishedSamples) {
-                $(while let Some(sample) = <$payload as Payload>::receive(&self.$name).expect("works") {
+                $(while let Some(sample) = <$payload as Payload>::receive(&self.$name).expect("a working subscriber") {
                     let bytes = Payload::bytes(<$payload as Payload>::read(&sample));
                     published.note(&self.sensor, <$payload as Payload>::TOPIC, sample.user_header(), bytes);
                 })*
@@ -69,8 +69,8 @@ subscribers!(
 );
 
 fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
-    let service = P::open(node, sensor).expect("a topic").expect("is there");
-    P::subscriber(node, &service).expect("a place")
+    let service = P::open(node, sensor).expect("a topic").expect("an existing topic");
+    P::subscriber(node, &service).expect("a free slot")
 }
 
 impl PublishedSamples {

@@ -235,7 +235,7 @@ impl RealSpeedEnvironment {
         if let Some(killed_at) = self.killed_at {
             std::thread::sleep(CLEANUP_INTERVAL.saturating_sub(killed_at.elapsed()));
         }
-        let hub = self.hub.take().expect("a hub lives").end(TERM);
+        let hub = self.hub.take().expect("a running hub").end(TERM);
         assert_eq!(hub.exit_code, Some(0), "{hub}");
         assert_eq!(self.env.leftover_files(), Vec::<std::path::PathBuf>::new());
         let (sent, summaries) = self.sensors.end(&self.env);

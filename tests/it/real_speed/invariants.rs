@@ -31,7 +31,7 @@ pub(super) fn all_samples_are_counted(received: &[Value], outcome: &Outcome) {
     }
     let boots: HashSet<_> = received.iter().map(|line| line["boot"].as_str()).collect();
     let runs = received.chunk_by(|one, next| one["boot"] == next["boot"]).count();
-    assert_eq!(boots.len(), runs, "a hub's life came back");
+    assert_eq!(boots.len(), runs, "a boot ID appeared again");
     assert_eq!(received.len() as u64 + number(summary, "missed"), published, "{summary}");
 }
 
@@ -49,12 +49,13 @@ pub(super) fn nothing_is_lost(received: &[Value], sent: &[Record], outcome: &Out
     let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
     let calm = &received[received.len() - FAULTLESS_TELEGRAMS..];
     let ends = [&calm[0], &calm[FAULTLESS_TELEGRAMS - 1]].map(|line| Record::hash(&bytes_of(line)));
-    let place = |hash| sent.iter().rposition(|record| record.sha256 == hash).expect("was sent");
+    let place =
+        |hash| sent.iter().rposition(|record| record.sha256 == hash).expect("a telegram that was sent");
     let [first, last] = ends.map(place);
     let intact = sent[first..=last].iter().filter(|record| record.fault.is_none()).count();
     let missed = number(summary, "missed") as usize;
     assert!(
         intact <= FAULTLESS_TELEGRAMS + missed,
-        "{intact} came whole, {FAULTLESS_TELEGRAMS} were published, {missed} missed"
+        "{intact} arrived intact, {FAULTLESS_TELEGRAMS} were published, {missed} missed"
     );
 }

@@ -43,12 +43,12 @@ impl Sensors {
             simulate_with(
                 &options,
                 &stopped,
-                |_| say_ready.send(()).expect("somebody waits"),
+                |_| say_ready.send(()).expect("a waiting test"),
                 |record| {
                     // The test drops the receiver once it has all records.
-                    let _ = record_sender.lock().expect("whole").send(record.clone());
+                    let _ = record_sender.lock().expect("an intact mutex").send(record.clone());
                 },
-                |port| event_queue.lock().expect("whole").get_mut(port)?.pop_front(),
+                |port| event_queue.lock().expect("an intact mutex").get_mut(port)?.pop_front(),
                 |_, _| {},
             )
         });
@@ -58,14 +58,15 @@ impl Sensors {
 
     /// Applies `event` to the sensor with the index `sensor`.
     pub(super) fn inject(&self, env: &TestEnv, sensor: usize, event: Event) {
-        let mut events = self.events.lock().expect("whole");
+        let mut events = self.events.lock().expect("an intact mutex");
         events.get_mut(&env.path(SENSORS[sensor])).expect("a sensor").push_back(event);
     }
 
     /// Ends the simulator. Returns what each sensor sent, in its order, and the summaries.
     pub(super) fn end(self, env: &TestEnv) -> ([Vec<Record>; 2], Vec<Summary>) {
         drop(self.stop);
-        let summaries = self.thread.join().expect("no panic").expect("ends well");
+        let summaries =
+            self.thread.join().expect("a thread that does not panic").expect("a run without an error");
         let records: Vec<Record> = self.records.into_iter().collect();
         let of = |name| {
             let port = env.path(name);

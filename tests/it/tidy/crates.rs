@@ -150,7 +150,7 @@ pub(crate) fn few_crates_can_write_the_eeprom(tree: &SourceTree) -> Vec<String> 
     let built = others.filter(|(name, _)| name != "scanhub-fuzz");
     built
         .filter(|(_, manifest)| built_dependencies(manifest).any(|name| name == "scanhub-lms-configure"))
-        .map(|(name, _)| format!("{name} is built with what writes the EEPROM"))
+        .map(|(name, _)| format!("{name} is built with the EEPROM writer"))
         .collect()
 }
 
@@ -584,7 +584,7 @@ pub(crate) fn only_the_program_sees_all(tree: &SourceTree) -> Vec<String> {
     }
     let all = tree.members().into_values().chain([tree.manifest("Cargo.toml")]);
     if all.into_iter().any(|manifest| own_dependencies(&manifest, &NORMAL).contains(WORLD)) {
-        breaches.push(format!("{WORLD} is for tests alone"));
+        breaches.push(format!("{WORLD} is only for tests"));
     }
     breaches
 }
@@ -605,7 +605,7 @@ pub(crate) fn every_crate_is_tested_from_the_top(tree: &SourceTree) -> Vec<Strin
     let apart = ["clients/bridge", "clients/python"].map(|member| expected.take(member));
     let mut breaches: Vec<String> = expected
         .difference(&list("default-members"))
-        .map(|member| format!("{member} is no default member"))
+        .map(|member| format!("{member} is not a default member"))
         .collect();
     if apart.iter().all(Option::is_some) {
         breaches.extend(missing_attributes(tree, ".ci/run", &["step cargo test --package scanhub-bridge"]));

@@ -47,7 +47,7 @@ const MAY_NAME_LMS: [&str; 4] = [
 fn hub_names_no_lms(tree: &SourceTree) -> Vec<String> {
     let others =
         hub_sources_with_lms(tree).filter(|path| !MAY_NAME_LMS.iter().any(|may| path.starts_with(may)));
-    others.map(|path| format!("{path} names the LMS: call what the drivers have for every family")).collect()
+    others.map(|path| format!("{path} names the LMS: call a function for all families")).collect()
 }
 
 /// Returns the sources of the hub that name the LMS.
@@ -68,7 +68,7 @@ fn hub_sources_with_lms(tree: &SourceTree) -> impl Iterator<Item = &str> {
 fn few_files_name_a_family(tree: &SourceTree) -> Vec<String> {
     let named = FAMILY_WORDS.iter().flat_map(|(name, words)| files_with_words(tree, name, words));
     let others = named.filter(|path| !ALLOWED_FILES.contains(path));
-    others.map(|path| format!("{path} names a family: what it needs of all belongs into a list")).collect()
+    others.map(|path| format!("{path} names a family: use a list of all families")).collect()
 }
 
 /// Returns the files that contain the name `name` of a family, or one of `words`.
@@ -114,7 +114,7 @@ fn the_hub_names_no_lms() {
     let tree = SourceTree::load();
     for may in MAY_NAME_LMS {
         let is_used = hub_sources_with_lms(&tree).any(|path| path.starts_with(may));
-        assert!(is_used, "{may} does not name the LMS: it need not be in the list");
+        assert!(is_used, "{may} does not name the LMS: remove it from the list");
     }
 }
 
@@ -139,7 +139,7 @@ fn a_family_is_a_line_in_few_files() {
     for (name, words) in FAMILY_WORDS {
         let named = files_with_words(&tree, name, words);
         for path in ALLOWED_FILES {
-            assert!(named.contains(&path), "{path} does not name {name}: it need not be in the list");
+            assert!(named.contains(&path), "{path} does not name {name}: remove it from the list");
         }
     }
 }

@@ -11,5 +11,5 @@ pub(crate) fn the_first_consumer_is_compiled(tree: &SourceTree) -> Vec<String> {
     let compiled = tree.text(example).lines().filter(|line| !line.starts_with("//!"));
     let compiled: String =
         compiled.skip_while(|line| line.is_empty()).map(|line| format!("{line}\n")).collect();
-    if shown == [compiled] { Vec::new() } else { vec![format!("{page} shows something else than {example}")] }
+    if shown == [compiled] { Vec::new() } else { vec![format!("{page} differs from {example}")] }
 }

@@ -77,7 +77,7 @@ fn a_topic_is_in_few_files() {
     let tree = SourceTree::load();
     let naming = files_with_topic(&tree);
     for path in TOPIC_FILES {
-        assert!(naming.contains(&path), "{path} does not name topic motion: it need not be in the list");
+        assert!(naming.contains(&path), "{path} does not name topic motion: remove it from the list");
     }
 }
 

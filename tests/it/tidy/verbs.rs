@@ -30,7 +30,7 @@ fn files_with_verb(tree: &SourceTree) -> Vec<&str> {
 /// Returns an error for each file that names the verb and may not.
 fn few_files_name_a_verb(tree: &SourceTree) -> Vec<String> {
     let others = files_with_verb(tree).into_iter().filter(|path| !VERB_FILES.contains(path));
-    let ask = "a verb touches no further file: its `run` takes the whole `Context`";
+    let ask = "a verb changes no other file: its `run` takes the whole `Context`";
     others.map(|path| format!("{path} names verb hz, but {ask}")).collect()
 }
 
@@ -55,7 +55,7 @@ fn a_verb_is_in_few_files() {
     let tree = SourceTree::load();
     let naming = files_with_verb(&tree);
     for path in VERB_FILES {
-        assert!(naming.contains(&path), "{path} does not name verb hz: it need not be in the list");
+        assert!(naming.contains(&path), "{path} does not name verb hz: remove it from the list");
     }
 }
 
