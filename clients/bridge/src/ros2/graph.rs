@@ -232,8 +232,8 @@ impl Graph {
         }
     }
 
-    /// Queues the reports that are due, once a second. One states whether the hub runs. The others state that the state
-    /// of a sensor without a recent status is unknown.
+    /// Queues the reports that are due, once a second: one on whether the hub runs, and one for each sensor without a
+    /// recent status, whose state is unknown.
     pub(super) fn report_silence(&mut self, is_hub_there: bool, now: WallTimestamp) {
         let now_ns = now.wall_ns;
         let missed_ns = *self.hub.missed_ns.get_or_insert(now_ns);
