@@ -62,9 +62,10 @@ impl Demo {
     ///
     /// # Errors
     ///
-    /// - [`Kind::Check`] if a telegram that a sensor sent did not arrive. - [`Kind::Interrupted`] if a bounded run was
-    /// stopped. - [`Kind::Timeout`] if a sensor does not stream within 30 seconds. - [`Kind::Failed`] if a process ends
-    /// early.
+    /// - [`Kind::Check`] if a telegram that a sensor sent did not arrive.
+    /// - [`Kind::Interrupted`] if a bounded run was stopped.
+    /// - [`Kind::Timeout`] if a sensor does not stream within 30 seconds.
+    /// - [`Kind::Failed`] if a process ends early.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let stop = context.signals.any_stop()?;
         let json = context.json;

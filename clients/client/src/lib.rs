@@ -112,7 +112,7 @@ impl<P: scanhub_shm::Payload + ?Sized> Payload for P {
 ///     let mut session = Session::new(domain_candidates(None, None)?);
 ///     let mut sources = [Source::new("front", Topic::Scan), Source::new("rear", Topic::Scan)];
 ///     loop {
-///         session.look()?;
+///         session.check_hub()?;
 ///         for source in &mut sources {
 ///             while let Some(sample) = source.receive(&mut session)? {
 ///                 println!("{} bytes", sample.bytes().len());

@@ -202,20 +202,20 @@ impl ZonesSource {
 /// # Examples
 ///
 /// ```
-/// use scanhub_client::clock::Moment;
+/// use scanhub_client::clock::Timestamp;
 /// use scanhub_client::streams::ZonesState;
 /// use scanhub_client::{Header, Robot, Verdict, Zones};
 ///
-/// let at = |ms: u64| Moment { monotonic_ns: ms * 1_000_000, boottime_ns: ms * 1_000_000 };
+/// let at = |ms: u64| Timestamp { monotonic_ns: ms * 1_000_000, boottime_ns: ms * 1_000_000 };
 /// let (mut front, mut robot) = (ZonesState::new(at(0)), Robot::default());
 /// let position = robot.expect("front");
 /// let clear = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
 /// let header = Header { stamp_last_ns: 10_000_000, period_us: 26_640, ..Header::default() };
-/// robot.hear(position, front.take(&header, &clear, 0, at(10)).zones);
+/// robot.update(position, front.take(&header, &clear, 0, at(10)).zones);
 /// assert_eq!(robot.verdict(), Verdict::Clear);
 /// // Two periods and 40 ms later.
 /// if let Some(silence) = front.silence(at(104)) {
-///     robot.hear(position, silence.zones);
+///     robot.update(position, silence.zones);
 /// }
 /// assert_eq!(robot.verdict(), Verdict::Unknown);
 /// ```
