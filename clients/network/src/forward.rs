@@ -1,5 +1,5 @@
-//! Subscribes to the sensors of a hub and passes their samples to a network: sensors as they appear, the absence of the
-//! hub, and the selection of topics.
+//! Forwarder of a hub's samples to a network. It subscribes to the selected topics of sensors as they appear, and
+//! handles the absence of the hub.
 
 mod selection;
 
@@ -49,7 +49,7 @@ pub struct Forwarder {
 }
 
 impl Forwarder {
-    /// Subscribes to the selected topics of the hub in the first live one of `places`.
+    /// Subscribes to the selected topics of the hub in the first live one of `locations`.
     pub fn new(selection: Selection, locations: &[Domain], sink: &mut impl SampleSink) -> Forwarder {
         let named = selection.named_sensors().into_iter().map(|name| {
             let publisher_kind = selection.publisher_kind(name);
@@ -74,11 +74,11 @@ impl Forwarder {
         self.required.push(sensor.to_owned());
     }
 
-    /// Passes waiting samples of all sensors to `carrier`. Returns whether there may be more.
+    /// Passes waiting samples of all sensors to `sink`. Returns whether more may wait.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind) if descriptors or memory are short.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind) if descriptors or memory are short.
     pub fn forward(&mut self, sink: &mut impl SampleSink) -> Result<bool, Failure> {
         let (mut more, mut subscribed) = (false, false);
         for sensor in &mut self.sensors {
@@ -87,12 +87,13 @@ impl Forwarder {
         Ok(more)
     }
 
-    /// Checks whether the hub has exited or started, which it reports to `tell`, and searches the sensors of a new one.
-    /// Call it after [`forward`](Forwarder::forward), because it takes longer.
+    /// Checks whether the hub has exited or started, passes that to `report`, and searches the sensors of a new
+    /// hub. Call it after [`forward`](Forwarder::forward), because it takes longer.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NoTopic`](scanhub_schema::Kind) if the first hub lacks a named sensor, and the errors of `tell`.
+    /// Returns [`Kind::NoTopic`](scanhub_schema::Kind) if the first hub lacks a named sensor, and the errors of
+    /// `report`.
     pub fn check_hub(
         &mut self,
         now: Instant,
@@ -182,7 +183,7 @@ pub fn report_notice(
 /// A subscribed sensor.
 struct Sensor {
     name: String,
-    /// Position at the carrier.
+    /// Position in the sink.
     position: usize,
     sources: Vec<Source>,
 }
@@ -206,8 +207,8 @@ impl Sensor {
         Sensor { name: name.to_owned(), position, sources }
     }
 
-    /// Passes waiting samples to `carrier`, and returns whether there may be more. Attaches at most one subscriber in
-    /// each round over all sensors, see `subscribed`, because that takes a thousand times as long as sending.
+    /// Passes waiting samples to `sink`, and returns whether more may wait. Attaches at most one subscriber in each
+    /// round over all sensors, see `subscribed`, because that takes a thousand times as long as sending.
     ///
     /// # Errors
     ///

@@ -127,14 +127,14 @@ enum Display {
     Lines,
     /// Objects, once a second.
     Json,
-    /// One line that is drawn over itself.
+    /// One line that each update overwrites.
     Terminal,
 }
 
 /// A running gateway.
 struct Gateway<'a> {
     args: &'a GatewayArgs,
-    /// Name of its key, if it has one.
+    /// Name of the gateway's key, if it has one.
     key_name: Option<String>,
     forwarder: Forwarder,
     network: Network,
@@ -385,7 +385,7 @@ impl<'a> Report<'a> {
 
     /// Draws the status line over the previous one.
     fn draw(&mut self, network: &Network, is_hub_running: bool) -> Result<(), ExitReason> {
-        // Disable wrapping, because a wrapped line could not be drawn over.
+        // Disable wrapping, because the next update could not overwrite a wrapped line.
         let mut line = [CLEAR_LINE, b"\x1b[?7l"].concat();
         write_status(&mut line, network, is_hub_running, self.sent)?;
         line.extend(b"\x1b[?7h");
@@ -446,7 +446,7 @@ fn id(network: &Network) -> String {
     format!("{:016x}", network.identity.hub)
 }
 
-/// Class `gateway`.
+/// JSON line of class `gateway`.
 #[derive(Serialize)]
 struct GatewayJson<'a> {
     class: &'static str,
@@ -460,7 +460,7 @@ struct GatewayJson<'a> {
     renumbered: bool,
 }
 
-/// Class `lan_to`.
+/// JSON line of class `lan_to`.
 #[derive(Serialize)]
 struct DestinationJson<'a> {
     class: &'static str,
@@ -472,7 +472,7 @@ struct DestinationJson<'a> {
     reported: u64,
 }
 
-/// Class `lan_link`.
+/// JSON line of class `lan_link`.
 #[derive(Serialize)]
 struct LinkJson<'a> {
     class: &'static str,

@@ -17,7 +17,7 @@ use scanhub_shm::{Directory, StateDirectory};
 pub struct GatewayIdentity {
     /// Number of the gateway.
     pub hub: u64,
-    /// Seconds since 1970 at its start, or one more than the last epoch of it.
+    /// Seconds since 1970 at the start of the run, or the epoch of the previous run plus one, if that is greater.
     pub epoch: u32,
     /// Whether the gateway has a new number, because the kept one belongs to another machine whose disk was copied.
     pub is_renumbered: bool,
@@ -83,7 +83,7 @@ impl GatewayIdentity {
             machine,
         });
         let line = stored.line();
-        // Earlier versions let others read it.
+        // Earlier versions let other users read the file.
         file.set_permissions(Permissions::from_mode(0o600))?;
         file.write_all_at(line.as_bytes(), 0)?;
         file.set_len(line.len() as u64)?;
@@ -133,13 +133,13 @@ fn directory() -> Result<PathBuf, Failure> {
 /// Maximum number of gateways of one domain on one interface. More are started by mistake.
 const MAX_GATEWAYS: u32 = 16;
 
-/// Begins a run of the gateway of `domain` on this machine, now. `way` is its interface, or another word for its
-/// destination.
+/// Begins a run of the gateway of `domain` on this machine, now. `destination` is its interface, or another word for
+/// its destination.
 ///
 /// # Errors
 ///
-/// Returns the same errors as `GatewayIdentity::begin`, and [`Kind::Configuration`] if the environment names no directory for its
-/// number.
+/// Returns the same errors as `GatewayIdentity::begin`, and [`Kind::Configuration`] if the environment names no
+/// directory for its number.
 pub fn begin_run(domain: &str, destination: &str) -> Result<GatewayIdentity, Failure> {
     let now_s = clock::wall_ns() / 1_000_000_000;
     GatewayIdentity::begin(&directory()?, domain, destination, now_s, machine(Path::new(MACHINE_ID)))

@@ -72,8 +72,8 @@ pub(crate) fn by_name(name: &str) -> Result<Interface, Failure> {
 /// Returns whether a sender with `address` is on this machine. `false` if the system cannot list its addresses.
 pub(crate) fn is_of_this_machine(address: IpAddr) -> bool {
     let has_address = |entry: &InterfaceAddress| ipv4(entry).is_some_and(|own| own == address);
-    // A datagram to a group has no source address if it is sent by loopback on a machine without another address. None
-    // with such an address arrives from outside.
+    // A datagram to a group has the source address 0.0.0.0 if it is sent by loopback on a machine without another
+    // address. No datagram with this address arrives from outside.
     address.is_loopback()
         || address.is_unspecified()
         || getifaddrs().is_ok_and(|mut all| all.any(|entry| has_address(&entry)))

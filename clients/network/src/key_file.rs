@@ -60,7 +60,7 @@ fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> 
     }
     let text: String = bytes.iter().map(|byte| format!("{byte:02x}")).chain(["\n".into()]).collect();
     let target = Target::open(path)?;
-    // No option replaces a key: other machines may have it.
+    // No option replaces a key, because other machines may use it.
     if target.check(true)?.is_some() {
         return Err(Failure::new(Kind::Output, format!("{} exists", path.display()), KEY_EXISTS));
     }

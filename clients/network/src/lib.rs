@@ -1,5 +1,5 @@
-//! Sends the topics of a hub to other machines and publishes the topics of other machines in this one: the verbs
-//! `gateway`, `listen` and `key`, and the parts of them that the bridge uses too.
+//! Transfer of topics between machines over UDP: the verbs `gateway`, `listen` and `key`, and the parts of them that
+//! the bridge uses too.
 #![forbid(unsafe_code)]
 
 use scanhub_client::clock;

@@ -90,7 +90,7 @@ pub struct RemoteReceiver<'a> {
     pub last_sample: Instant,
     /// Datagrams that arrived under a name that is not their own.
     pub foreign: u64,
-    /// Buffer for samples that come in parts.
+    /// Buffer for samples that are sent in parts.
     reassembled: Vec<u8>,
     /// Error of reading the kept epochs, until it is reported.
     unreadable: Option<Failure>,
@@ -118,7 +118,7 @@ impl<'a> RemoteReceiver<'a> {
     ///
     /// Returns [`Kind::Configuration`](scanhub_schema::Kind) if a name or hub is not valid or the memory is too small
     /// for a sensor, [`Kind::DomainHeld`](scanhub_schema::Kind) if another listener publishes in the domain, and
-    /// [`Kind::Short`](scanhub_schema::Kind) if memory is short.
+    /// [`Kind::ResourceExhausted`](scanhub_schema::Kind) if memory is short.
     pub fn open(
         config: ReceiverConfig<'_>,
         json: bool,
@@ -251,7 +251,7 @@ impl<'a> RemoteReceiver<'a> {
     /// Handles the result of receiving a datagram.
     fn handle(&mut self, arrived: ReceiveOutcome<'_>, from: Option<IpAddr>) -> Result<(), ExitReason> {
         if let (Some(head), Some(publication)) = (arrived.begins(), &mut self.publication) {
-            // A run of the same epoch that was active until now was another gateway's.
+            // A run of the same epoch that was active until now belongs to another gateway.
             publication.on_run_started(head, now());
         }
         match arrived {
@@ -366,8 +366,8 @@ struct Evictions {
     samples: u64,
 }
 
-/// Reports at the first eviction, and then from time to time, how many there were. Someone may cause them a thousand
-/// times a second.
+/// Reporter of the number of evictions: at the first one, and then from time to time. A sender may cause a thousand
+/// evictions per second.
 #[derive(Default)]
 struct CapacityReporter {
     reported: Evictions,

@@ -70,7 +70,7 @@ fn zones() -> Vec<u8> {
     buffer[..len].to_vec()
 }
 
-/// An announcement of three topics that is sent at `at_s`.
+/// Returns an announcement that is sent at `at_s`.
 fn announcement(epoch: u32, sequence: u32, at_s: u64, next: [u32; 3]) -> Vec<u8> {
     announcement_of(epoch, sequence, at_s, ANNOUNCED.into_iter().zip(next))
 }
@@ -223,7 +223,7 @@ fn vector_list() -> String {
     )
 }
 
-/// Returns the golden datagram `name`, which has no MAC.
+/// Returns the payload of the golden scan.
 fn golden_datagram(name: &str) -> Vec<u8> {
     let list: Value =
         serde_json::from_str(include_str!("../../../tests/vectors/datagram.json")).expect("JSON");

@@ -1,5 +1,5 @@
-//! A host that gets copies, and the address that its name has now. The name is resolved again in the background,
-//! because that may take half a minute.
+//! Host that gets copies, and the current address of its name. The name is resolved again in the background, because
+//! that may take half a minute.
 
 use std::io;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs};

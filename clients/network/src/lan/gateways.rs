@@ -43,7 +43,7 @@ pub struct GatewayTable {
     joined_topics: u64,
     /// Whether the receiver has a key, so that only samples of announced topics are accepted.
     is_keyed: bool,
-    /// By number.
+    /// Gateways by number.
     gateways: BTreeMap<u64, Gateway>,
     run_count: usize,
     row_count: usize,
@@ -736,7 +736,7 @@ mod tests {
         table.since_ns(hub, epoch).is_some()
     }
 
-    /// 64 gateways that are known to deliver.
+    /// Returns a table with 64 gateways that are known to deliver.
     fn full() -> GatewayTable {
         let mut table = GatewayTable::new(&Topic::ALL);
         for (number, now_ms) in [(0, 0), (1, 1000)] {

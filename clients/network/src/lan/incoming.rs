@@ -1,4 +1,4 @@
-//! The receiving end of a network: each datagram is refused, recorded in the table of gateways, or becomes a new sample
+//! Receiving end of a network: it refuses each datagram, records it in the table of gateways, or returns a new sample
 //! with everything that is known about its sender.
 //!
 //! With a key, only datagrams that are authenticated with it are accepted. A recording of such datagrams is refused

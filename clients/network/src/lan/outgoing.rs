@@ -1,5 +1,5 @@
-//! The sending end of a network: turns samples of a hub's sensors into whole datagrams, with announcements, thinned and
-//! numbered.
+//! Sending end of a network: it converts samples of a hub's sensors to complete datagrams, thinned and numbered, and
+//! announces the sensors.
 //!
 //! A sample is an argument, and so is the time. Datagrams go to a [`Transmit`] at once, or wait until
 //! [`Outgoing::take_next`] takes them.
@@ -72,8 +72,8 @@ impl Outgoing {
     }
 
     /// Creates the end of gateway `hub` in its run `epoch` for a connection that is slow at times: the newest sample of
-    /// each sensor and topic waits until [`take_next`](Outgoing::take_next) takes it. A sample is one datagram, however long it
-    /// is.
+    /// each sensor and topic waits until [`take_next`](Outgoing::take_next) takes it. A sample is one datagram, however
+    /// long it is.
     pub fn with_queue(hub: u64, epoch: u32) -> Outgoing {
         Outgoing { writer: DatagramWriter::with_queue(hub, epoch), sensors: Vec::new() }
     }
@@ -125,26 +125,26 @@ impl Outgoing {
         self.writer.is_waiting()
     }
 
-    /// Counts the last sample that [`take_next`](Outgoing::take_next) returned for this sensor and topic, of `bytes` bytes, as
-    /// failed. Its number stays in use.
+    /// Counts the last sample that [`take_next`](Outgoing::take_next) returned for this sensor and topic, of `bytes`
+    /// bytes, as failed. Its number stays in use.
     pub fn mark_failed(&mut self, sensor: u8, topic: Option<Topic>, bytes: usize) {
         self.writer.mark_failed(sensor, topic, bytes);
     }
 
     /// Returns the announcement (no topic), the status or the background of the sensor called `name` that
-    /// [`take_next`](Outgoing::take_next) returned last, for a receiver that queries it at `now`. It has the number that it had
-    /// before, so that receivers count it once.
+    /// [`take_next`](Outgoing::take_next) returned last, for a receiver that queries it at `now`. It has the number
+    /// that it had before, so that receivers count it once.
     pub fn resend_last(&mut self, name: &str, topic: Option<Topic>, now: WallTimestamp) -> Option<&[u8]> {
         self.writer.resend_last(name, topic, now)
     }
 
-    /// Returns the sensors and topics (`None`: announcements) for which [`again`](Outgoing::resend_last) has a sample. The
-    /// announcement of a sensor comes before its samples.
+    /// Returns the sensors and topics (`None`: announcements) for which [`resend_last`](Outgoing::resend_last) has a
+    /// sample. The announcement of a sensor comes before its samples.
     pub fn stored_samples(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
         self.writer.stored_samples()
     }
 
-    /// Drops the samples that [`again`](Outgoing::resend_last) returns.
+    /// Drops the samples that [`resend_last`](Outgoing::resend_last) returns.
     pub fn drop_kept(&mut self) {
         self.writer.drop_kept();
     }

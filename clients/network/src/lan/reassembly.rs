@@ -1,5 +1,5 @@
-//! Reassembles samples that are sent in parts. Parts may arrive in any order, twice, or not at all. Memory is bounded,
-//! no matter who sends what.
+//! Reassembly of samples that are sent in parts. Parts may arrive in any order, twice, or not at all. Memory is
+//! bounded, whatever anyone sends.
 
 use scanhub_schema::datagram::{Datagram, Head, MAX_PART_LEN};
 

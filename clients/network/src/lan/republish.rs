@@ -42,7 +42,7 @@ pub struct DroppedSamples {
     pub unannounced: u64,
     /// A newer sample was published before.
     pub late: u64,
-    /// There are 16 other sensors, the maximum.
+    /// The maximum of 16 sensors is reached.
     pub capacity: u64,
     /// There was no memory or no descriptor for the topic.
     pub shortage: u64,
@@ -102,8 +102,8 @@ impl<S: TopicStore> Republisher<S> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short. Other sensors are not
-    /// affected.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind) if memory or descriptors are short. Other sensors are
+    /// not affected.
     pub fn on_announcement(
         &mut self,
         announcement: &Announcement,
@@ -118,13 +118,13 @@ impl<S: TopicStore> Republisher<S> {
         made
     }
 
-    /// Publishes `sample`, or counts it in [`dropped`](Self::dropped). Creates its topics as
-    /// [`announced`](Self::on_announcement) does if its gateway is known to deliver since this sample. If there is no room
-    /// for its sensor, another one may be evicted.
+    /// Publishes `sample`, or counts it in [`left_out`](Self::left_out). Creates its topics as
+    /// [`on_announcement`](Self::on_announcement) does if its gateway is known to deliver since this sample. If there
+    /// is no room for its sensor, another one may be evicted.
     ///
     /// # Errors
     ///
-    /// Returns the same errors as [`announced`](Self::on_announcement).
+    /// Returns the same errors as [`on_announcement`](Self::on_announcement).
     pub fn sample(
         &mut self,
         sample: &RemoteSample<'_>,
@@ -322,7 +322,7 @@ pub trait TopicStore {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind) if there is not.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind) if there is not.
     fn check_room(&self, topics: &[Topic]) -> Result<(), Failure>;
 
     /// Returns whether the memory that remote sensors may use has room for `topics` of one more sensor.
@@ -335,7 +335,8 @@ pub trait TopicStore {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short, or another error of the store.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind) if memory or descriptors are short, or another error
+    /// of the store.
     fn sensor(&self, name: &str) -> Result<Self::Sensor, Failure>;
 
     /// Cleans up after dead subscribers.
@@ -348,7 +349,8 @@ pub trait SensorTopics {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short, or another error of the store.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind) if memory or descriptors are short, or another error
+    /// of the store.
     fn add(&mut self, topic: Topic) -> Result<(), Failure>;
 
     /// Removes `topic`.
@@ -485,7 +487,7 @@ mod tests {
 
     use super::*;
 
-    /// A store with places for a number of sensors.
+    /// Store with room for a number of sensors.
     #[derive(Clone)]
     struct TestStore {
         free: Rc<Cell<usize>>,
@@ -493,7 +495,7 @@ mod tests {
         sent: Rc<Cell<usize>>,
     }
 
-    /// A sensor in a place, which is free again when this is dropped.
+    /// Sensor in the store, whose room is free again when this is dropped.
     struct TestSensor(TestStore);
 
     impl TopicStore for TestStore {

@@ -1,5 +1,5 @@
-//! Detects two gateways that send under one number, for example because one machine was made from a copy of the other's
-//! disk. Their samples must not become one stream.
+//! Detection of two gateways that send under one number, for example because the disk of one machine is a copy of the
+//! other's. Their samples must not become one stream.
 //!
 //! Gateways with the same epoch are distinguished by their senders and by the run of the hub (`boot`) that they
 //! announce. A sender is any number that differs between two of them. If the epochs differ, the gateway with the lower

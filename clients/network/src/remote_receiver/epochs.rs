@@ -1,5 +1,5 @@
-//! Keeps the highest epochs of the gateways that have the key in a file, so that datagrams of an older run are refused
-//! even after a restart of the listener.
+//! File with the highest epochs of the gateways that have the key. With it, datagrams of an older run are refused even
+//! after a restart of the listener.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;

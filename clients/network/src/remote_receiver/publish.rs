@@ -1,4 +1,4 @@
-//! Publishes remote sensors in the shared memory of a domain, within a budget of memory.
+//! Publication of remote sensors in the shared memory of a domain, within a budget of memory.
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -33,9 +33,9 @@ pub(super) struct SharedTopics {
     limits: TopicLimits,
     /// Number of times that the limits were raised.
     widen_count: u32,
-    /// Samples without memory of topics that were created again or no longer exist.
+    /// Number of samples without memory of topics that were created again or no longer exist.
     failed: u64,
-    // After the topics, because it wakes their subscribers.
+    // This field is after the topics, because it wakes their subscribers.
     sensor: SensorPublisher,
     budget: Rc<Budget>,
     /// Memory of the doorbell and the event.
@@ -46,7 +46,7 @@ pub(super) struct SharedTopics {
 struct CreatedTopic {
     publisher: AnyPublisher,
     limits: TopicLimits,
-    // After the publisher, whose memory it counts.
+    // This field is after the publisher, whose memory it counts, so that it is dropped later.
     share: Share,
 }
 
@@ -58,8 +58,8 @@ const MAX_EXACT_WIDENINGS: u32 = 4;
 /// together.
 ///
 /// Returns [`Kind::Configuration`] if `memory` is too small for a sensor, and [`Kind::DomainHeld`] if another listener
-/// has the lock. Returns [`Kind::Short`] if there is no memory for even one sensor, and [`Kind::Failed`] if shared
-/// memory refuses.
+/// has the lock. Returns [`Kind::ResourceExhausted`] if there is no memory for even one sensor, and [`Kind::Failed`] if
+/// shared memory refuses.
 pub(super) fn open(domain: &Domain, limits: TopicLimits, memory: u64) -> Result<Publication, Failure> {
     // With a lower limit, fewer subscribers can attach.
     let _ = raise_descriptor_limit();

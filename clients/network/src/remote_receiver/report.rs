@@ -337,7 +337,7 @@ fn topic(row: &StreamCounters) -> &'static str {
     }
 }
 
-/// Class `notice`.
+/// JSON line of class `notice`.
 #[derive(Serialize)]
 struct NoticeJson<'a> {
     class: &'static str,
@@ -377,7 +377,7 @@ impl NoticeJson<'_> {
     }
 }
 
-/// Class `ready`. Only a receiver that publishes has `domain`, `root` and `pid`.
+/// JSON line of class `ready`. Only a receiver that publishes has `domain`, `root` and `pid`.
 #[derive(Serialize)]
 struct ReadyJson<'a> {
     class: &'static str,

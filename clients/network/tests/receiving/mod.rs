@@ -92,7 +92,7 @@ impl ReceivingMachine {
         silence_at.min(self.next_check_at.max(self.stalled_until))
     }
 
-    /// Handles waiting datagrams, and calls `seen` with each event.
+    /// Handles waiting datagrams, and calls `on_event` with each event.
     pub(crate) fn step(&mut self, now: Nanos, hub: &str, mut on_event: impl FnMut(TestEvent<'_>)) {
         if now >= self.stalled_until {
             let wall = self.stamp(now);

@@ -121,7 +121,8 @@ impl Transmit for Uplink<'_> {
 }
 
 impl SendingMachine {
-    /// Creates a machine that sends every `every`th sample of zones, in datagrams of at most `longest` bytes.
+    /// Creates a machine that sends one of every `send_interval` samples of zones, in datagrams of at most
+    /// `max_datagram_len` bytes.
     pub(crate) fn new(
         seed: u64,
         faults: MachineFaults,
@@ -250,7 +251,7 @@ impl SendingMachine {
         }
     }
 
-    /// Publishes what is due of a sensor.
+    /// Publishes the samples of a sensor that are due.
     fn publish_due(&mut self, position: usize, now: Nanos, network: &mut Network) {
         let SimulatedSensor { scan_at, unknown_at, status_at, .. } = self.sensors[position];
         if now >= scan_at {
