@@ -64,7 +64,7 @@ impl<T: Subscribe + ?Sized> SubscriberBuilder<T> {
         SubscriberBuilder { domain: Some(name.into()), ..self }
     }
 
-    /// Sets the directory of the hub, as its option `--root`. Default: each directory that a hub may have chosen.
+    /// Sets the directory of the hub, as its option `--root` does. Default: each directory that a hub may have chosen.
     pub fn root(self, directory: impl Into<PathBuf>) -> Self {
         SubscriberBuilder { root: Some(directory.into()), ..self }
     }
@@ -89,8 +89,8 @@ impl<T: Subscribe + ?Sized> SubscriberBuilder<T> {
         Ok(Subscriber::new(self.session()?, T::source(&self), self.timeout))
     }
 
-    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
-    /// [`wait`](Self::wait) says.
+    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, even if
+    /// [`wait`](Self::wait) sets another method.
     ///
     /// # Errors
     ///
@@ -139,8 +139,8 @@ impl SubscriberBuilder<Robot> {
     }
 }
 
-/// Returns the places where the hub of the domain `name` may run: below `root`, or in each directory that a hub may have
-/// chosen. Without a name, the domain is the one that SCANHUB_DOMAIN names, otherwise `scanhub`.
+/// Returns the locations where the hub of the domain `name` may run: below `root`, or in each directory that a hub may
+/// have chosen. Without a name, the domain is the one that SCANHUB_DOMAIN names, otherwise `scanhub`.
 ///
 /// # Errors
 ///

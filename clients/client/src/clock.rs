@@ -1,17 +1,17 @@
-//! The clocks that the client library uses.
+//! Clocks that the client library uses.
 
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
-/// One moment on two clocks, in ns.
+/// Point in time on two clocks, in ns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Timestamp {
-    /// CLOCK_MONOTONIC, the clock of all stamps; it stops while the machine is suspended.
+    /// CLOCK_MONOTONIC, the clock of all stamps. It stops while the machine is suspended.
     pub monotonic_ns: u64,
-    /// CLOCK_BOOTTIME: the same, but it continues then.
+    /// CLOCK_BOOTTIME, which continues while the machine is suspended.
     pub boottime_ns: u64,
 }
 
-/// Returns this moment.
+/// Returns the current time on both clocks.
 pub fn now() -> Timestamp {
     Timestamp { monotonic_ns: read(ClockId::Monotonic), boottime_ns: read(ClockId::Boottime) }
 }

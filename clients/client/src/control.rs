@@ -1,4 +1,4 @@
-//! A request to the hub: sends it, and waits until the link has accepted it.
+//! Requests to the hub. The library sends a request, and waits until the link has handled it.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
@@ -11,7 +11,7 @@ use scanhub_shm::{Domain, hub_pid};
 use crate::error::Error;
 use crate::hub_finder::{STARTUP_GRACE, find};
 
-/// Sends `request` to the hub at the first of `places` where one runs, and returns its answer.
+/// Sends `request` to the hub at the first of `locations` where one runs, and returns its reply.
 ///
 /// # Examples
 ///
@@ -30,11 +30,11 @@ use crate::hub_finder::{STARTUP_GRACE, find};
 ///
 /// # Errors
 ///
-/// - [`ErrorKind::NoHub`](crate::ErrorKind) within a second if no hub runs, or if it ends before it answers.
+/// - [`ErrorKind::NoHub`](crate::ErrorKind) within a second if no hub runs, or if it ends before it replies.
 /// - [`ErrorKind::NoTopic`](crate::ErrorKind) with the sensors that exist.
 /// - [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there are too many requests at a time.
-/// - [`ErrorKind::Failed`](crate::ErrorKind) if the link cannot do it.
-/// - [`ErrorKind::Timeout`](crate::ErrorKind) if the hub does not answer, because it lacks memory or descriptors, or
+/// - [`ErrorKind::Failed`](crate::ErrorKind) if the link cannot execute the request.
+/// - [`ErrorKind::Timeout`](crate::ErrorKind) if the hub does not reply, because it lacks memory or descriptors, or
 ///   because the link is busy.
 /// - [`ErrorKind::Interrupted`](crate::ErrorKind) if `stop` is set.
 pub fn request(
@@ -47,7 +47,7 @@ pub fn request(
     send_request(&open(&node)?, &domain, request, stop)
 }
 
-/// The control service; waits for the service of a hub that is just starting.
+/// Opens the control service. Waits for the service of a hub that is just starting.
 fn open(node: &Node) -> Result<ControlClient, Error> {
     let deadline = Instant::now() + STARTUP_GRACE;
     loop {
@@ -71,7 +71,7 @@ fn send_request(
     let deadline = Instant::now() + RESPONSE_TIMEOUT;
     loop {
         scanhub_shm::take_wakeups(&[client.responses()])?;
-        // In this order, because a hub may exit just after its answer.
+        // Check the hub before its reply, because a hub may exit just after it has replied.
         let is_hub_running = pending.is_open() && hub_pid(domain.root())?.is_some();
         if let Some(response) = pending.try_receive()? {
             return Ok(response.0?);
@@ -96,7 +96,7 @@ fn send_request(
     }
 }
 
-/// Time limit of an answer. A link takes a request within milliseconds; one that opens its port may need longer.
+/// Timeout for the reply. A link handles a request within milliseconds, but needs longer while it opens its port.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Interval of the checks for the hub and for the request to stop.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);

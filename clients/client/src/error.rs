@@ -49,7 +49,7 @@ pub enum ErrorKind {
     DomainHeld,
     /// Another process publishes under the name.
     NameHeld,
-    /// Memory, descriptors or places for subscribers have run out; a later attempt may succeed.
+    /// Memory, descriptors or slots for subscribers have run out; a later attempt may succeed.
     ResourceExhausted,
     /// The program holds four samples of one subscriber.
     TooManyHeld,
@@ -106,7 +106,7 @@ impl Error {
         }
     }
 
-    /// Returns what the user can do about it, with control characters replaced. Empty if nothing is known to help.
+    /// Returns the remedy for the user, with control characters replaced. Empty if no remedy is known.
     pub fn remedy(&self) -> String {
         match self {
             Error::TooManyHeld => TOO_MANY_HELD.1.to_owned(),
@@ -152,7 +152,7 @@ impl From<Failure> for Error {
     }
 }
 
-/// For programs that end with the exit codes of `scanhub`.
+/// Conversion for programs that end with the exit codes of `scanhub`.
 impl From<Error> for Failure {
     fn from(error: Error) -> Failure {
         match error {

@@ -1,5 +1,5 @@
-//! Detects whether a hub or a listener runs in a domain, in which of its places, and which sensors and topics exist
-//! there. It queries the locks of the places.
+//! Detection of a hub or listener in a domain: at which of the domain's locations it runs, and which sensors and topics
+//! exist there. The locks at the locations are queried.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -19,10 +19,10 @@ const MAX_HUBS: usize = 3;
 /// Remedy for a user who needs the data of another user's hub.
 const SHARING_REMEDY: &str = "to have its data under this user: docs/sharing.md";
 
-/// Interval of the queries of the locks while the hub rings bells.
+/// Interval of the queries of the locks while the hub rings doorbells.
 const ACTIVE_POLL_INTERVAL: Duration = Duration::from_secs(1);
 
-/// The hub or listener of a domain, as its lock shows.
+/// Hub or listener of a domain, as its lock shows.
 pub(crate) struct HubFinder {
     locations: Vec<Domain>,
     hub: Option<HolderProcess>,
@@ -49,7 +49,7 @@ struct HolderProcess {
     kind: DomainHolder,
 }
 
-/// Change since the last look. If both are set, one publisher has replaced another one.
+/// Change since the last check. If both are set, one publisher has replaced another one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Change {
     /// The publisher that has ended.
@@ -59,8 +59,8 @@ pub struct Change {
 }
 
 impl Change {
-    /// Compares two results. A listener that runs together with a hub does not count as new when the hub ends, or as
-    /// gone when a hub starts.
+    /// Compares two results. A listener that runs together with a hub does not count as started when the hub ends, or
+    /// as ended when a hub starts.
     fn between(before: Option<&HolderProcess>, now: Option<&HolderProcess>) -> Change {
         let kind = |holder: Option<&HolderProcess>| holder.map(|holder| holder.kind);
         let is_same_domain = before.zip(now).is_some_and(|(a, b)| a.domain == b.domain && a.kind != b.kind);
@@ -73,18 +73,18 @@ impl Change {
 }
 
 impl HubFinder {
-    /// Watches for a hub at `locations`; uses the first place where one runs.
+    /// Creates the finder of a hub at `locations`. It uses the first location where one runs.
     pub(crate) fn new(locations: Vec<Domain>) -> HubFinder {
         HubFinder { locations, hub: None, checked_at: None, queried_at: None, rang_at: None, denied: None }
     }
 
-    /// Notes that the hub has just rung a bell.
+    /// Notes that the hub has just rung a doorbell.
     pub(crate) fn note_ring(&mut self) {
         self.rang_at = Some(Instant::now());
     }
 
     /// Checks for a hub, if the last check is long enough ago. The locks are queried less often while the hub rings
-    /// bells.
+    /// doorbells.
     pub(crate) fn check(&mut self) -> Change {
         let now = Instant::now();
         let is_within = |at: Option<Instant>, limit| at.is_some_and(|at| now - at < limit);
@@ -94,7 +94,7 @@ impl HubFinder {
         self.checked_at = Some(now);
         let is_ringing =
             is_within(self.rang_at, LOCK_POLL_INTERVAL) && is_within(self.queried_at, ACTIVE_POLL_INTERVAL);
-        // A hub that rings a bell but was not known has started, so the locks are queried.
+        // If an unknown hub rings a doorbell, it has just started, so query the locks.
         if is_ringing && self.hub.is_some() {
             return Change::default();
         }
@@ -102,7 +102,7 @@ impl HubFinder {
         self.denied = None;
         let found = self.find_live();
         if found.is_none() && self.shortage().is_some() {
-            // The look failed for lack of a descriptor, so the hub may still run.
+            // The check failed for lack of a descriptor, so the hub may still run.
             return Change::default();
         }
         let change = Change::between(self.hub.as_ref(), found.as_ref());
@@ -110,12 +110,12 @@ impl HubFinder {
         change
     }
 
-    /// Lets the next call of [`look`](Self::look) query the locks, because something has changed.
+    /// Makes the next call of [`check`](Self::check) query the locks, because something has changed.
     pub(crate) fn expire(&mut self) {
         (self.checked_at, self.queried_at) = (None, None);
     }
 
-    /// Returns the places where a hub may run.
+    /// Returns the locations where a hub may run.
     pub(crate) fn locations(&self) -> &[Domain] {
         &self.locations
     }
@@ -158,7 +158,7 @@ impl HubFinder {
         if is_of_other { error.with_kind(ErrorKind::OtherUser) } else { error }
     }
 
-    /// Returns why there is no hub, for a subscriber that waits for one. It reads /proc: a few milliseconds.
+    /// Returns why there is no hub, for a subscriber that waits for one. Reads /proc, which takes a few milliseconds.
     pub(crate) fn silence_reason(&self) -> Silence {
         let hubs = RunningHub::all(Path::new("/"));
         let (uid, name) = (Environment::of_process().uid, self.locations.first().map(Domain::name));
@@ -195,7 +195,7 @@ impl HubFinder {
                 Ok((Some(pid), who)) => {
                     return Some(HolderProcess { domain: location.clone(), pid, kind: who });
                 }
-                // A shortage is kept, because the other places fail for it, too.
+                // Keep a shortage, because the other locations fail for the same reason.
                 Err(failure) if self.shortage().is_none() => self.denied = Some(failure),
                 Err(_) => {}
             }
@@ -204,8 +204,8 @@ impl HubFinder {
     }
 }
 
-/// Returns the failure for a domain without a hub at `locations`. `denied` is the failure to open one of them, `hubs` are
-/// the hubs of this machine, and `caller` is the environment of this process.
+/// Returns the failure for a domain without a hub at `locations`. `denied` is the failure to open one of them, `hubs`
+/// are the hubs of this machine, and `caller` is the environment of this process.
 fn no_hub(
     locations: &[Domain],
     denied: Option<&Failure>,

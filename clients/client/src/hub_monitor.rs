@@ -1,7 +1,8 @@
-//! Makes a descriptor readable when a hub starts or ends, so that a program that polls it needs no timer.
+//! Monitor that makes a descriptor readable when a hub starts or ends, so that a program that polls it needs no timer.
 //!
-//! Without a hub, inotify reports changes in the directories in which a hub creates its files. A directory that does
-//! not exist yet is watched for in the nearest one that exists. With a hub, a pidfd reports the end of its process.
+//! Without a hub, inotify reports changes in the directories in which a hub creates its files. For a directory that
+//! does not exist yet, the nearest one above it that exists is watched. With a hub, a pidfd reports the end of its
+//! process.
 
 use std::ffi::{OsStr, OsString};
 use std::mem::MaybeUninit;
@@ -21,20 +22,21 @@ use scanhub_shm::Domain;
 /// Monitor of the hub of a domain. Its descriptors are part of an epoll.
 pub(crate) struct HubMonitor {
     epoll: Arc<OwnedFd>,
-    /// The directories, while no hub runs. A user can have only about a hundred of these.
+    /// Directories, while no hub runs. Each monitor needs an inotify instance, and a user can have only about a
+    /// hundred.
     directories: Option<Directories>,
     /// The hub's process ID, and its pidfd until it has ended.
     hub: Option<(u32, Option<OwnedFd>)>,
 }
 
-/// Pause after a change that is not of a hub. In a directory such as /tmp, others can create files all the time.
+/// Pause after a change that does not concern a hub. In a directory such as /tmp, others can create files all the time.
 const UNRELATED_CHANGE_PAUSE: Duration = Duration::from_secs(2);
 
-/// Interval of the looks for a hub if the directories cannot be watched.
+/// Interval of the checks for a hub if the directories cannot be watched.
 const UNWATCHED_INTERVAL: Duration = Duration::from_secs(2);
 
-/// Interval of the looks for a hub if all directories are watched. The kernel does not report the removal of a directory
-/// while any process has a file of it open.
+/// Interval of the checks for a hub if all directories are watched. The kernel does not report the removal of a
+/// directory while any process has a file in it open.
 const RECHECK_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Files of a domain's directory that a hub or listener writes when it starts.
@@ -49,7 +51,7 @@ impl HubMonitor {
     pub(crate) fn watch_hub(&mut self, pid: u32) -> bool {
         self.directories = None;
         if self.hub.as_ref().is_none_or(|(known, _)| *known != pid) {
-            // Without a pidfd, the timer looks for the hub.
+            // Without a pidfd, the caller checks for the hub after the interval.
             let process = i32::try_from(pid).ok().and_then(Pid::from_raw);
             let opened = process.and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
             self.hub = Some((pid, opened.filter(|pidfd| add(&self.epoll, pidfd).is_ok())));
@@ -62,8 +64,8 @@ impl HubMonitor {
         has_ended
     }
 
-    /// Watches the directories in which a hub would appear at `places`. Returns whether something has changed since the
-    /// last call, so that the caller must look for a hub.
+    /// Watches the directories in which a hub would appear at `locations`. Returns whether something has changed since
+    /// the last call, so that the caller must check for a hub.
     pub(crate) fn watch_directories(&mut self, locations: &[Domain]) -> bool {
         self.hub = None;
         let (directories, is_new) = match &mut self.directories {
@@ -79,11 +81,12 @@ impl HubMonitor {
         } else {
             directories.resume(&self.epoll);
         }
-        // In this order: a directory that was created after the first look is watched, or found by the next one.
+        // Read the changes before watching: a directory that is created in between is then either watched now, or found
+        // by the next call.
         directories.watch(locations) || is_new || change == Change::Related
     }
 
-    /// Returns the time after which the caller must look for a hub although nothing has changed.
+    /// Returns the time after which the caller must check for a hub although nothing has changed.
     pub(crate) fn interval(&self) -> Duration {
         match &self.directories {
             Some(Directories { paused_until: Some(until), .. }) => {
@@ -104,13 +107,13 @@ struct Directories {
     paused_until: Option<Instant>,
 }
 
-/// A directory to watch, with its number if it is watched.
+/// Directory to watch, with its inotify number if it is watched.
 struct WatchedDirectory {
     target: Target,
     number: Option<i32>,
 }
 
-/// A directory, and the entry in it that leads to a domain; `None` for the domain's directory itself.
+/// Directory, with the entry in it that leads to a domain; `None` for the domain's directory itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Target {
     directory: PathBuf,
@@ -137,7 +140,7 @@ impl Directories {
         Ok(Directories { inotify, watches: Vec::new(), is_complete: true, paused_until: None })
     }
 
-    /// Watches for `places`. Returns whether the directories have changed since the last call.
+    /// Watches the directories of `locations`. Returns whether these directories have changed since the last call.
     fn watch(&mut self, locations: &[Domain]) -> bool {
         let targets: Vec<Target> = locations.iter().map(|location| Target::of(location.root())).collect();
         if self.watches.iter().map(|watch| &watch.target).eq(&targets) {
@@ -148,12 +151,12 @@ impl Directories {
         for mut target in targets {
             let number = match inotify::add_watch(&self.inotify, &target.directory, target.flags()) {
                 Ok(number) => Some(number),
-                // It was removed. The next one can have the same inode.
+                // The directory was removed. The next one can have the same inode.
                 Err(Errno::NOENT | Errno::NOTDIR) => {
                     target.inode = None;
                     None
                 }
-                // It belongs to another user, who then has its hub.
+                // The directory belongs to another user, so only that user can run a hub there.
                 Err(Errno::ACCESS) => None,
                 Err(_) => {
                     self.is_complete = false;
@@ -197,7 +200,7 @@ impl Directories {
         change
     }
 
-    /// Stops watching for a moment, unless it has done so.
+    /// Pauses watching for a moment, unless it is already paused.
     fn pause(&mut self, epoll: &OwnedFd) {
         if self.paused_until.is_none_or(|until| until <= Instant::now()) {
             let nothing = epoll::EventFlags::empty();
@@ -206,7 +209,7 @@ impl Directories {
         }
     }
 
-    /// Watches again after a pause.
+    /// Resumes watching after a pause.
     fn resume(&mut self, epoll: &OwnedFd) {
         if self.paused_until.is_some_and(|until| until <= Instant::now()) {
             let input = epoll::EventFlags::IN;
@@ -268,7 +271,7 @@ mod tests {
 
     use super::*;
 
-    /// Far longer than anything takes on a busy machine.
+    /// Timeout that is far longer than any step on a busy machine.
     const TEST_TIMEOUT: Timespec = Timespec { tv_sec: 60, tv_nsec: 0 };
 
     fn monitor() -> HubMonitor {
@@ -318,7 +321,7 @@ mod tests {
         while monitor.watch_directories(&locations) {}
         fs::remove_dir_all(&domain).unwrap();
         fs::create_dir(&domain).unwrap();
-        // No change is reported, so the caller looks after the interval.
+        // No change is reported, so the caller checks after the interval.
         assert!(!becomes_readable(&monitor, NO_WAIT));
         assert!(monitor.interval() <= RECHECK_INTERVAL);
         assert!(monitor.watch_directories(&locations), "it is another directory");

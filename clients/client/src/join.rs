@@ -1,14 +1,14 @@
-//! Joins the samples of two topics that a hub computes from the same telegram, such as `scan` and `foreground`. They
+//! Join of the samples of two topics that a hub computes from the same telegram, such as `scan` and `foreground`. They
 //! arrive one after the other, and either one may be missing.
 
 use std::collections::VecDeque;
 
 use scanhub_schema::Header;
 
-/// Pairs of samples with the same `boot` and `seq`, from two topics of one sensor. Time is an argument.
+/// Pairs of samples with the same `boot` and `seq`, from two topics of one sensor. Callers pass the time.
 ///
-/// A sample waits for its partner until the partner's topic sends a later one, so for one period. If that topic is
-/// silent, it waits for 1 s.
+/// A sample waits for its partner until the partner's topic sends a later sample, which takes one period. If that topic
+/// is silent, the sample waits for 1 s.
 ///
 /// # Examples
 ///
@@ -50,8 +50,7 @@ impl<A, B> Default for Join<A, B> {
 }
 
 impl<A, B> Join<A, B> {
-    /// Takes a sample of the first topic that was received at `now_ns`. Returns it with its partner if that has
-    /// arrived.
+    /// Adds a sample of the first topic that was received at `now_ns`. Returns it with its partner if that has arrived.
     pub fn first(&mut self, header: &Header, sample: A, now_ns: u64) -> Option<(A, B)> {
         match partner(&mut self.second, header, &mut self.dropped) {
             Some(partner) => Some((sample, partner)),
@@ -62,7 +61,7 @@ impl<A, B> Join<A, B> {
         }
     }
 
-    /// Takes a sample of the second topic that was received at `now_ns`. Returns it with its partner if that has
+    /// Adds a sample of the second topic that was received at `now_ns`. Returns it with its partner if that has
     /// arrived.
     pub fn second(&mut self, header: &Header, sample: B, now_ns: u64) -> Option<(A, B)> {
         match partner(&mut self.first, header, &mut self.dropped) {
@@ -86,8 +85,8 @@ impl<A, B> Join<A, B> {
     }
 }
 
-/// Removes the partner of the sample with this header from `waiting`, and drops the samples before it: the topics are
-/// in order, so the partners of these are lost.
+/// Removes the partner of the sample with this header from `waiting`, and drops the samples before it. Each topic is in
+/// order, so the partners of those are lost.
 fn partner<T>(waiting: &mut VecDeque<WaitingSample<T>>, header: &Header, dropped: &mut u64) -> Option<T> {
     let is_earlier = |one: &&WaitingSample<T>| one.boot == header.boot && one.seq < header.seq;
     let found = waiting.iter().position(|one| (one.boot, one.seq) == (header.boot, header.seq));
@@ -111,7 +110,7 @@ fn wait<T>(
     waiting.push_back(WaitingSample { boot: header.boot, seq: header.seq, since_ns, sample });
 }
 
-/// Returns the number of dropped samples.
+/// Drops samples that have waited too long. Returns their number.
 fn expire<T>(waiting: &mut VecDeque<WaitingSample<T>>, now_ns: u64) -> u64 {
     let is_old = |one: &&WaitingSample<T>| now_ns.saturating_sub(one.since_ns) > PARTNER_TIMEOUT_NS;
     let old = waiting.iter().take_while(is_old).count();
@@ -132,7 +131,7 @@ mod tests {
         let mut join = Join::default();
         assert_eq!(join.second(&header(1, 4), 'b', 0), None);
         assert_eq!(join.first(&header(1, 4), 'a', 1), Some(('a', 'b')));
-        // Many of one topic, and then many of the other one.
+        // Many samples of one topic arrive, and then many of the other one.
         (5..37).for_each(|seq| assert_eq!(join.first(&header(1, seq), 'a', 2), None));
         (5..37).for_each(|seq| assert_eq!(join.second(&header(1, seq), 'b', 3), Some(('a', 'b'))));
         assert_eq!((join.dropped(), join.first.len() + join.second.len()), (0, 0));

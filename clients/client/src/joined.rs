@@ -1,7 +1,8 @@
-//! Subscribes to two topics that the hub computes from the same telegram, such as `scan` and `foreground`, and returns
-//! their samples in pairs.
+//! Subscriber of two topics that the hub computes from the same telegram, such as `scan` and `foreground`, which
+//! returns their samples in pairs.
 //!
-//! Each topic is in order, so one sample of each is enough: if their numbers differ, the earlier one has no partner.
+//! Each topic is in order, so the subscriber needs only one sample of each. If their numbers differ, the earlier sample
+//! has no partner.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -18,8 +19,8 @@ use crate::subscribe::sealed::Sealed;
 use crate::subscribe::{ItemSource, Subscribe, Subscriber, WithTimeout};
 use crate::topic_reader::{Received, TopicReader};
 
-/// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. The samples
-/// come in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
+/// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. It returns the
+/// samples in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
 ///
 /// # Examples
 ///
@@ -51,14 +52,15 @@ pub struct Joined<A: Payload + ?Sized, B: Payload + ?Sized> {
     pub first: Received<A>,
     /// The sample of the second topic.
     pub second: Received<B>,
-    /// Pairs between the last one and this one that were not received whole: one or both samples were missed, or one
-    /// was never sent. It is the smallest number that the numbers of both topics allow. 0 for the first pair.
+    /// Number of incomplete pairs between the last one and this one: one or both samples were missed, or one was never
+    /// sent. It is the smallest number that is consistent with the sequence numbers of both topics. 0 for the first
+    /// pair.
     pub missed: u64,
     /// Whether the hub was restarted since the last pair.
     pub restarted: bool,
 }
 
-/// Subscriber of two topics of one sensor. A sample waits for its partner for one period at most.
+/// Subscriber of two topics of one sensor. A sample waits for its partner for at most one period.
 pub type JoinedSubscriber<A, B> = Subscriber<Joined<A, B>>;
 
 /// Source of the pairs.
@@ -75,16 +77,16 @@ struct Side<P: Payload + ?Sized> {
     reader: TopicReader<P>,
     /// Sample without a partner, and CLOCK_MONOTONIC in ns until which it waits.
     waiting: Option<(Received<P>, u64)>,
-    /// Samples since the last pair that were missed or have no partner.
+    /// Number of samples since the last pair that were missed or have no partner.
     missed: u64,
     restarted: bool,
 }
 
-/// Telegrams since the last pair with a sample that was dropped because it had no partner.
+/// Telegrams since the last pair that had a sample without a partner, which was dropped.
 #[derive(Default)]
 struct DiscardedTelegrams {
     count: u64,
-    /// `boot` and `seq` of the last ones. The partner of a dropped sample can arrive too late, and is dropped, too.
+    /// `boot` and `seq` of the last ones. The partner of a dropped sample may arrive too late, and is then dropped too.
     recent: VecDeque<(u64, u64)>,
 }
 
@@ -116,7 +118,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> ItemSource for PairSource<A, B> {
         self.first.reader.subscribed() && self.second.reader.subscribed()
     }
 
-    /// Receives until there is a pair, or nothing more to receive.
+    /// Receives samples until a pair is complete or no sample waits.
     fn receive(&mut self, session: &mut Session) -> Result<Option<Joined<A, B>>, Error> {
         loop {
             self.first.fill(session)?;
@@ -124,7 +126,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> ItemSource for PairSource<A, B> {
             let is_first_earlier = match (self.first.header(), self.second.header()) {
                 (Some(a), Some(b)) if (a.boot, a.seq) == (b.boot, b.seq) => return Ok(self.pair()),
                 (Some(a), Some(b)) if a.boot == b.boot => a.seq < b.seq,
-                // The earlier run of the hub has ended.
+                // The samples belong to two runs of the hub, and the earlier run has ended.
                 (Some(a), Some(b)) => a.stamp_last_ns < b.stamp_last_ns,
                 (Some(_), None) if self.first.is_overdue() => true,
                 (None, Some(_)) if self.second.is_overdue() => false,
@@ -152,7 +154,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> ItemSource for PairSource<A, B> {
 impl<A: Payload + ?Sized, B: Payload + ?Sized> PairSource<A, B> {
     fn pair(&mut self) -> Option<Joined<A, B>> {
         let (first, second) = (self.first.waiting.take()?.0, self.second.waiting.take()?.0);
-        // A telegram without a sample of one topic may have a sample of the other one, which was dropped.
+        // A missed sample and a dropped one may belong to the same telegram, so count the larger number.
         let lost = std::mem::take(&mut self.first.missed).max(std::mem::take(&mut self.second.missed));
         let lost = lost.max(std::mem::take(&mut self.discarded).count);
         let missed = if std::mem::replace(&mut self.has_returned_pair, true) { lost } else { 0 };

@@ -1,5 +1,5 @@
-//! The client library: subscribes to the topics of a hub, and publishes topics next to those of the hub. A program
-//! needs no other crate.
+//! Client library for programs that subscribe to the topics of a hub, and that publish topics next to those of the hub.
+//! A program needs no other crate.
 //!
 //! - [`subscribe`] subscribes to one topic of one sensor in shared memory. It makes no copy, and continues after
 //!   restarts of the hub.
@@ -99,8 +99,8 @@ impl<P: scanhub_shm::Payload + ?Sized> Payload for P {
     const TOPIC: Topic = <P as scanhub_shm::Payload>::TOPIC;
 }
 
-/// Many topics in one thread: a session in a domain, sources of topics in it, and the state of the hub. It is for
-/// programs that need more than a [`Subscriber`].
+/// Parts for programs that follow many topics in one thread: a session in a domain, sources of topics in it, and the
+/// state of the hub. Most programs only need a [`Subscriber`].
 ///
 /// # Examples
 ///

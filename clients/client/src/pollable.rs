@@ -1,4 +1,4 @@
-//! Subscriber for programs that also wait for other things: with a descriptor for `poll`, `epoll` or an executor.
+//! Subscriber with a descriptor for `poll`, `epoll` or an executor, for programs that also wait for other events.
 
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,14 +10,14 @@ use crate::silence::Silence;
 use crate::stream::Registration;
 use crate::subscribe::{Subscribe, Subscriber};
 
-/// [`Subscriber`] with a descriptor that is readable while there may be something to take. Poll it, never read it. While
-/// it is readable, `poll` returns at once, until [`try_next`](Self::try_next) returns `None`.
+/// [`Subscriber`] with a descriptor that is readable while an item may be waiting. Poll the descriptor, but never read
+/// it. While it is readable, `poll` returns at once, until [`try_next`](Self::try_next) returns `None`.
 /// [`SubscriberBuilder::open_pollable`](crate::SubscriberBuilder::open_pollable) creates it.
 ///
 /// The descriptor can be readable although nothing has arrived: once a second while a hub runs, when another topic of
 /// the sensor has a sample, and when a hub starts or ends. Without a hub, it is readable only if something changes. For
-/// zones and robots, it also becomes readable when a verdict becomes too old. The descriptor stays the same for the
-/// subscriber's life, even if the hub restarts, and a program that the process starts does not inherit it. With the
+/// zones and robots, it also becomes readable when a verdict becomes too old. The descriptor stays the same as long as
+/// the subscriber exists, even if the hub restarts. Programs that the process starts do not inherit it. With the
 /// feature `tokio`, the subscriber is a `Stream`.
 ///
 /// # Examples
@@ -43,7 +43,7 @@ use crate::subscribe::{Subscribe, Subscriber};
 /// ```
 pub struct PollableSubscriber<T: Subscribe + ?Sized> {
     descriptor: Arc<OwnedFd>,
-    // A lock, so that `try_next` works while an executor borrows the descriptor.
+    // The lock lets `try_next` work while an executor borrows the descriptor.
     subscriber: Mutex<Subscriber<T>>,
     #[cfg(feature = "tokio")]
     registration: Registration,
@@ -110,7 +110,7 @@ impl<T: Subscribe + ?Sized> AsRawFd for PollableSubscriber<T> {
     }
 }
 
-/// So that tokio's `AsyncFd` can borrow the subscriber.
+/// Lets tokio's `AsyncFd` borrow the subscriber.
 impl<T: Subscribe + ?Sized> AsRawFd for &PollableSubscriber<T> {
     fn as_raw_fd(&self) -> RawFd {
         self.descriptor.as_raw_fd()

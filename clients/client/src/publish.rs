@@ -1,5 +1,5 @@
-//! Publishes topics of a program, such as results that it computes from other topics. Subscribers follow them like
-//! topics of a hub: by name, in every language, with a count of missed samples, and without polling. A name has one
+//! Topics that a program publishes, such as results that it computes from other topics. Programs subscribe to them like
+//! to topics of a hub: by name, in every language, with a count of missed samples, and without polling. A name has one
 //! publisher, which holds a lock while it runs.
 
 use std::hash::{BuildHasher, RandomState};
@@ -22,13 +22,13 @@ use crate::error::Error;
 type Node = scanhub_shm::Node<ThreadSafeService>;
 type Waker = scanhub_shm::WakeSender<ThreadSafeService>;
 
-/// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names. Programs follow it by
-/// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener runs; publishing needs neither.
+/// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names. Programs subscribe to it
+/// with [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener runs. Publishing needs neither.
 ///
-/// Which names are possible depends on the topic. A topic that no hub publishes, such as people or the angles of a
-/// mount, has a name without a dot, such as `mount`. Any number of programs publish this way, each under another name.
-/// A topic that hubs publish has a name of the form `OWNER.NAME`, such as `tracker.near`. Only one process of a domain
-/// publishes these.
+/// The form of the name depends on the topic. A topic that no hub publishes, such as people or the angles of a mount,
+/// has a name without a dot, such as `mount`. Any number of programs can publish these, each under another name. A
+/// topic that hubs publish has a name of the form `OWNER.NAME`, such as `tracker.near`. Only one process of a domain
+/// can publish these.
 ///
 /// A process that publishes more than one topic, or for more than 32 subscribers, opens a [`PublishSession`].
 ///
@@ -55,12 +55,12 @@ pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Error>
     Publication::in_domain(&publish_domain(None)?, name)
 }
 
-/// Returns where a program publishes in `domain`, or if none is named in that which SCANHUB_DOMAIN names: its first
-/// live place, or that which a hub would take.
+/// Returns the location at which a program publishes in `domain`, or in the domain that SCANHUB_DOMAIN names if
+/// `domain` is `None`: the first location at which a hub runs, otherwise the one that a hub would choose.
 ///
 /// # Errors
 ///
-/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible.
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is invalid.
 pub fn publish_domain(domain: Option<&str>) -> Result<Domain, Error> {
     let name = domain.map_or_else(domain_of_process, str::to_owned);
     Ok(publisher_domain(&name, None, &Environment::of_process())?)
@@ -77,15 +77,15 @@ struct Membership {
     /// Wakers by name. A second waker of the same name would disconnect the subscribers of the first one when it ends.
     sensors: Mutex<Vec<Weak<NameWaker>>>,
     node: Node,
-    // After the node, so that the next holder of the lock finds no node of this process.
+    // This field is after the node, so that the next holder of the lock finds no node of this process.
     lock: DomainLock,
 }
 
 /// Lock of the publishing process.
 enum DomainLock {
-    /// For other machines, under names with a dot.
+    /// Lock for publishing under names with a dot, as for sensors of other machines.
     RemoteSensors { _lock: ListenLock },
-    /// Under a name of its own.
+    /// Lock for publishing under one name.
     OwnName { name: String, _lock: NameLock },
 }
 
@@ -100,7 +100,7 @@ const SERVICE_DESCRIPTORS: u64 = 8;
 impl PublishSession {
     /// Takes the domain's only lock for a process that publishes in addition to the hub, and removes the shared memory
     /// of killed processes. There must be memory for one sensor with `topics`. `limits` hold for all topics of the
-    /// session, but a topic that subscribers have kept alive has the places for subscribers that it was created with.
+    /// session, but a topic that subscribers have kept alive has the slots for subscribers with which it was created.
     ///
     /// # Errors
     ///
@@ -117,7 +117,7 @@ impl PublishSession {
 
     /// Publishes as `name`. A hub or a listener may run in the same domain. Use it for results that a program computes
     /// from other topics, for example tracks of people, and for data that no hub has. The name has no dot, and it is
-    /// not that of a sensor of the hub. The rest is as in [`open`](Self::open).
+    /// not that of a sensor of the hub. Locks, limits and cleanup are as in [`open`](Self::open).
     ///
     /// # Errors
     ///
@@ -140,7 +140,7 @@ impl PublishSession {
             sensor == name && topic.publisher_kind() == PublisherKind::Link
         };
         if scanhub_shm::published_topics(domain)?.iter().any(of_hub) {
-            // A hub that is starting, or that has waited for this name, takes it now.
+            // A hub that is starting, or that has waited for this name, may take it now.
             if let Some(pid) = hub_pid(domain.root())? {
                 return Err(name_taken(name, pid).into());
             }
@@ -178,9 +178,9 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible;
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is invalid;
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
-    /// [`ErrorKind::OtherUser`](crate::ErrorKind) if the place is taken by another user.
+    /// [`ErrorKind::OtherUser`](crate::ErrorKind) if files of another user have the name.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Error> {
         check_any_sensor(name)?;
         let is_own = matches!(&self.0.lock, DomainLock::OwnName { name: own, .. } if own == name);
@@ -207,13 +207,13 @@ impl PublishSession {
     }
 }
 
-/// The topics of one name. They share the waker of their subscribers.
+/// Publisher of the topics of one name. The topics share the waker of their subscribers.
 pub struct SensorPublisher(Arc<NameWaker>);
 
 struct NameWaker {
     name: String,
     waker: Waker,
-    /// Rings of the samples that were sent since the last [`SensorPublisher::wake`].
+    /// Doorbells that must ring for samples since the last [`SensorPublisher::wake`].
     pending_rings: Mutex<PendingWakeups>,
     membership: Arc<Membership>,
 }
@@ -265,7 +265,7 @@ impl SensorPublisher {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::Failed`](crate::ErrorKind) if some were not woken; these look by themselves ten times a second.
+    /// [`ErrorKind::Failed`](crate::ErrorKind) if some were not woken. These poll ten times a second.
     pub fn wake(&self, why: WakeEvent) -> Result<(), Error> {
         let mut due = std::mem::take(&mut *locked(&self.0.pending_rings));
         DoorbellWord::ALL
@@ -283,7 +283,7 @@ impl SensorPublisher {
 
 /// Publisher of one topic. It fills in headers and sequence numbers, and wakes the subscribers.
 pub struct Publication<P: Payload + ?Sized> {
-    // Dropped before the waker and the session.
+    // This field is first, so that it is dropped before the waker and the session.
     topic: TopicPublisher<P, SharedMemory<P, ThreadSafeService>>,
     sensor: SensorPublisher,
 }
@@ -309,8 +309,8 @@ impl<P: Payload + ?Sized> Publication<P> {
         Publication { topic, sensor }
     }
 
-    /// Returns the header of a sample that is made now: both stamps are this moment, on CLOCK_MONOTONIC, and its number
-    /// is the next one.
+    /// Returns the header of a sample that is created now: both stamps are the current time on CLOCK_MONOTONIC, and it
+    /// has the next sequence number.
     pub fn header(&self) -> Header {
         let now_ns = clock::now_ns();
         let number = self.topic.next_number();
@@ -339,7 +339,7 @@ impl<P: Payload + ?Sized> Publication<P> {
         self.topic.skip_numbers(count);
     }
 
-    /// Returns the number that the next sample will have: from 0, as they are sent.
+    /// Returns the sequence number of the next sample, counted from 0.
     pub fn next_number(&self) -> u64 {
         self.topic.next_number()
     }
@@ -361,8 +361,8 @@ impl<P: Payload + ?Sized> Publication<P> {
         self.topic.failed()
     }
 
-    /// Sends a sample of `len` bytes that `fill` writes in place, beginning with all of them 0, and wakes the
-    /// subscribers. Use it for payloads of variable size, such as a scan.
+    /// Sends a sample of `len` bytes, and wakes the subscribers. `fill` writes it in place; all bytes are 0 before. Use
+    /// it for payloads of variable size, such as a scan.
     ///
     /// # Errors
     ///
@@ -374,13 +374,13 @@ impl<P: Payload + ?Sized> Publication<P> {
         self.sensor.wake(WakeEvent::Telegram)
     }
 
-    /// Sends as [`send_len`](Self::send_len), with `header` but for the sample's number in the topic, and wakes no
-    /// subscriber. Returns the number of subscribers that have received it.
+    /// Sends a sample as [`send_len`](Self::send_len) does, but with `header`, whose sequence number in the topic is
+    /// replaced, and without waking subscribers. Returns the number of subscribers that have received the sample.
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it, or it is longer than the topic
-    /// was made for: its number is used up.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for the sample, or if it is longer than
+    /// the limit of the topic. Its sequence number is used up.
     pub fn send_len_with(
         &mut self,
         header: &Header,
@@ -394,20 +394,20 @@ impl<P: Payload + ?Sized> Publication<P> {
 }
 
 impl<P: Payload> Publication<P> {
-    /// Sends a sample that `fill` writes in place, beginning with the payload's default, and wakes the subscribers.
+    /// Sends a sample, and wakes the subscribers. `fill` writes it in place, over the payload's default.
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it: its number is used up. Else as
-    /// [`SensorPublisher::wake`].
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for the sample; its sequence number is
+    /// used up. Also returns the errors of [`SensorPublisher::wake`].
     pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header();
         self.send_with(&header, fill)?;
         self.sensor.wake(WakeEvent::Telegram)
     }
 
-    /// Sends as [`send`](Self::send) a sample that was measured at `stamp_ns` on CLOCK_MONOTONIC, such as the angle of
-    /// a mount.
+    /// Sends a sample as [`send`](Self::send) does, which was measured at `stamp_ns` on CLOCK_MONOTONIC, such as the
+    /// angle of a mount.
     ///
     /// # Errors
     ///
@@ -418,13 +418,14 @@ impl<P: Payload> Publication<P> {
         self.sensor.wake(WakeEvent::Telegram)
     }
 
-    /// Sends as [`send`](Self::send), with `header` but for the sample's number in the topic, and wakes no subscriber.
-    /// Use it for samples of several topics that are sent together. Returns the number of subscribers that have
-    /// received it.
+    /// Sends a sample as [`send`](Self::send) does, but with `header`, whose sequence number in the topic is replaced,
+    /// and without waking subscribers. Use it for samples of several topics that are sent together. Returns the number
+    /// of subscribers that have received the sample.
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it: its number is used up.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for the sample; its sequence number is
+    /// used up.
     pub fn send_with(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Error> {
         let reached = self.topic.send(header, fill)?;
         self.sensor.note(P::TOPIC, reached);
@@ -438,19 +439,19 @@ impl Publication<[u8]> {
     /// # Errors
     ///
     /// Returns the errors of [`send`](Publication::send), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) for
-    /// more than [`Telegram::MAX`](scanhub_schema::Telegram::MAX_LEN) bytes.
+    /// more than [`Telegram::MAX_LEN`](scanhub_schema::Telegram::MAX_LEN) bytes.
     pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Error> {
         let header = self.header();
         self.send_bytes_with(&header, bytes)?;
         self.sensor.wake(WakeEvent::Telegram)
     }
 
-    /// Sends `bytes` with `header`, as [`send_with`](Publication::send_with).
+    /// Sends `bytes` with `header`, as [`send_with`](Publication::send_with) does.
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it, or it is longer than
-    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX_LEN).
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for the sample, or if it is longer than
+    /// [`Telegram::MAX_LEN`](scanhub_schema::Telegram::MAX_LEN).
     pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Error> {
         let reached = self.topic.send_bytes(header, bytes)?;
         self.sensor.note(Topic::Telegram, reached);

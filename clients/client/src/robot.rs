@@ -1,4 +1,4 @@
-//! The robot's verdict: the zones of its sensors, combined. A sensor without recent data counts as unknown.
+//! Verdict of a robot: the combined zones of its sensors. A sensor without recent data counts as unknown.
 
 use std::time::{Duration, Instant};
 
@@ -14,9 +14,9 @@ use crate::subscribe::sealed::Sealed;
 use crate::subscribe::{ItemSource, Subscribe, Subscriber};
 use crate::zones::{StalenessTimer, ZonesSource, ZonesUpdate};
 
-/// Subscribes to the zones of `sensors` in the domain that SCANHUB_DOMAIN names. Without names, it follows all sensors
-/// of the hub. In a domain without a hub, it follows the sensors of other machines that are published there. The hub
-/// may start later.
+/// Subscribes to the zones of `sensors` in the domain that SCANHUB_DOMAIN names. Without names, it subscribes to all
+/// sensors of the hub. In a domain without a hub, these are the remote sensors that are published there. The hub may
+/// start later.
 ///
 /// # Examples
 ///
@@ -46,7 +46,7 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// Returns the worst verdict of all sensors; unknown as long as there are none.
+    /// Returns the worst verdict of all sensors; unknown if there are no sensors.
     pub fn verdict(&self) -> Verdict {
         let verdicts = self.sensors().map(|(_, verdict)| verdict);
         verdicts.reduce(Verdict::worse).unwrap_or(Verdict::Unknown)
@@ -74,14 +74,14 @@ impl Robot {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
     }
 
-    /// Counts `sensor` as unknown until its data arrives; returns its position. [`robot`](robot()) does that by itself:
-    /// it is for programs that get samples another way.
+    /// Adds `sensor`, which counts as unknown until its data arrives, and returns its position. It is for programs that
+    /// do not receive samples through [`robot`](robot()).
     pub fn expect(&mut self, sensor: &str) -> usize {
         self.parts.push((sensor.to_owned(), Zones::unknown()));
         self.parts.len() - 1
     }
 
-    /// Takes what is known now of the zones of the sensor at this position.
+    /// Sets the zones of the sensor at this position.
     ///
     /// # Panics
     ///
@@ -95,8 +95,8 @@ impl Robot {
 pub type RobotSubscriber = Subscriber<Robot>;
 
 impl Subscriber<Robot> {
-    /// Waits until zones of any sensor arrive, or become too old, and returns what is known then. The first call waits
-    /// until this is so for each sensor. A sensor becomes unknown as with [`ZonesSubscriber`](crate::ZonesSubscriber).
+    /// Waits until zones of any sensor arrive or become too old, and returns the robot's state. The first call waits
+    /// for this from each sensor. A sensor becomes unknown as with [`ZonesSubscriber`](crate::ZonesSubscriber).
     ///
     /// # Errors
     ///
@@ -106,7 +106,7 @@ impl Subscriber<Robot> {
         self.wait_for_next()
     }
 
-    /// Returns what is known now, even if it has not changed. It never waits.
+    /// Returns the current state, even if it has not changed. It never waits.
     ///
     /// # Errors
     ///
@@ -154,8 +154,8 @@ impl ItemSource for RobotSource {
     }
 }
 
-/// The zones of a robot's sensors, combined sample by sample, in the caller's session. If no sensor is named, it
-/// follows those of the hub, or those of other machines if only they are published. It never waits.
+/// Source of the combined zones of a robot's sensors, sample by sample, in the caller's session. If no sensor is named,
+/// it subscribes to all sensors of the hub, or to remote sensors if only they are published. It never waits.
 pub struct RobotSource {
     robot: Robot,
     parts: Vec<ZonesSource>,
@@ -178,13 +178,13 @@ pub struct RobotSource {
 enum SensorOrigin {
     /// The caller named them.
     Named,
-    /// All sensors of this publisher: the first one, and the hub as soon as one runs, because the zones of another
-    /// robot's sensors are around the center of that robot. After the hub has exited, its sensors are missing; no
-    /// others replace them.
+    /// All sensors of one publisher. It is the first one that runs, and the hub as soon as a hub runs, because the
+    /// zones of another robot's sensors are around the center of that robot. After the hub has exited, its sensors are
+    /// missing, and no others replace them.
     All(Option<DomainHolder>),
 }
 
-/// A sample or silence of one sensor, and what is known with it.
+/// Sample or silence of one sensor, with the resulting state of the robot.
 pub struct RobotUpdate {
     /// The zones of all sensors.
     pub robot: Robot,
@@ -192,19 +192,20 @@ pub struct RobotUpdate {
     pub update: ZonesUpdate,
 }
 
-/// Maximum number of sensors of other machines that are followed: as many as a listener publishes at a time. None is
-/// ever removed, and a sender in its network can announce new ones without end.
+/// Maximum number of remote sensors of a robot: the number that a listener publishes at a time. No sensor is ever
+/// removed, and a sender in the listener's network can announce any number of new ones.
 const MAX_REMOTE_SENSORS: usize = 16;
 
-/// Name of an entry for the sensors of other machines that are not followed. It is always unknown. No sensor can have
-/// this name.
+/// Name of an entry for the remote sensors beyond the maximum. Its zones are always unknown. No sensor can have this
+/// name.
 const OTHERS_NAME: &str = "others...";
 
-/// Interval at which the source searches for new sensors. A hub that is starting creates its topics one after the other.
+/// Interval at which the source searches for new sensors. A hub that is starting creates its topics one after the
+/// other.
 const DISCOVERY_INTERVAL: Duration = Duration::from_secs(1);
 
 impl RobotSource {
-    /// Creates a source for the zones of `sensors`. If empty: all sensors, as [`robot`](robot()) does.
+    /// Creates a source for the zones of `sensors`, or of all sensors if it is empty, as [`robot`](robot()) does.
     pub fn new(sensors: &[&str]) -> RobotSource {
         let mut source = RobotSource {
             robot: Robot::default(),
@@ -229,12 +230,12 @@ impl RobotSource {
         RobotSource { parts, robot, early: true, ..self }
     }
 
-    /// Returns what is known.
+    /// Returns the current state.
     pub fn robot(&self) -> &Robot {
         &self.robot
     }
 
-    /// Returns whether the topic of each sensor has been there at least once.
+    /// Returns whether the topic of each sensor has existed at least once.
     pub fn subscribed(&self) -> bool {
         !self.parts.is_empty() && self.parts.iter().all(ZonesSource::subscribed)
     }
@@ -257,7 +258,7 @@ impl RobotSource {
         }
     }
 
-    /// Takes all samples and silences. Returns whether there were any.
+    /// Handles all waiting samples and silences. Returns whether there were any.
     ///
     /// # Errors
     ///
@@ -270,9 +271,9 @@ impl RobotSource {
         Ok(any)
     }
 
-    /// Takes all samples and silences, and checks for the hub. Returns whether there were any.
+    /// Handles all waiting samples and silences, and checks for the hub. Returns whether there were any.
     fn drain_and_check(&mut self, session: &mut Session) -> Result<bool, Error> {
-        // Samples that have arrived come first, as with one sensor. But a program that always finds some must also
+        // Handle samples before the check for the hub, as with one sensor. A program that always has samples must also
         // notice a new hub.
         let has_update = self.drain(session)?;
         session.check_hub()?;
@@ -309,13 +310,13 @@ impl RobotSource {
                 }
             }
         }
-        // Last, because it takes longer than everything else.
+        // Search for sensors last, because it takes longer than everything else.
         self.discover(session)?;
         let silence = self.parts.is_empty() && self.no_sensors.silence(clock::now());
         Ok(silence.then(ZonesUpdate::silence))
     }
 
-    /// Forgets the sensors of other machines if a hub has started. Nothing is known until the hub's own sensors send
+    /// Drops the remote sensors if a hub has started. The verdict is then unknown until the hub's own sensors send
     /// zones. Returns whether this has just happened.
     fn switch_to_hub(&mut self, holder: Option<DomainHolder>) -> bool {
         if (self.origin, holder) != (SensorOrigin::All(Some(DomainHolder::Listener)), Some(DomainHolder::Hub))
@@ -327,8 +328,8 @@ impl RobotSource {
         true
     }
 
-    /// Adds the sensors that exist and are not followed yet. Sensors that no longer exist stay, so that the user sees
-    /// that they are missing.
+    /// Subscribes to new sensors. Sensors that no longer exist stay in the list, so that the user sees that they are
+    /// missing.
     fn discover(&mut self, session: &Session) -> Result<(), Error> {
         let (SensorOrigin::All(holder), Some(domain)) = (self.origin, session.domain()) else {
             self.discover_at = None;
@@ -348,8 +349,8 @@ impl RobotSource {
         Ok(())
     }
 
-    /// Follows `sensor`, if it is not followed yet. If there are too many sensors of other machines, [`OTHERS_NAME`]
-    /// represents the rest; it never has data.
+    /// Subscribes to `sensor`, unless that was done before. If there are too many remote sensors, [`OTHERS_NAME`]
+    /// represents the rest, without data.
     fn add_sensor(&mut self, sensor: &str) {
         let is_known = |name: &str| self.robot.sensors().any(|(known, _)| known == name);
         if is_known(sensor) {
@@ -391,7 +392,7 @@ mod tests {
         }
         assert_eq!((source.robot.verdict(), source.robot.worst()), (Verdict::Unknown, Some(OTHERS_NAME)));
         assert!(scanhub_schema::check_any_sensor(OTHERS_NAME).is_err(), "no sensor has its name");
-        // A hub's own sensors are as many as its configuration says.
+        // The number of a hub's own sensors is not limited.
         let mut source = RobotSource::new(&[]);
         (0..40).for_each(|n| source.add_sensor(&format!("front{n}")));
         assert_eq!(source.parts.len(), 40);

@@ -1,4 +1,4 @@
-//! Samples of any topic, and their sources, for programs that follow topics of several kinds.
+//! Samples of any topic, and their sources, for programs that subscribe to topics of several kinds.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ use crate::subscribe::Subscribe;
 use crate::topic_reader::Received;
 use crate::zones::{ZonesSource, ZonesUpdate};
 
-/// Kind of the subscriber of a topic: zones expire, other samples do not.
+/// Selects the source type of a topic. Zones expire, other samples do not.
 macro_rules! kind {
     (Zones $payload:tt) => {
         ZonesUpdate
@@ -31,7 +31,7 @@ macro_rules! samples {
         /// Received sample of one of the topics, or of the combined verdict of a robot.
         pub enum Sample {
             $(#[doc = $about] $topic(<kind!($topic $payload) as Subscribe>::Item),)*
-            /// The combined zones of a robot's sensors.
+            /// Combined zones of a robot's sensors.
             Robot(RobotUpdate),
         }
 
@@ -47,7 +47,7 @@ macro_rules! samples {
         /// Source of the samples of a topic, or of the combined verdict of a robot.
         pub enum Source {
             $(#[doc = $about] $topic(<kind!($topic $payload) as Subscribe>::Source),)*
-            /// The combined zones of a robot's sensors.
+            /// Combined zones of a robot's sensors.
             Robot(RobotSource),
         }
 
@@ -140,7 +140,7 @@ impl Sample {
         self.header().is_none()
     }
 
-    /// Returns the payload as it is in memory. For a robot, it is that of the sensor that sent the sample.
+    /// Returns the payload as it is in memory. For a robot, it is the payload of the sensor that sent the sample.
     pub fn bytes(&self) -> &[u8] {
         self.any().bytes()
     }
@@ -151,7 +151,8 @@ impl Sample {
         self.any().pack(room)
     }
 
-    /// Writes it as [`pack`](Self::pack) does, zones as the hub said them: however old they were on arrival here.
+    /// Writes the payload as [`pack`](Self::pack) does, but zones as the hub published them, even if they were too old
+    /// on arrival.
     pub fn pack_as_published(&self, room: &mut [u8]) -> Option<usize> {
         match self {
             Sample::Zones(sample) => sample.as_published.pack(room),

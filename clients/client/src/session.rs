@@ -21,17 +21,18 @@ use crate::hub_monitor::HubMonitor;
 use crate::silence::Silence;
 use crate::wait::{Wait, Wakeups};
 
-/// Maximum wait. After it, the session looks for the hub, and the caller can stop.
+/// Maximum wait. Afterwards, the session checks for the hub, and the caller can stop.
 const MAX_WAIT: Duration = Duration::from_millis(100);
 
-/// Interval at which a program that polls the descriptor checks a running hub. An event reports the next hub.
+/// Interval at which a program that polls the descriptor checks a running hub. An event reports the start of the next
+/// hub.
 const HUB_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Membership in the first of several domains where a hub runs.
 pub struct Session {
     finder: HubFinder,
     joined: Option<JoinedDomain>,
-    /// Whether a hub has started, and its shared memory may have other names than those that were joined.
+    /// Whether a hub has started whose shared memory may have other names than the joined one.
     is_unsure: bool,
     join_count: u32,
     /// Number of hubs or listeners that have started.
@@ -39,10 +40,10 @@ pub struct Session {
     wait: Wait,
     /// CLOCK_BOOTTIME at the last sample, or at the creation, in ns.
     last_sample_ns: u64,
-    /// For programs that poll the descriptor.
+    /// Descriptor for programs that poll it; `None` if it is not used.
     poll_descriptor: Option<PollDescriptor>,
-    /// Time until which the caller looks ten times a second: the hub creates its topics one after the other, and sends
-    /// samples to late joiners without an event.
+    /// Time until which the caller checks ten times a second, because a starting hub creates its topics one after the
+    /// other, and sends samples to late joiners without an event.
     quick_until: Option<Instant>,
 }
 
@@ -53,7 +54,7 @@ struct JoinedDomain {
 }
 
 impl Session {
-    /// Creates a session that joins the first live one of `places`, as soon as there is one.
+    /// Creates a session that joins the first one of `locations` at which a hub runs, as soon as one runs.
     pub fn new(locations: Vec<Domain>) -> Session {
         Session {
             finder: HubFinder::new(locations),
@@ -68,12 +69,12 @@ impl Session {
         }
     }
 
-    /// Sets the method by which the session waits. Call it before anything is followed.
+    /// Sets the method by which the session waits. Call it before subscribing to any topic.
     pub fn waiting_by(self, wait: Wait) -> Session {
         Session { wait, ..self }
     }
 
-    /// Checks whether a hub runs, and joins its domain if it is at a new place.
+    /// Checks whether a hub runs, and joins its domain if it is at a new location.
     ///
     /// # Errors
     ///
@@ -112,7 +113,7 @@ impl Session {
                     self.joined = Some(JoinedDomain { domain, wakeups, node });
                     self.join_count += 1;
                 }
-                // It is just starting or ending: the next look decides.
+                // The hub is just starting or ending, so the next check decides.
                 Err(failure) if failure.kind == Kind::NoHub => return Ok(change),
                 Err(failure) => return Err(failure.into()),
             },
@@ -126,7 +127,7 @@ impl Session {
         self.finder.domain()
     }
 
-    /// Returns who publishes there, as of the last look.
+    /// Returns the kind of the publisher there, as of the last check.
     pub fn domain_holder(&self) -> Option<DomainHolder> {
         self.finder.holder()
     }
@@ -147,7 +148,7 @@ impl Session {
         self.domain().is_some_and(|domain| matches!(hub_pid(domain.root()), Ok(Some(_))))
     }
 
-    /// Returns whether there is a hub that does not have all its topics yet.
+    /// Returns whether a hub runs that does not have all of its topics yet.
     pub fn hub_is_starting(&self) -> bool {
         self.domain().is_some_and(|domain| is_starting(domain.root()) == Ok(true))
     }
@@ -162,17 +163,18 @@ impl Session {
         self.finder.no_hub_here()
     }
 
-    /// Returns why no hub runs, as of the last look.
+    /// Returns why no hub runs, as of the last check.
     pub(crate) fn silence_reason(&self) -> Silence {
         self.finder.silence_reason()
     }
 
-    /// Counts the domains joined: ports of an earlier one must be opened again.
+    /// Returns the number of times that a domain was joined. Ports of an earlier one must be opened again.
     pub fn join_count(&self) -> u32 {
         self.join_count
     }
 
-    /// Counts the starts of a hub or listener that the looks have shown. A session can stay in the domain meanwhile.
+    /// Returns the number of starts of a hub or listener that the checks have found. A session can stay in the domain
+    /// during a start.
     pub(crate) fn start_count(&self) -> u32 {
         self.start_count
     }
@@ -182,8 +184,8 @@ impl Session {
         self.joined.as_ref().map(|joined| &joined.node)
     }
 
-    /// Returns a subscriber of `sensor`, or `None` if its hub or topic does not exist yet. The bell or event is opened
-    /// first, so that the subscriber is woken for every sample.
+    /// Returns a subscriber of `sensor`, or `None` if its hub or topic does not exist yet. The doorbell or event is
+    /// opened first, so that the subscriber is woken for every sample.
     ///
     /// # Errors
     ///
@@ -211,16 +213,16 @@ impl Session {
     }
 
     /// Returns a value that stays the same until a sample of the `sensor`'s `topic` may have been sent. `None` if that
-    /// is unknown. The hub sends samples to late joiners without ringing the bell, so each check for the hub changes
-    /// the value.
+    /// is unknown. The hub sends samples to late joiners without ringing the doorbell, so each check for the hub
+    /// changes the value.
     pub fn sample_mark(&self, sensor: &str, topic: Topic) -> Option<(u32, Instant)> {
         let rung = self.joined.as_ref()?.wakeups.ring_count(sensor, topic)?;
         Some((rung, self.finder.checked_at()?))
     }
 
-    /// Returns a descriptor that is readable while there may be something to receive or to check. The session waits by
-    /// event from now on. The descriptor stays the same when the hub is replaced. Only [`rearm_descriptor`](Self::rearm_descriptor) makes
-    /// it unreadable. Call this before anything is followed.
+    /// Returns a descriptor that is readable while a sample or a check may be due. The session waits by event from now
+    /// on. The descriptor stays the same when the hub is replaced. Only [`rearm_descriptor`](Self::rearm_descriptor)
+    /// makes it unreadable. Call this before subscribing to any topic.
     ///
     /// # Errors
     ///
@@ -235,7 +237,7 @@ impl Session {
 
     /// Notes that the caller has received all samples. The descriptor, if it is used, is not readable until something
     /// changes or `left` has passed. Returns whether samples were sent, or a hub has started or ended, in the meantime.
-    /// Then the caller must look and receive first.
+    /// The caller must then first check for the hub and receive samples.
     ///
     /// # Errors
     ///
@@ -260,8 +262,8 @@ impl Session {
         Ok(self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())?)
     }
 
-    /// Sleeps until a sample was sent, at most until `until` and for 100 ms. Returns at once if one may have been sent
-    /// since the caller looked.
+    /// Sleeps until a sample was sent, at most until `until` and for 100 ms. Returns at once if a sample may have been
+    /// sent since the caller last received.
     ///
     /// # Errors
     ///
@@ -277,8 +279,8 @@ impl Session {
     /// Returns the errors of [`wait`](Self::wait).
     pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Error> {
         let left = left.map_or(MAX_WAIT, |left| left.min(MAX_WAIT));
-        // This takes events that a program that polls has not seen, so the descriptor stays readable until it is
-        // settled.
+        // The wait takes events that a polling program has not seen, so keep the descriptor readable until it is
+        // rearmed.
         if let Some(poll_descriptor) = &self.poll_descriptor {
             poll_descriptor.set_timer(Some(Duration::ZERO))?;
         }
@@ -292,8 +294,8 @@ impl Session {
     }
 }
 
-/// Descriptor for programs that also wait for other things: an epoll over a timer, the events of each hub, and the
-/// start and end of hubs. It is readable while there may be something to receive or to check.
+/// Descriptor for programs that also wait for other events: an epoll over a timer, the events of each hub, and the
+/// start and end of hubs. It is readable while a sample or a check may be due.
 struct PollDescriptor {
     descriptor: Arc<OwnedFd>,
     timer: OwnedFd,

@@ -10,8 +10,8 @@ use crate::hub_finder::DomainHolder;
 use crate::session::Session;
 use crate::topic_reader::TopicReader;
 
-/// Reason why a subscriber receives no samples. `Display` writes one line; [`Silence::remedy`] returns what the user
-/// can do about it.
+/// Reason why a subscriber receives no samples. `Display` writes one line; [`Silence::remedy`] returns the remedy for
+/// the user.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Silence {
@@ -34,8 +34,8 @@ pub enum Silence {
     /// The hub has no such sensor.
     #[non_exhaustive]
     UnknownSensor {
-        /// Name of the sensor to which the program has subscribed. Empty if it follows all sensors with zones, and the hub
-        /// has none.
+        /// Name of the sensor to which the program has subscribed. Empty if the program subscribes to all sensors with
+        /// zones, and the hub has none.
         sensor: String,
         /// Names of the sensors that exist.
         sensors: Vec<String>,
@@ -64,16 +64,16 @@ pub enum Silence {
         /// Name of the sensor.
         sensor: String,
     },
-    /// No place, memory or descriptor was left for the subscriber.
+    /// No slot, memory or descriptor was left for the subscriber.
     #[non_exhaustive]
     Full {
         /// Message that names the exhausted resource.
         message: String,
-        /// Ways to get a place.
+        /// Ways to get a slot.
         remedy: String,
     },
-    /// Nothing is wrong as far as the library knows: the next sample has not been sent yet, the hub is starting, or its
-    /// status has not arrived yet.
+    /// No problem is known: the next sample has not been sent yet, the hub is starting, or its status has not arrived
+    /// yet.
     Waiting,
 }
 
@@ -118,7 +118,7 @@ impl Silence {
         })
     }
 
-    /// Returns the reason for a robot that follows all sensors and has found none.
+    /// Returns the reason for a robot that subscribes to all sensors and has found none.
     pub(crate) fn of_all_sensors(session: &Session) -> Silence {
         // A listener publishes a sensor as soon as another machine sends it.
         let is_complete = session.domain_holder() == Some(DomainHolder::Hub) && !session.hub_is_starting();
@@ -130,7 +130,7 @@ impl Silence {
         }
     }
 
-    /// Returns what the user can do about it. Empty for [`Silence::Waiting`].
+    /// Returns the remedy for the user. Empty for [`Silence::Waiting`].
     pub fn remedy(&self) -> String {
         match self {
             Silence::NoHub { remedy, .. }
@@ -175,8 +175,8 @@ impl fmt::Display for Silence {
     }
 }
 
-/// Finds the reason for the silence of one topic of one sensor. From the first call of [`reason`](Self::reason) on, it
-/// subscribes to the sensor's status.
+/// Check why a sensor's topic is silent. From the first call of [`reason`](Self::reason) on, it subscribes to the
+/// sensor's status.
 #[derive(Default)]
 pub(crate) struct SilenceCheck {
     status: Option<Box<SensorStatus>>,
@@ -186,7 +186,7 @@ pub(crate) struct SilenceCheck {
 struct SensorStatus {
     reader: TopicReader<Status>,
     last: Option<Status>,
-    /// The session's count of starts with the hub that publishes it.
+    /// The session's count of starts, as of the hub that publishes the status.
     start_count: u32,
 }
 
@@ -206,9 +206,9 @@ impl SilenceCheck {
         }
         let Some(domain) = session.domain() else { return Silence::Waiting };
         let (sensor, topic) = (reader.sensor(), <P as Payload>::TOPIC);
-        // In this order: a hub has all its topics when it is not starting any more.
+        // Check the start before the topics, because a hub that is no longer starting has all of its topics.
         let is_starting = session.hub_is_starting();
-        // The port of a program that stays in the domain is still open if the next hub lacks the topic.
+        // If the next hub lacks the topic, the ports of subscribers still keep it open.
         let is_served = match session.node().map(|node| has_publisher(node, sensor, topic)) {
             Some(Ok(is_served)) => is_served,
             Some(Err(failure)) => return Silence::of_shortage(&failure.into()),
@@ -232,7 +232,7 @@ impl SilenceCheck {
         let status = self.status.get_or_insert_with(|| {
             Box::new(SensorStatus { reader: TopicReader::new(sensor), last: None, start_count: starts })
         });
-        // Without its status, nothing is known of the sensor.
+        // Only the status shows the state of the sensor.
         while let Ok(Some(received)) = status.reader.receive_quietly(session) {
             status.last = Some(*received);
         }

@@ -20,7 +20,7 @@ use crate::subscribe::Subscribe;
 pub(crate) struct Registration(Option<AsyncFd<Arc<OwnedFd>>>);
 
 impl Registration {
-    /// Waits until `descriptor` is readable again, or may be.
+    /// Waits until `descriptor` is readable again. It may also end early.
     fn poll_readable(&mut self, descriptor: &Arc<OwnedFd>, cx: &mut Context<'_>) -> Poll<Result<(), Error>> {
         let is_registered = self.0.is_some();
         let registered = match &self.0 {
@@ -30,7 +30,8 @@ impl Registration {
                     let hint = "poll the stream in a runtime that has I/O enabled";
                     return Poll::Ready(Err(Error::new(Kind::Configuration, "no tokio runtime", hint)));
                 }
-                // Its replacement is unsafe, because a type may close its descriptor early. An `Arc` keeps it open.
+                // The replacement of this function is unsafe, because a type may close its descriptor early. Here, an
+                // `Arc` keeps it open.
                 #[allow(deprecated)]
                 let registered = AsyncFd::with_interest(descriptor.clone(), Interest::READABLE);
                 let registered = registered.map_err(|error| {
@@ -59,7 +60,7 @@ impl Registration {
     }
 }
 
-/// No field is pinned.
+/// No field of the subscriber is pinned.
 impl<T: Subscribe + ?Sized> Unpin for PollableSubscriber<T> {}
 
 /// Items as they arrive. The stream never ends. It keeps no item, so a dropped future loses none.

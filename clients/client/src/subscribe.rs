@@ -1,5 +1,5 @@
-//! Subscribers of any kind, and the one of a topic: it makes no copies, waits for a hub that does not run yet, and
-//! continues when the hub is restarted.
+//! Subscribers of any kind, and the subscriber of a topic. It makes no copies, waits for a hub that does not run yet,
+//! and continues when the hub is restarted.
 
 use std::time::{Duration, Instant};
 
@@ -36,7 +36,7 @@ pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscriber<P>, Err
     Subscriber::builder(sensor).open()
 }
 
-/// Subscriber of one topic of one sensor, as `Subscriber<Scan>`. [`JoinedSubscriber`](crate::JoinedSubscriber),
+/// Subscriber of one topic of one sensor, such as `Subscriber<Scan>`. [`JoinedSubscriber`](crate::JoinedSubscriber),
 /// [`ZonesSubscriber`](crate::ZonesSubscriber) and [`RobotSubscriber`](crate::RobotSubscriber) are subscribers, too.
 pub struct Subscriber<T: Subscribe + ?Sized> {
     pub(crate) session: Session,
@@ -60,7 +60,8 @@ pub trait Subscribe: sealed::Sealed {
     fn source(options: &SubscriberBuilder<Self>) -> Self::Source;
 }
 
-/// Kind of a [`Subscriber`] whose `next` can end after a timeout. Zones and robots report `unknown` in its place.
+/// Kind of a [`Subscriber`] whose `next` can end after a timeout. Zones and robots report `unknown` instead of a
+/// timeout.
 pub trait WithTimeout: Subscribe {}
 
 /// Names of one or several sensors.
@@ -94,7 +95,7 @@ pub trait ItemSource {
 
     /// Checks for the hub if necessary, and returns the next item that has arrived.
     fn check_and_receive(&mut self, session: &mut Session) -> Result<Option<Self::Item>, Error> {
-        // Samples that have arrived come first, because the check for the hub takes longer than receiving.
+        // Receive samples before the check for the hub, because the check takes longer.
         if self.subscribed()
             && let Some(item) = self.receive(session)?
         {
@@ -120,7 +121,7 @@ pub(crate) mod sealed {
 
 impl<T: Subscribe + ?Sized> Subscriber<T> {
     /// Returns the options of a subscriber of a sensor, for example `"front"`, or of a robot's sensors, for example
-    /// `&["front", "rear"]`. A robot without names follows all sensors.
+    /// `&["front", "rear"]`. A robot without names subscribes to all sensors.
     pub fn builder(sensors: T::Sensors<'_>) -> SubscriberBuilder<T> {
         SubscriberBuilder::new(sensors.names())
     }
@@ -170,8 +171,8 @@ impl<T: Subscribe + ?Sized> Subscriber<T> {
         Iter(self)
     }
 
-    /// Sleeps until there may be an item, but at most for `longest` and a tenth of a second, so that the caller can
-    /// stop.
+    /// Sleeps until an item may have arrived, but for at most `longest` and at most a tenth of a second, so that the
+    /// caller can stop.
     ///
     /// # Errors
     ///
@@ -192,8 +193,8 @@ impl<T: Subscribe + ?Sized> Subscriber<T> {
     }
 
     /// Returns why no sample arrives. It never waits, and is cheap enough for once a second. The first call after a
-    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor. A robot has
-    /// the reason of its first sensor whose verdict is unknown and that has a reason.
+    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor. For a robot,
+    /// it is the reason of the first sensor whose verdict is unknown and that has a reason.
     ///
     /// # Examples
     ///
@@ -221,7 +222,7 @@ impl<T: Subscribe + ?Sized> Subscriber<T> {
 
     /// Waits for the next item. Returns `None` only after the timeout.
     pub(crate) fn next_until_timeout(&mut self) -> Result<Option<T::Item>, Error> {
-        // A timeout beyond all time is none.
+        // A timeout that is too long for the clock never expires.
         let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
             if let Some(item) = self.try_next()? {
@@ -267,14 +268,14 @@ impl<T: Subscribe + ?Sized> Iterator for Iter<'_, T> {
 }
 
 impl<T: WithTimeout + ?Sized> Subscriber<T> {
-    /// Waits for the next sample or pair; `None` only after the timeout. Up to four samples, or three pairs, may be held
-    /// while others are received.
+    /// Waits for the next sample or pair; `None` only after the timeout. Up to four samples, or three pairs, may be
+    /// held while others are received.
     ///
     /// # Errors
     ///
     /// [`Error::TooManyHeld`] if the program holds four samples and another one has arrived.
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers have run
-    /// out. [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or slots for subscribers have run out.
+    /// [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
     #[allow(clippy::should_implement_trait)] // `iter` returns an iterator.
     pub fn next(&mut self) -> Result<Option<T::Item>, Error> {
         self.next_until_timeout()

@@ -1,5 +1,5 @@
-//! Receives one topic of one sensor, sample by sample, and counts missed samples by their sequence numbers. It
-//! continues by itself when the hub is replaced. It never waits: the session does that.
+//! Reader of one topic of one sensor. It receives sample by sample, and counts missed samples by their sequence
+//! numbers. It continues when the hub is replaced. It never waits, because the session does that.
 
 use std::mem;
 use std::ops::Deref;
@@ -12,14 +12,14 @@ use crate::error::{Error, ErrorKind};
 use crate::session::Session;
 use crate::silence::{Silence, SilenceCheck};
 
-/// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four samples of a
+/// Sample in shared memory. `*` returns the payload, read-only and without a copy. Hold at most four samples of a
 /// subscriber at a time. They stay valid while it waits, and after the hub has ended.
 #[derive(Debug)]
 pub struct Received<P: Payload + ?Sized> {
     sample: Sample<P, ThreadSafeService>,
-    /// Samples of this topic that were sent before this one and not received.
+    /// Number of samples of this topic that were sent before this one and not received.
     pub missed: u64,
-    /// The hub was restarted since the last sample: its numbers start again at 0.
+    /// Whether the hub was restarted since the last sample, so that its sequence numbers start again at 0.
     pub restarted: bool,
 }
 
@@ -39,23 +39,23 @@ impl<P: Payload + ?Sized> Deref for Received<P> {
 }
 
 impl Received<Scan> {
-    /// Returns CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are of bytes on the wire, the measurement is
-    /// older.
+    /// Returns the time at which beam `i` was measured, in ns of CLOCK_MONOTONIC. It is earlier than the sample's
+    /// stamps, which are those of bytes on the line.
     pub fn beam_time_ns(&self, i: usize) -> u64 {
         self.header().stamp_first_ns.saturating_add_signed(self.beam_ns(i))
     }
 }
 
-/// Follows one topic, also across restarts of the hub.
+/// Reader of one topic, which continues across restarts of the hub.
 pub struct TopicReader<P: Payload + ?Sized> {
     sensor: String,
     port: Option<(u32, Subscriber<P, ThreadSafeService>)>,
     tried_at: Option<Instant>,
-    /// Reason why the last attempt to subscribe found no place, memory or descriptor.
+    /// Reason why the last attempt to subscribe found no slot, memory or descriptor.
     refused: Option<Error>,
     sequence: SequenceTracker,
     unconnected_since: Option<Instant>,
-    /// Moment of the session in which no sample had arrived.
+    /// Mark of the session at which no sample had arrived.
     empty_at: Option<(u32, Instant)>,
     silence: SilenceCheck,
 }
@@ -67,7 +67,7 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 const CONNECTION_FAILURE_TIMEOUT: Duration = Duration::from_secs(3);
 
 impl<P: Payload + ?Sized> TopicReader<P> {
-    /// Creates a follower of the topic of `sensor`, which may not exist yet.
+    /// Creates a reader of the topic of `sensor`, which may not exist yet.
     pub fn new(sensor: &str) -> TopicReader<P> {
         TopicReader {
             sensor: sensor.to_owned(),
@@ -99,12 +99,12 @@ impl<P: Payload + ?Sized> TopicReader<P> {
         &self.sensor
     }
 
-    /// Returns whether it is subscribed to the topic of the session's present hub.
+    /// Returns whether it is subscribed to the topic of the session's current hub.
     pub(crate) fn is_attached(&self, session: &Session) -> bool {
         self.port.as_ref().is_some_and(|(number, _)| *number == session.join_count())
     }
 
-    /// Returns the reason why the last attempt to subscribe found no place, memory or descriptor.
+    /// Returns the reason why the last attempt to subscribe found no slot, memory or descriptor.
     pub(crate) fn refused(&self) -> Option<&Error> {
         self.refused.as_ref()
     }
@@ -125,7 +125,7 @@ impl<P: Payload + ?Sized> TopicReader<P> {
         Ok(received)
     }
 
-    /// Returns the next sample that has arrived, and does not end a silence of the session by it.
+    /// Returns the next sample that has arrived, without ending a silence of the session.
     pub(crate) fn receive_quietly(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
         if !self.subscribe(session)? {
             return Ok(None);
@@ -144,7 +144,8 @@ impl<P: Payload + ?Sized> TopicReader<P> {
                 Ok(sample.map(|sample| self.count(sample)))
             }
             Err(ReceiveError::ExceedsMaxBorrows) => Err(Error::TooManyHeld),
-            // Occurs while the memory of a killed hub is being removed. If it persists, it is a shortage.
+            // This occurs while the memory of a killed hub is being removed. If it persists, descriptors or memory are
+            // short.
             Err(ReceiveError::ConnectionFailure(error)) => {
                 let since = *self.unconnected_since.get_or_insert_with(Instant::now);
                 if since.elapsed() < CONNECTION_FAILURE_TIMEOUT {
@@ -191,23 +192,23 @@ pub struct SequenceTracker {
     expected: Option<u64>,
 }
 
-/// Result of comparing the number of a sample with the one before.
+/// Result of comparing the sequence number of a sample with the previous one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SequenceGap {
-    /// Samples of this topic that were sent before this one and not received.
+    /// Number of samples of this topic that were sent before this one and not received.
     pub missed: u64,
-    /// The hub was restarted since the last sample: its numbers start again at 0.
+    /// Whether the hub was restarted since the last sample, so that its sequence numbers start again at 0.
     pub restarted: bool,
 }
 
 impl SequenceTracker {
-    /// Continues at the number of the next sample, because the port is a new one.
+    /// Continues at the sequence number of the next sample, because the port is new.
     pub fn reset(&mut self) {
         self.expected = None;
     }
 
-    /// Takes the sample with `header`. A port that was open before the hub started receives the hub's samples from
-    /// number 0; a new port starts at any number.
+    /// Compares the sample with `header`. A port that was open before the hub started receives the hub's samples from
+    /// number 0. A new port starts at any number.
     pub fn note(&mut self, header: &Header) -> SequenceGap {
         let restarted = self.boot.is_some_and(|boot| boot != header.boot);
         // Numbers of remote topics continue when the hub on the other machine restarts.

@@ -1,4 +1,4 @@
-//! Waits until samples of any followed sensor arrive: on doorbells in shared memory, on events, or by spinning.
+//! Wait for samples of several sensors: on doorbells in shared memory, on events, or by spinning.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -14,30 +14,30 @@ type Listener = scanhub_shm::Listener<ThreadSafeService>;
 /// Method by which a subscriber waits for samples.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Wait {
-    /// Sleep on a word in shared memory; one call of the hub wakes all. If the system cannot wait for the words of
-    /// several sensors at once, it uses the event.
+    /// Sleep on a word in shared memory. One call of the hub wakes all subscribers. If the system cannot wait for the
+    /// words of several sensors at once, it uses the event.
     #[default]
     Doorbell,
-    /// Sleep on the event, which other languages use; the hub sends one message to each subscriber.
+    /// Sleep on the event, which other languages use. The hub sends one message to each subscriber.
     Event,
-    /// Do not sleep: read the words all the time. It has the shortest latency, and uses one CPU core completely.
+    /// Do not sleep, and read the words continuously. It has the shortest latency, and uses one CPU core completely.
     Spin,
 }
 
-/// Doorbells or events of the sensors that a subscriber follows.
+/// Doorbells or events of a subscriber's sensors.
 pub(crate) struct Wakeups {
     wait: Wait,
     sensors: Vec<Sensor>,
-    /// Whether a bell was rung since the last [`Wakeups::take_activity`].
+    /// Whether a doorbell was rung since the last [`Wakeups::take_activity`].
     has_activity: bool,
-    /// Whether wake-ups by event were taken since the last sleep, so that the caller has looked for samples.
+    /// Whether wake-ups by event were taken since the last sleep, so that the caller has received samples.
     taken: bool,
 }
 
 struct Sensor {
     name: String,
     doorbell: Option<Doorbell>,
-    /// For each ring of a followed topic, the count of the bell when the caller last looked for samples.
+    /// For each doorbell word at which the subscriber waits, its count when the caller last received samples.
     ring_counts: [Option<u32>; DoorbellWord::ALL.len()],
     listener: Option<Listener>,
 }
@@ -47,8 +47,8 @@ impl Wakeups {
         Wakeups { wait, sensors: Vec::new(), has_activity: false, taken: false }
     }
 
-    /// Adds `topic` of the sensor `name`. Returns whether its bell or event exists already. Fails with
-    /// [`Kind::ResourceExhausted`](scanhub_schema::Kind) if memory, descriptors or places for subscribers are short.
+    /// Adds `topic` of the sensor `name`. Returns whether its doorbell or event already exists. Fails with
+    /// [`Kind::ResourceExhausted`](scanhub_schema::Kind) if memory, descriptors or slots for subscribers are short.
     pub(crate) fn add(&mut self, node: &Node, name: &str, topic: Topic) -> Result<bool, Failure> {
         let ring = topic.spec().doorbell_word;
         if let Some(known) = self.sensors.iter_mut().find(|sensor| sensor.name == name) {
@@ -68,20 +68,20 @@ impl Wakeups {
         Ok(is_there)
     }
 
-    /// Forgets the bells, because a hub has started or ended: the next hub has other bells.
+    /// Closes the doorbells, because a hub has started or ended, and the next hub has other doorbells.
     pub(crate) fn close_doorbells(&mut self) {
         self.sensors.iter_mut().for_each(|sensor| sensor.doorbell = None);
     }
 
-    /// Sleeps until a bell or event wakes it, a signal arrives or the time `left` has passed. Returns at once if this
-    /// has happened since the caller looked for samples. Fails with [`Kind::ResourceExhausted`](scanhub_schema::Kind) if the system
-    /// cannot wait.
+    /// Sleeps until a doorbell or event wakes it, a signal arrives or the time `left` has passed. Returns at once if it
+    /// was woken since the caller last received samples. Fails with [`Kind::ResourceExhausted`](scanhub_schema::Kind)
+    /// if the system cannot wait.
     pub(crate) fn wait(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
         if self.wait == Wait::Event {
             return self.wait_for_event(node, left);
         }
         for sensor in &mut self.sensors {
-            // Without a bell, the subscriber continues with a short sleep each time, until there is one.
+            // Without a doorbell, the subscriber continues with a short sleep each time, until there is one.
             let _ = sensor.open_doorbell(node);
         }
         if self.has_rung() {
@@ -109,12 +109,12 @@ impl Wakeups {
         }
     }
 
-    /// Returns whether a bell was rung since the last call. If so, the hub is alive.
+    /// Returns whether a doorbell was rung since the last call. If so, the hub is alive.
     pub(crate) fn take_activity(&mut self) -> bool {
         std::mem::take(&mut self.has_activity)
     }
 
-    /// Returns how often the bell of the sensor `name` was rung for `topic`. `None` if this does not show whether a
+    /// Returns how often the doorbell of the sensor `name` was rung for `topic`. `None` if this does not show whether a
     /// sample was sent.
     pub(crate) fn ring_count(&self, name: &str, topic: Topic) -> Option<u32> {
         let sensor = self.sensors.iter().find(|sensor| sensor.name == name)?;
@@ -122,7 +122,7 @@ impl Wakeups {
         Some(doorbell.ring_count(topic.spec().doorbell_word))
     }
 
-    /// Returns whether a bell was rung since the last call. Samples that were sent before can be received now.
+    /// Returns whether a doorbell was rung since the last call. Samples that were sent before can be received now.
     fn has_rung(&mut self) -> bool {
         let mut any = false;
         for Sensor { doorbell: bell, ring_counts: rung, .. } in &mut self.sensors {
@@ -140,7 +140,7 @@ impl Wakeups {
     fn wait_for_event(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
         let mut is_new = false;
         for sensor in self.sensors.iter_mut().filter(|sensor| sensor.listener.is_none()) {
-            // Its hub was still creating it, or there was no room.
+            // Retry, because the hub was still creating the event, or there was no slot.
             is_new |= sensor.listen(node).unwrap_or(false);
         }
         if is_new {
@@ -161,7 +161,7 @@ impl Wakeups {
         self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).map(scanhub_shm::descriptor)
     }
 
-    /// Takes the pending events. Returns whether there were any; then the caller must look for samples. Fails with
+    /// Takes the pending events. Returns whether there were any, so that the caller must receive samples. Fails with
     /// [`Kind::ResourceExhausted`](scanhub_schema::Kind) if an event does not work.
     pub(crate) fn take(&mut self) -> Result<bool, Failure> {
         let mut any = false;
@@ -171,7 +171,7 @@ impl Wakeups {
         Ok(any)
     }
 
-    /// Uses events from now on. Returns without a wait, because samples may have arrived before the listeners existed.
+    /// Changes to events. Returns without a wait, because samples may have arrived before the listeners existed.
     fn switch_to_events(&mut self, node: &Node) -> Result<(), Failure> {
         self.wait = Wait::Event;
         for sensor in &mut self.sensors {
@@ -190,11 +190,12 @@ impl Sensor {
         Ok(true)
     }
 
-    /// Opens the bell, unless it is open. Closes the bell of a hub that has ended. Returns whether there is one.
+    /// Opens the doorbell, unless it is open. Closes the doorbell of a hub that has ended. Returns whether there is
+    /// one.
     fn open_doorbell(&mut self, node: &Node) -> Result<bool, Failure> {
         if self.doorbell.as_ref().is_none_or(Doorbell::is_closed) {
             self.doorbell = Doorbell::open(node, &self.name)?.filter(|bell| !bell.is_closed());
-            // A new bell has a count of its own, and samples may have been sent before.
+            // A new doorbell has its own counts, and samples may have been sent before.
             for ring in DoorbellWord::ALL {
                 self.ring_counts[ring as usize] =
                     self.ring_counts[ring as usize].map(|_| self.stale_count(ring));
@@ -203,14 +204,14 @@ impl Sensor {
         Ok(self.doorbell.is_some())
     }
 
-    /// Waits for `ring` too. Samples may have been sent before.
+    /// Adds the doorbell word `ring` to the wait. Samples may have been sent before.
     fn watch_word(&mut self, ring: DoorbellWord) {
         if self.ring_counts[ring as usize].is_none() {
             self.ring_counts[ring as usize] = Some(self.stale_count(ring));
         }
     }
 
-    /// Returns a count that the bell does not have now.
+    /// Returns a count that the doorbell does not have now.
     fn stale_count(&self, ring: DoorbellWord) -> u32 {
         self.doorbell.as_ref().map_or(0, |bell| bell.ring_count(ring).wrapping_sub(1))
     }
@@ -235,10 +236,10 @@ fn spin(bells: &[(&Doorbell, DoorbellWord, u32)], until_ns: u64) {
     }
 }
 
-/// Number of polls between two readings of the clock.
+/// Number of polls per reading of the clock.
 const POLLS_PER_CLOCK_READ: u32 = 100;
 
-/// Maximum sleep while there is no bell, between the end of a hub and the start of the next one.
+/// Maximum sleep while there is no doorbell, between the end of a hub and the start of the next one.
 const MAX_SLEEP_WITHOUT_DOORBELL: Duration = Duration::from_millis(20);
 
 #[cfg(test)]
@@ -251,7 +252,7 @@ mod tests {
     use std::thread;
     use std::time::Instant;
 
-    /// A domain that goes with the test.
+    /// Domain that is removed at the end of the test.
     struct TestDomain(PathBuf, Domain);
 
     impl TestDomain {
@@ -273,10 +274,10 @@ mod tests {
         }
     }
 
-    /// Far longer than any wait here may last.
+    /// Timeout that is far longer than any wait in these tests.
     const TEST_TIMEOUT: Duration = Duration::from_secs(60);
 
-    /// Returns whether a wait ended before its timeout, so that a bell or event has woken it.
+    /// Returns whether a wait ended before its timeout, so that a doorbell or event has woken it.
     fn ended_before_timeout(started: Instant) -> bool {
         started.elapsed() < TEST_TIMEOUT
     }

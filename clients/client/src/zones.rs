@@ -1,6 +1,6 @@
-//! Follows the zones of one sensor: its verdict, the deadline after which the verdict is `unknown`, and early warnings.
-//! The verdict expires here, whether the sensor, the hub or the machine has stopped. A program that acts on it needs no
-//! timeout.
+//! Subscriber of the zones of one sensor: its verdict, the deadline after which the verdict is `unknown`, and early
+//! warnings. The verdict expires in this process, whether the sensor, the hub or the machine has stopped. A program
+//! that acts on it needs no timeout.
 
 use std::time::Duration;
 
@@ -40,23 +40,23 @@ pub fn zones(sensor: &str) -> Result<ZonesSubscriber, Error> {
     ZonesSubscriber::builder(sensor).open()
 }
 
-/// New data of a sensor's zones, or the news that none arrives.
+/// New zones of a sensor, or the report of a silence.
 #[derive(Clone, Copy, Debug)]
 pub struct ZonesUpdate {
-    /// The zones of the sample; [`Zones::unknown`] if it was too old on arrival, and in a silence.
+    /// Zones of the sample; [`Zones::unknown`] if it was too old on arrival, and in a silence.
     pub zones: Zones,
-    /// The header of the sample; nothing in a silence.
+    /// Header of the sample; `None` in a silence.
     pub header: Option<Header>,
-    /// Samples that were sent since the previous one and were skipped.
+    /// Number of samples that were sent since the previous update and not returned.
     pub missed: u64,
-    /// The zones are unknown because no recent data arrived, not because the hub reports it.
+    /// Whether the zones are unknown because no recent data arrived, and not because the hub reports it.
     pub stale: bool,
-    /// The zones that the hub sent, however old they were on arrival. Store them, but do not act on them.
+    /// Zones that the hub sent, even if they were too old on arrival. Store them, but do not act on them.
     pub as_published: Zones,
 }
 
 impl ZonesUpdate {
-    /// Returns what is known during a silence.
+    /// Returns the update of a silence.
     pub(crate) fn silence() -> ZonesUpdate {
         ZonesUpdate {
             zones: Zones::unknown(),
@@ -72,9 +72,9 @@ impl ZonesUpdate {
 pub type ZonesSubscriber = Subscriber<ZonesUpdate>;
 
 impl Subscriber<ZonesUpdate> {
-    /// Waits for news: the newest sample, or one `unknown` per silence. It returns that two scan periods and 40 ms after
-    /// the last sample (for another machine not before half a second), or a second after the start if there was none,
-    /// with or without a hub.
+    /// Waits for the newest sample, or for one `unknown` per silence. It returns `unknown` two scan periods and 40 ms
+    /// after the last sample; for a remote sensor, after at least half a second. Without any sample, it returns
+    /// `unknown` one second after the start, with or without a hub.
     ///
     /// # Errors
     ///
@@ -104,7 +104,7 @@ impl ItemSource for ZonesSource {
         self.subscribed()
     }
 
-    /// Returns the last of all samples that have arrived. The skipped ones count as missed.
+    /// Returns the last one of all samples that have arrived. The samples before it count as missed.
     fn receive(&mut self, session: &mut Session) -> Result<Option<ZonesUpdate>, Error> {
         let mut newest: Option<ZonesUpdate> = None;
         while let Some(mut update) = self.receive(session)? {
@@ -123,11 +123,11 @@ impl ItemSource for ZonesSource {
     }
 }
 
-/// The zones of a sensor, sample by sample and silence by silence, in the caller's session.
+/// Source of the samples and silences of a sensor's zones, in the caller's session.
 pub struct ZonesSource {
     reader: TopicReader<Zones>,
     state: ZonesState,
-    /// Early warnings, if the caller wants them.
+    /// Early warnings, if the caller has requested them.
     early: Option<Box<(TopicReader<Early>, EarlyState)>>,
 }
 
@@ -137,13 +137,13 @@ impl ZonesSource {
         ZonesSource { reader: TopicReader::new(sensor), state: ZonesState::new(clock::now()), early: None }
     }
 
-    /// Takes early warnings of `sensor` too: a warning makes the verdict worse until the zones of its scan arrive, or
-    /// until the hub withdraws it.
+    /// Subscribes to early warnings of `sensor` too. A warning makes the verdict worse until the zones of its scan
+    /// arrive, or until the hub withdraws it.
     pub(crate) fn with_early(self, sensor: &str) -> ZonesSource {
         ZonesSource { early: Some(Box::new((TopicReader::new(sensor), EarlyState::new()))), ..self }
     }
 
-    /// Returns whether the topic has been there at least once.
+    /// Returns whether the topic has existed at least once.
     pub fn subscribed(&self) -> bool {
         self.reader.subscribed()
     }
@@ -197,7 +197,7 @@ impl ZonesSource {
     }
 }
 
-/// State of one sensor's zones, for programs that receive samples from elsewhere than a session. Time is an argument.
+/// State of one sensor's zones, for programs that do not receive samples through a session. Callers pass the time.
 ///
 /// # Examples
 ///
@@ -226,13 +226,12 @@ pub struct ZonesState {
 }
 
 impl ZonesState {
-    /// Creates the state of a sensor that the program follows from `now` on.
+    /// Creates the state of a sensor, whose first sample is expected from `now` on.
     pub fn new(now: Timestamp) -> ZonesState {
         ZonesState { staleness: StalenessTimer::new(now), has_update: false }
     }
 
-    /// Takes a sample that arrived at `now`, and returns what is known with it. `missed` samples before it were not
-    /// received.
+    /// Handles a sample that arrived at `now`, and returns the update. `missed` samples before it were not received.
     pub fn take(&mut self, header: &Header, zones: &Zones, missed: u64, now: Timestamp) -> ZonesUpdate {
         self.has_update = true;
         let fresh = self.staleness.update(header, zones.verdict(), now);
@@ -258,37 +257,37 @@ impl ZonesState {
     }
 }
 
-/// Deadline of one sensor's verdict. Time is an argument.
+/// Deadline of one sensor's verdict. Callers pass the time.
 #[derive(Clone, Debug)]
 pub struct StalenessTimer {
     until: Timestamp,
-    /// Whether the verdict is unknown already: this silence was reported.
+    /// Whether this silence was reported, so that the verdict is already unknown.
     is_reported: bool,
 }
 
-/// The hub publishes `unknown` two periods and this long after the last scan (`docs/topics.md`).
+/// Time after the last scan and two periods at which the hub publishes `unknown` (`docs/topics.md`).
 const HUB_STALE_AFTER_NS: u64 = 20_000_000;
 
-/// Additional time that a client waits. A live hub then reports the silence first, so that there is one `unknown` per
-/// silence.
+/// Additional time that a client waits. A running hub then reports the silence first, so that each silence has only one
+/// `unknown`.
 const CLIENT_MARGIN_NS: u64 = 20_000_000;
 
-/// Limit of a sample without a period. It is enough for two periods of half degrees at 38400 baud, 0.4 s. It is also
-/// the minimum limit of a sample from another machine, because networks delay data, wireless ones by a tenth of a
+/// Time limit of a sample without a period. It is enough for two periods of half degrees at 38400 baud, 0.4 s. It is
+/// also the minimum limit of a sample from another machine, because networks delay data; wireless ones by a tenth of a
 /// second.
 const DEFAULT_STALE_AFTER_NS: u64 = 500_000_000;
 
-/// Time limit of the first sample. A running hub sends its last sample to new subscribers ten times a second; a hub
-/// that is starting needs longer.
+/// Time limit of the first sample. A running hub sends the history to new subscribers within a tenth of a second, and a
+/// starting hub needs longer.
 const FIRST_SAMPLE_TIMEOUT_NS: u64 = 1_000_000_000;
 
 impl StalenessTimer {
-    /// Creates the deadline of a sensor that the program follows from `now` on.
+    /// Creates the deadline of a sensor, whose first sample is expected from `now` on.
     pub fn new(now: Timestamp) -> StalenessTimer {
         StalenessTimer { until: add_ns(now, FIRST_SAMPLE_TIMEOUT_NS), is_reported: false }
     }
 
-    /// Takes a sample with `header` and `verdict` that arrived at `now`. Returns whether its verdict is valid. The
+    /// Handles a sample with `header` and `verdict` that arrived at `now`. Returns whether its verdict is valid. The
     /// deadline runs from the stamp or from the arrival, whichever is earlier, so a stamp in the future does not extend
     /// it. `unknown` is valid at any age.
     pub fn update(&mut self, header: &Header, verdict: Verdict, now: Timestamp) -> bool {
@@ -339,7 +338,7 @@ struct EarlyState {
     zones: Zones,
     /// `boot` and `seq` of the last scan whose zones are known.
     scan: Option<(u64, u64)>,
-    /// The warning that is valid, with `boot` and `seq` of its scan.
+    /// Valid warning, with `boot` and `seq` of its scan.
     warning: Option<((u64, u64), Early)>,
 }
 
@@ -348,8 +347,8 @@ impl EarlyState {
         EarlyState { zones: Zones::unknown(), scan: None, warning: None }
     }
 
-    /// Takes the zones of a scan, or a silence, which has no header. Returns them, made worse by the warning of a later
-    /// scan.
+    /// Handles the zones of a scan, or a silence, which has no header. Returns the zones, combined with the warning of
+    /// a later scan.
     fn update(&mut self, zones: &Zones, header: Option<&Header>) -> Zones {
         self.zones = *zones;
         let Some(header) = header else {
@@ -361,7 +360,7 @@ impl EarlyState {
         self.warning.map_or(*zones, |(_, early)| self.with_warning(&early))
     }
 
-    /// Returns the zones with the warning `early`, or `None` if the zones of its scan are known.
+    /// Returns the zones combined with the warning `early`, or `None` if the zones of its scan have arrived.
     fn warn(&mut self, early: &Early, header: &Header) -> Option<Zones> {
         if self.scan.is_some_and(|(boot, seq)| boot == header.boot && header.seq <= seq) {
             return None;
@@ -397,7 +396,7 @@ mod tests {
 
     const MS: u64 = 1_000_000;
 
-    /// `ms` after the machine's start; it was never suspended.
+    /// Returns the time `ms` after the start of the machine, which was never suspended.
     fn at(ms: u64) -> Timestamp {
         Timestamp { monotonic_ns: ms * MS, boottime_ns: ms * MS }
     }
@@ -406,7 +405,7 @@ mod tests {
         Header { stamp_last_ns: stamp_ms * MS, period_us, ..Header::default() }
     }
 
-    /// Two periods of half degrees, 20 ms, and as long again for the hub: 93.28 ms.
+    /// Period of scans at half degrees. The limit is two periods and 2 x 20 ms: 93.28 ms.
     const PERIOD_US: u32 = 26_640;
 
     #[test]
@@ -426,7 +425,7 @@ mod tests {
         let mut freshness = StalenessTimer::new(at(50));
         assert_eq!(freshness.time_left(at(50)), Some(Duration::from_secs(1)));
         assert!(!freshness.silence(at(1049)) && freshness.silence(at(1050)) && !freshness.silence(at(9000)));
-        // The hub's own word of the silence.
+        // The hub itself publishes the silence.
         assert!(freshness.update(&header(2000, PERIOD_US), Verdict::Unknown, at(2000)));
         assert_eq!((freshness.silence(at(9000)), freshness.time_left(at(2000))), (false, None));
         assert!(freshness.update(&header(2000, PERIOD_US), Verdict::Unknown, at(60_000)), "to a late joiner");
@@ -479,7 +478,7 @@ mod tests {
     const STOP: Early =
         Early { verdict: 2, flags: 0, beam: 40, distance_mm: 500, bytes_seen: 240, beams_seen: 116 };
 
-    /// Vectors that the tests of the Python package use, too.
+    /// Vectors that the tests of the Python package also use.
     const VECTORS: &str = include_str!("../../../tests/vectors/early.txt");
 
     fn scan_header(scan: &str) -> Header {

@@ -1,4 +1,4 @@
-//! Samples of two topics in pairs.
+//! Tests of subscribers that return the samples of two topics in pairs.
 
 mod fake;
 
@@ -7,10 +7,10 @@ use std::time::Duration;
 use fake::{FakeHub, FakeSensor, TestDomain, wait_until};
 use scanhub_client::{Error, Foreground, JoinedSubscriber, Scan, Silence};
 
-/// Far longer than anything takes on a busy machine.
+/// Timeout that is far longer than any step on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// A subscriber of both topics that has attached to the hub.
+/// Returns a subscriber of both topics that has attached to the hub.
 fn attach(test_domain: &TestDomain, hub: &mut FakeHub) -> JoinedSubscriber<Scan, Foreground> {
     let builder = JoinedSubscriber::builder("front").in_domain(&test_domain.domain);
     let mut pairs = builder.timeout(WAIT_TIMEOUT).open().unwrap();
@@ -105,7 +105,7 @@ fn a_sample_waits_for_one_period() {
     assert!(pairs.try_next().unwrap().is_none());
     std::thread::sleep(Duration::from_millis(40));
     assert!(pairs.try_next().unwrap().is_none());
-    // Its partner is too late now.
+    // The partner of the dropped sample is too late now.
     hub.front_sensor().publish_foreground(2, 1);
     hub.front_sensor().wake();
     assert!(pairs.try_next().unwrap().is_none());

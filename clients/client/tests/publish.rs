@@ -1,4 +1,4 @@
-//! Topics that a program publishes: followed like a hub's own, with a hub and without one.
+//! Tests of topics that a program publishes. Programs subscribe to them like to a hub's topics, with and without a hub.
 
 mod fake;
 
@@ -103,7 +103,7 @@ fn another_life_begins_again() {
     assert_eq!(next_pair(&mut subscriber), (0, false, 0, 1));
     drop(near);
     let mut near = open();
-    // Its subscriber has to find it first.
+    // The subscriber must find the topic first.
     wait_until("the consumer", || {
         let _ = subscriber.try_next().unwrap();
         near.subscribers() == 1
@@ -162,7 +162,7 @@ fn single_session_next_to_a_hub_cannot_use_its_names() {
         assert_eq!(topic(impossible).unwrap_err().kind(), ErrorKind::InvalidInput, "{impossible}");
     }
     assert!(topic("tracker.near").is_ok() && session.check_room(&Topic::ALL).is_ok());
-    // The hub goes on.
+    // The hub continues.
     let mut scans = Subscriber::<Scan>::builder("front")
         .in_domain(&test_domain.domain)
         .timeout(Duration::from_secs(60))

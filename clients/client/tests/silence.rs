@@ -1,4 +1,4 @@
-//! Reasons for a silence, as a program sees them that asks once a second.
+//! Tests of the reasons for a silence, as a program gets them that checks once a second.
 
 mod fake;
 
@@ -18,7 +18,7 @@ fn scans(test_domain: &TestDomain, sensor: &str) -> Subscriber<Scan> {
     builder.timeout(Duration::from_millis(100)).open().unwrap()
 }
 
-/// Returns the reason after two seconds at most, as a program that calls `next` has it.
+/// Waits for an expected reason, as a program that calls `next` gets it after at most two seconds.
 fn await_reason(scans: &mut Subscriber<Scan>, is_expected: impl Fn(&Silence) -> bool) -> Silence {
     let started = Instant::now();
     loop {
@@ -200,7 +200,7 @@ fn the_state_of_the_last_hub_is_not_the_reason() {
         assert!(scans.try_next().unwrap().is_none());
         scans.hub_is_running()
     });
-    // It sends no status.
+    // The new hub has not sent a status.
     assert_eq!(scans.why_silent(), Silence::Waiting);
 }
 

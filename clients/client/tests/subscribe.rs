@@ -1,4 +1,4 @@
-//! Subscribers of one topic: their options, and what they return.
+//! Tests of subscribers of one topic: their options and their results.
 
 mod fake;
 
@@ -8,7 +8,7 @@ use fake::{FakeHub, TestDomain, wait_until};
 use scanhub_client::{Error, ErrorKind, Scan, Subscriber, SubscriberBuilder, Telegram, Wait};
 use scanhub_schema::limits::MAX_BORROWED_SAMPLES;
 
-/// Far longer than anything takes on a busy machine.
+/// Timeout that is far longer than any step on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 #[test]

@@ -1,4 +1,4 @@
-//! Subscribers, samples and publications in other threads than the one that made them.
+//! Tests of subscribers, samples and publications in other threads than the one that created them.
 
 mod fake;
 
@@ -14,7 +14,7 @@ use scanhub_client::{
 use scanhub_schema::limits::MAX_BORROWED_SAMPLES;
 use scanhub_shm::{LocalService, Payload, Role, Service, ThreadSafeService};
 
-/// Far longer than anything takes on a busy machine.
+/// Timeout that is far longer than any step on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 fn is_send<T: Send>() {}
@@ -80,7 +80,7 @@ fn a_subscriber_and_its_samples_move_between_threads() {
     });
     for beams in 1..=3 * MAX_BORROWED_SAMPLES {
         hub.front_sensor().publish_scan(&vec![1000; beams]);
-        // Dropped in this thread, so the slot is free again for the other one.
+        // The sample is dropped in this thread, so its slot is free for the other one.
         let scan = take.recv_timeout(WAIT_TIMEOUT).expect("a scan");
         assert_eq!((scan.beams(), scan.missed), (beams, 0));
     }

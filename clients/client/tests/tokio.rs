@@ -1,4 +1,4 @@
-//! Subscribers in tokio: samples as a stream, canceled waits, and the example.
+//! Tests of subscribers in tokio: samples as a stream, canceled waits, and the example.
 
 #[path = "../../examples/tokio.rs"]
 #[allow(dead_code)] // A test runs its `main` in another process.
@@ -21,14 +21,14 @@ use scanhub_shm::Domain;
 use tokio::io::unix::AsyncFd;
 use tokio::time::timeout;
 
-/// Far longer than anything takes on a busy machine.
+/// Timeout that is far longer than any step on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 fn scans(test_domain: &TestDomain) -> PollableSubscriber<Scan> {
     Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap()
 }
 
-/// Sends scans from another thread while the waits are canceled: before a scan, while it is sent, and after it.
+/// Another thread sends scans while the waits are canceled: before a scan, while it is sent, and after it.
 #[test]
 fn a_thousand_cancelled_waits_lose_no_sample() {
     let test_domain = TestDomain::new();
@@ -170,7 +170,7 @@ fn a_stream_without_a_runtime_says_so() {
     assert!(error.message().contains("tokio"), "{error}");
 }
 
-/// Set in the process that runs the example.
+/// Variable that is set in the process that runs the example.
 const EXAMPLE_VARIABLE: &str = "SCANHUB_TEST_EXAMPLE";
 
 #[test]

@@ -1,5 +1,5 @@
-//! A hub without sensors: the lock, the topics and whatever a test publishes. Each in a domain of its own that goes
-//! with the test.
+//! Fake hub without scanners: the lock, the topics, and the samples that a test publishes. Each one has its own domain,
+//! which is removed at the end of the test.
 #![allow(dead_code)] // Every test file takes what it needs.
 
 use std::fs::File;
@@ -21,7 +21,7 @@ use scanhub_shm::{
 use scanhub_shm::{Domain, HubLock};
 use tempfile::TempDir;
 
-/// A domain that goes with the test.
+/// Domain that is removed at the end of the test.
 pub(crate) struct TestDomain {
     pub(crate) base: PathBuf,
     _directory: TempDir,
@@ -32,7 +32,7 @@ impl TestDomain {
     pub(crate) fn new() -> TestDomain {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let name = format!("c{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
-        // Not TMPDIR: root and prefix of a domain must be short.
+        // Do not use TMPDIR, because root and prefix of a domain must be short.
         let directory = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
         let base = directory.path().to_owned();
         TestDomain { domain: Domain::at(&name, &base).unwrap(), base, _directory: directory }
@@ -54,7 +54,7 @@ impl Drop for TestDomain {
     }
 }
 
-/// A topic with its own numbers.
+/// Topic with its own sequence numbers.
 pub(crate) struct TopicPort<P: Payload + ?Sized> {
     pub(crate) service: TopicService<P>,
     pub(crate) publisher: Publisher<P>,
@@ -85,7 +85,7 @@ impl<P: Payload + ?Sized> TopicPort<P> {
     }
 }
 
-/// One sensor of a hub.
+/// One sensor of the fake hub.
 pub(crate) struct FakeSensor {
     pub(crate) telegram: TopicPort<[u8]>,
     pub(crate) scan: TopicPort<Scan>,
@@ -99,7 +99,7 @@ pub(crate) struct FakeSensor {
     /// Flags of the headers.
     pub(crate) flags: u8,
     pub(crate) seq: u64,
-    /// CLOCK_MONOTONIC at its first telegram, in ns. By default long before any subscriber.
+    /// CLOCK_MONOTONIC at its first telegram, in ns. By default, it is long before any subscriber.
     pub(crate) start_ns: u64,
     /// Period of the scans in us.
     pub(crate) period_us: u32,
@@ -166,7 +166,7 @@ impl FakeSensor {
         self.publish_zones_at(verdict, nearest_mm, now_ns);
     }
 
-    /// Publishes zones as [`zones`](Self::zones) does, measured at `stamp_ns`.
+    /// Publishes zones as [`publish_zones`](Self::publish_zones) does, measured at `stamp_ns`.
     pub(crate) fn publish_zones_at(&mut self, verdict: Verdict, nearest_mm: u32, stamp_ns: u64) {
         let header = self.header(self.zones.topic_seq);
         let mut sample = self.zones.publisher.loan().unwrap();
@@ -204,7 +204,7 @@ impl FakeSensor {
     }
 }
 
-/// A hub.
+/// Fake hub.
 pub(crate) struct FakeHub {
     pub(crate) sensors: Vec<FakeSensor>,
     _node: Node,
@@ -239,7 +239,7 @@ impl FakeHub {
         &mut self.sensors[0]
     }
 
-    /// Hands the last status to newcomers until `done`.
+    /// Sends the last status to new subscribers until `is_done` returns true.
     pub(crate) fn serve_history(&self, is_done: impl Fn() -> bool) {
         wait_until("history taken", || {
             for sensor in &self.sensors {
@@ -250,7 +250,7 @@ impl FakeHub {
     }
 }
 
-/// A verb at work in a thread of its own, its output as it comes.
+/// Verb that runs in its own thread, with its output.
 pub(crate) struct RunningVerb {
     pub(crate) out: OutputFile,
     pub(crate) notes: OutputFile,
@@ -277,7 +277,7 @@ impl RunningVerb {
         self.thread.is_finished()
     }
 
-    /// Waits for the end.
+    /// Waits for the end of the verb. Returns its result, its standard output and its standard error.
     pub(crate) fn join(self) -> (Result<(), Failure>, String, String) {
         wait_until("the verb's end", || self.thread.is_finished());
         (self.thread.join().unwrap(), self.out.text(), self.notes.text())
@@ -313,7 +313,7 @@ impl OutputFile {
     }
 }
 
-/// Waits until `done`. The limit only bounds a hang.
+/// Waits until `is_done` returns true. The time limit is only reached if the test hangs.
 pub(crate) fn wait_until(description: &str, mut is_done: impl FnMut() -> bool) {
     let give_up_at = Instant::now() + Duration::from_secs(180);
     while !is_done() {
