@@ -1,6 +1,6 @@
 /*
- * The MACs of datagrams for programs in C: who has the key sent it, and it is not sent again. Refuses to know sockets and
- * files. C99, no heap, no library: it brings SHA-256. docs/datagram.md says what a listener with a key believes.
+ * Authentication of datagrams for programs in C: it checks that the sender has the key, and that a datagram is not a replayed
+ * recording. C99, no heap, no library; SHA-256 is included. docs/datagram.md has the rules of a listener with a key.
  *
  *     static struct scanhub_guard guard;
  *     struct scanhub_key key;
@@ -18,7 +18,7 @@
 extern "C" {
 #endif
 
-/* A SHA-256 (FIPS 180-4) that goes on: its state, and the bytes of the block that is not full. */
+/* State of a SHA-256 (FIPS 180-4): the hash so far, and the bytes of the incomplete block. */
 struct scanhub_sha {
     uint32_t state[8];
     uint64_t len;
@@ -160,8 +160,8 @@ static inline int scanhub_is_of(const struct scanhub_key *key, const void *bytes
     return differs == 0;
 }
 
-/* As scanhub_read, for who takes only what was sent with `key`. That alone does not keep what was recorded from being sent
- * again: scanhub_guard_take does. */
+/* Checks a datagram as scanhub_read does, and that it was sent with `key`. It accepts replayed recordings, which
+ * scanhub_guard_take refuses. */
 static inline enum scanhub_result scanhub_read_with(const struct scanhub_key *key, const void *bytes, size_t len,
                                                     struct scanhub_datagram *out)
 {
@@ -173,19 +173,19 @@ static inline enum scanhub_result scanhub_read_with(const struct scanhub_key *ke
     return scanhub_is_of(key, bytes, len) ? SCANHUB_OK : SCANHUB_BAD_MAC;
 }
 
-/* Maximum number of gateways. */
+/* Maximum numbers of gateways, and of topics of all their sensors. */
 #define SCANHUB_HUBS 16
 /* Maximum number of topics of all their sensors, with announcements: enough for 16 sensors that have all topics. */
 #define SCANHUB_STREAMS (16 * SCANHUB_TOPICS)
 
-/* A gateway, and the greatest epoch that came of it. */
+/* A gateway, and the greatest epoch that was received from it. */
 struct scanhub_run {
     uint64_t hub;
     uint32_t epoch;
 };
 
-/* The numbers of one sensor's topic: the highest that came, if any did, which came of the 1024 up to it, and below which none
- * is believed. */
+/* Sequence numbers of one topic of a sensor: the highest one that arrived, if `any` did, the ones that arrived among the 1024
+ * up to it, and the first one that is accepted. */
 struct scanhub_stream {
     uint64_t hub;
     uint8_t sensor, topic, any;
@@ -214,7 +214,7 @@ static inline struct scanhub_stream *scanhub_guard_find(struct scanhub_guard *gu
     return NULL;
 }
 
-/* Begins to count `topic` from `first` on, if it is not counted yet and there is room. */
+/* Starts to count `topic` from `first` on, if it is not counted yet and there is room. */
 static inline struct scanhub_stream *scanhub_guard_begin(struct scanhub_guard *guard, uint64_t hub, uint8_t sensor,
                                                          uint8_t topic, uint32_t first)
 {
@@ -230,7 +230,7 @@ static inline struct scanhub_stream *scanhub_guard_begin(struct scanhub_guard *g
     return stream;
 }
 
-/* What is to become of a number; if `is_taken`, it came from now on. */
+/* Returns whether a sequence number is accepted. If `is_taken` is set, records that it arrived. */
 static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *stream, uint32_t number, int is_taken)
 {
     uint8_t bit = (uint8_t)(1u << number % 8), *byte = stream->seen + number / 8 % 128;
@@ -241,7 +241,7 @@ static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *str
     if (is_behind && *byte & bit)
         return SCANHUB_DUPLICATE;
     if (!is_behind && is_taken) {
-        /* What lies between did not come. */
+        /* The numbers in between have not arrived. */
         uint32_t leave = stream->any && number - stream->highest < 1024 ? number - stream->highest : 1024;
         for (i = 0; i < leave; i++)
             stream->seen[(number - i) / 8 % 128] &= (uint8_t) ~(1u << (number - i) % 8);
@@ -255,8 +255,8 @@ static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *str
     return SCANHUB_OK;
 }
 
-/* Whether a datagram that scanhub_read_with took is new, and not of a recording: at `wall_ns`, ns since 1970. Parts are
- * judged, and not counted: hand over the sample, with `parts` 1, when it is whole. */
+/* Checks at `wall_ns`, ns since 1970, whether a datagram that scanhub_read_with accepted is new and not a replayed recording.
+ * Parts are checked but not counted: pass the complete sample, with `parts` 1, as well. */
 static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard, const struct scanhub_datagram *datagram,
                                                      uint64_t wall_ns)
 {

@@ -27,7 +27,7 @@ try {
     for (;;) {
         if (poll(fds, 2, -1) < 0 && errno != EINTR)
             return 1;
-        // Take all that there is: only then does poll sleep again.
+        // Take all waiting samples. Otherwise, poll does not sleep again.
         while (scanhub::Sample sample = robot.take()) {
             const scanhub_robot &now = sample.as<scanhub_robot>();
             if (now.verdict != last)

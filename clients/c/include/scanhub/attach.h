@@ -1,6 +1,6 @@
 /*
- * The topics of a hub on this machine for programs in C and C++: its samples in shared memory, read where the hub wrote
- * them. C99, or C++11; link with -lscanhub. docs/c.md is the page about it, docs/topics.md has the bytes.
+ * Client library for programs in C and C++: they read the samples of a hub on this machine in shared memory, without a copy.
+ * C99, or C++11; link with -lscanhub. docs/c.md describes the use, and docs/topics.md has the bytes.
  *
  *     struct scanhub_attachment *scans;
  *     struct scanhub_sample sample;
@@ -41,27 +41,27 @@ extern "C" {
 /* Reasons why a call was refused. */
 #define SCANHUB_REFUSED_ARGUMENT (-1)      /* NULL, an unknown handle or number, a fifth sample */
 #define SCANHUB_REFUSED_CONFIGURATION (-2) /* an invalid name, a descriptor without SCANHUB_WAIT_EVENT */
-#define SCANHUB_REFUSED_SHORT (-3)         /* no memory, descriptors or places for subscribers are left: try later */
+#define SCANHUB_REFUSED_SHORT (-3)         /* no memory, descriptors or slots for subscribers are left; try later */
 #define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, a taken name, or another failure */
 #define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
 
 /* Methods of scanhub_wait. */
-#define SCANHUB_WAIT_DOORBELL 0 /* on a word in the hub's memory; one call of the hub wakes all. The default choice */
+#define SCANHUB_WAIT_DOORBELL 0 /* on a word in the hub's memory: one call of the hub wakes all subscribers. The usual choice */
 #define SCANHUB_WAIT_EVENT 1    /* on a descriptor, which poll and epoll accept, too: scanhub_fd */
 #define SCANHUB_WAIT_SPIN 2     /* without sleep: uses one CPU core completely for the shortest latency */
 
 /* Reasons why no sample arrives, from scanhub_why_silent. Later versions may have more. */
-#define SCANHUB_SILENCE_WAITING 0        /* nothing is wrong as far as the library knows, or the hub is starting */
+#define SCANHUB_SILENCE_WAITING 0        /* no problem is known, or the hub is starting */
 #define SCANHUB_SILENCE_NO_HUB 1         /* no hub runs in the domain */
 #define SCANHUB_SILENCE_OTHER_USER 2     /* only another user runs a hub in the domain */
 #define SCANHUB_SILENCE_UNKNOWN_SENSOR 3 /* the hub has no such sensor; the text has the names that exist */
 #define SCANHUB_SILENCE_UNKNOWN_TOPIC 4  /* the hub does not publish this topic of the sensor */
 #define SCANHUB_SILENCE_ABSENT 5         /* the scanner sends no data */
 #define SCANHUB_SILENCE_PAUSED 6         /* the link is paused on request */
-#define SCANHUB_SILENCE_FULL 7           /* no place, memory or descriptor is left for this subscriber */
+#define SCANHUB_SILENCE_FULL 7           /* no slot, memory or descriptor is left for this subscriber */
 #define SCANHUB_SILENCE_OTHER 8          /* another reason: see the text */
 
-/* A topic that is followed. */
+/* A subscription to a topic. */
 struct scanhub_attachment;
 
 /* A topic that this program publishes. */
@@ -581,35 +581,35 @@ struct scanhub_robot_sensor {
 
 /* Verdict of a robot: the payload of scanhub_open_robot. All of it is lent with the sample. */
 struct scanhub_robot {
-    uint8_t verdict;     /* the worst of its sensors: stop, unknown, slow, clear; unknown as long as there are none */
-    uint32_t nearest_mm; /* of all sensors; or SCANHUB_NOTHING_MM */
-    const char *worst;   /* the first sensor with this verdict; NULL: there are none */
-    const char *nearest; /* the sensor that sees the nearest point; NULL: no sensor sees a point */
-    size_t count;        /* of sensors */
+    uint8_t verdict;     /* worst verdict of its sensors: stop, unknown, slow, clear; unknown without sensors */
+    uint32_t nearest_mm; /* smallest distance of all sensors; or SCANHUB_NOTHING_MM */
+    const char *worst;   /* first sensor with this verdict; NULL without sensors */
+    const char *nearest; /* sensor with the nearest point; NULL if no sensor has a point */
+    size_t count;        /* number of sensors */
     const struct scanhub_robot_sensor *sensors;
 };
 
 /* A sample that is lent: scanhub_take fills it, scanhub_release empties it. */
 struct scanhub_sample {
-    const struct scanhub_header_v2 *header; /* NULL: no hub sent it, see stale; or a robot's verdict */
-    const void *payload;                    /* where the hub wrote it, for reading */
-    size_t length;                          /* its bytes, as far as they are used */
-    uint64_t missed;                        /* samples that were sent before it and not received */
-    int restarted;                          /* 1: the hub restarted, seq and topic_seq start again */
-    int stale;                              /* 1: zones that are unknown because no recent data arrived */
+    const struct scanhub_header_v2 *header; /* NULL if no hub sent the sample, see stale, or for a robot's verdict */
+    const void *payload;                    /* payload in shared memory, read-only */
+    size_t length;                          /* number of used bytes of the payload */
+    uint64_t missed;                        /* number of samples that were sent before it and not received */
+    int restarted;                          /* 1 if the hub has restarted, so that seq and topic_seq start again */
+    int stale;                              /* 1 for zones that are unknown because no recent data arrived */
     struct scanhub_attachment *of;                     /* the library's */
     uint64_t number;                        /* the library's */
 };
 
 /*
- * Starts to follow a topic of `sensor` ("front", "robot1.front") in `domain` (NULL: the one that SCANHUB_DOMAIN names). It
+ * Subscribes to a topic of `sensor` ("front", "robot1.front") in `domain` (NULL: the one that SCANHUB_DOMAIN names). It
  * does not wait for a hub. Returns 0; *handle is NULL after a refusal.
  */
 int scanhub_open(struct scanhub_attachment **handle, const char *domain, const char *sensor, int topic, int wait);
 
 /*
- * Starts to follow the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL means all
- * sensors of the hub. In a domain without a hub, it means the sensors of other machines that are published there.
+ * Subscribes to the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL means all
+ * sensors of the hub. In a domain without a hub, it means the remote sensors that are published there.
  * scanhub_take then lends a struct scanhub_robot, a copy without header. The first one is lent when every sensor has a
  * verdict. Another one is lent when a sensor has a new verdict, or is silent for too long: its verdict then becomes unknown by
  * itself. Everything else is as with scanhub_open.
@@ -618,46 +618,47 @@ int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, c
 
 /*
  * Like scanhub_open_robot, with early warnings (docs/early.md): the verdict becomes worse before a scan (a telegram or a
- * turn) is complete, and goes back if the warning is withdrawn.
+ * revolution) is complete, and is restored if the warning is withdrawn.
  */
 int scanhub_open_robot_early(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
 /*
- * A descriptor that is readable while there may be a sample, for poll, select and epoll: never read, written or closed.
- * It stays the same until scanhub_close, also over restarts of the hub. It is readable until scanhub_take has returned
- * 0: take all, then poll. A readable descriptor does not promise a sample. It also becomes readable when a hub starts
+ * Returns a descriptor that is readable while a sample may be waiting, for poll, select and epoll. Never read, write or
+ * close it. It stays the same until scanhub_close, even if the hub restarts. It is readable until scanhub_take has returned 0, so
+ * take all samples before the next poll. A readable descriptor does not guarantee a sample. It also becomes readable when a hub starts
  * or ends, and when other topics of the sensor have a sample. While a hub runs, it becomes readable once a second, and
  * ten times a second just after the start of the hub. Only with SCANHUB_WAIT_EVENT.
  */
 int scanhub_fd(struct scanhub_attachment *handle);
 
 /*
- * Sleeps until a sample has arrived: 1; or until `timeout_ms` have passed: 0. Negative: waits without limit. A signal whose
- * handler returns does not end the wait: choose a timeout within which your program must see the handler's flag.
+ * Sleeps until a sample has arrived, and returns 1, or until `timeout_ms` have passed, and returns 0. A negative timeout
+ * never expires. A signal whose handler returns does not end the wait: choose a timeout within which your program must see the
+ * handler's flag.
  */
 int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
 
 /*
- * Lends the next sample: 1; or there is none: 0, and *sample is empty. Never waits. Four samples can be lent at a time. The
+ * Lends the next sample and returns 1. If no sample waits, returns 0, and *sample is empty. Never waits. Four samples can be lent at a time. The
  * memory that a sample points to is valid until it is released.
  *
- * Of zones it is the latest one, as a copy. When that becomes too old, because sensor, hub or machine stopped, there is one
- * more sample, without header, whose verdict is unknown (`stale`). A program that acts on zones needs no clock of its own.
+ * For zones, it is a copy of the latest sample. When that sample becomes too old, because sensor, hub or machine stopped, one
+ * more sample follows, without header and with the verdict unknown (`stale`). A program that acts on zones needs no timer.
  */
 int scanhub_take(struct scanhub_attachment *handle, struct scanhub_sample *sample);
 
-/* Returns a sample and empties it: 0, even if it is empty. A refused sample stays as it is. */
+/* Releases a sample and empties it. Returns 0, even if it is empty. A refused sample stays as it is. */
 int scanhub_release(struct scanhub_sample *sample);
 
-/* Closes the handle; its lent samples become invalid too: 0, also for NULL. */
+/* Closes the handle. Its lent samples become invalid too. Returns 0, even for NULL. */
 int scanhub_close(struct scanhub_attachment *handle);
 
-/* 1 if a hub runs in the domain, 0 if not, as of the last call that found no sample. */
+/* Returns 1 if a hub runs in the domain and 0 otherwise, as of the last call that found no sample. */
 int scanhub_hub_is_running(struct scanhub_attachment *handle);
 
 /*
- * Sets *silent_ns to the nanoseconds since the last sample; if there was none, since scanhub_open: 0. Time during which
- * the machine was suspended counts (CLOCK_BOOTTIME).
+ * Sets *silent_ns to the nanoseconds since the last sample, or since scanhub_open if there was none. Includes the time
+ * that the machine was suspended (CLOCK_BOOTTIME). Returns 0.
  */
 int scanhub_silent_for(struct scanhub_attachment *handle, uint64_t *silent_ns);
 
@@ -683,32 +684,32 @@ int scanhub_topics(const char *domain, char *names, size_t size);
 
 /*
  * Publishes the angles of a mount as the topic tilt of `name` ("mount") in `domain` (NULL: the one that SCANHUB_DOMAIN names),
- * for scanhub tilt and all other subscribers: docs/tilt.md. There need not be a hub. A name with a dot is refused with
- * SCANHUB_REFUSED_CONFIGURATION. One process publishes under it: if another one has it, a program or the hub whose sensor it
- * is, SCANHUB_REFUSED_FAILED, and scanhub_error names that process. Returns 0; *publication is NULL after a refusal.
+ * for scanhub tilt and all other subscribers: docs/tilt.md. It needs no hub. A name with a dot is refused with
+ * SCANHUB_REFUSED_CONFIGURATION. If another process publishes under the name, a program or the hub whose sensor it is, the
+ * result is SCANHUB_REFUSED_FAILED, and scanhub_error names that process. Returns 0; *publication is NULL after a refusal.
  */
 int scanhub_publish_tilt(struct scanhub_publication **publication, const char *domain, const char *name);
 
 /*
- * Publishes that the mount was at `angle_rad`, right-handed around its axis, at `stamp_ns` of CLOCK_MONOTONIC (0: now), and
- * how fast the angle grew (NAN: not known). Wakes the subscribers, and never waits: 0.
+ * Publishes the angle of the mount, right-handed around its axis, at `stamp_ns` of CLOCK_MONOTONIC (0: now), and its angular
+ * rate (NAN: unknown). Wakes the subscribers, and never waits. Returns 0.
  */
 int scanhub_send_tilt(struct scanhub_publication *publication, uint64_t stamp_ns, double angle_rad, double rate_rad_s);
 
-/* Ends the publication and releases the name: 0, even for NULL. The end of the thread or of the process does the same. */
+/* Ends the publication and releases the name. Returns 0, even for NULL. The end of the thread or of the process does the same. */
 int scanhub_unpublish(struct scanhub_publication *publication);
 
-/* The message of this thread's last refused call: a line, and often a second one with the remedy. Valid until the next. */
+/* Returns the message of this thread's last refused call, often with the remedy in a second line. Valid until the next. */
 const char *scanhub_error(void);
 
-/* The version of the library, "0.1.0". */
+/* Returns the version of the library, "0.1.0". */
 const char *scanhub_version(void);
 
 /*
- * Samples of SCANHUB_TOPIC_SCAN. Beams are numbered from 0; one that does not exist has no reading.
+ * Samples of SCANHUB_TOPIC_SCAN. Beams are numbered from 0. A beam that does not exist has no reading.
  */
 
-/* The head of a scan; NULL if the sample is none. */
+/* Returns the head of a scan; NULL if the sample is not a scan. */
 static inline const struct scanhub_scan_v2 *scanhub_scan_head(const struct scanhub_sample *scan)
 {
     const size_t head = sizeof(struct scanhub_scan_v2);
@@ -732,7 +733,7 @@ static inline size_t scanhub_scan_width(unsigned contents)
 }
 /* End of arrays. */
 
-/* Beams of a scan: the same number in all scans of a sensor and its settings. */
+/* Returns the number of beams of a scan, which is the same in all scans of a sensor with the same settings. */
 static inline unsigned scanhub_count(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -742,7 +743,7 @@ static inline unsigned scanhub_count(const struct scanhub_sample *scan)
     return head->count < room ? head->count : (unsigned)room;
 }
 
-/* The array that follows those of `before`. */
+/* Returns the array that follows those of `before`. */
 static inline const void *scanhub_scan_array(const struct scanhub_sample *scan, unsigned before)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -752,13 +753,13 @@ static inline const void *scanhub_scan_array(const struct scanhub_sample *scan, 
     return (const unsigned char *)scan->payload + sizeof *head + offset;
 }
 
-/* The ranges in device units, scanhub_count of them, for programs that read many. Values above `valid_to` are codes. */
+/* Returns the scanhub_count ranges in device units, for programs that read many. Values above `valid_to` are codes. */
 static inline const uint16_t *scanhub_ranges(const struct scanhub_sample *scan)
 {
     return (const uint16_t *)scanhub_scan_array(scan, SCANHUB_SCAN_ANGLES);
 }
 
-/* The range of beam i in meters; NAN if it has no reading, whatever the reason. */
+/* Returns the range of beam i in meters; NAN if it has no reading. */
 static inline double scanhub_range_m(const struct scanhub_sample *scan, unsigned i)
 {
     if (i >= scanhub_count(scan))
@@ -768,7 +769,7 @@ static inline double scanhub_range_m(const struct scanhub_sample *scan, unsigned
     return range <= head->valid_to ? (double)range * head->unit_um / 1e6 : NAN;
 }
 
-/* The angle of beam i in radians, exact if the sensor reports it; NAN if the sample is not a scan. */
+/* Returns the angle of beam i in radians, exact if the scanner reports it; NAN if the sample is not a scan. */
 static inline double scanhub_angle(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -783,8 +784,8 @@ static inline double scanhub_angle(const struct scanhub_sample *scan, unsigned i
 }
 
 /*
- * The reason why beam i has no reading: "not_measured", "no_return", "beyond" the range limit, "too_near", "too_bright", "weak",
- * "overflow", "error"; NULL if it has one, or does not exist.
+ * Returns the reason why beam i has no reading: "not_measured", "no_return", "beyond" the range limit, "too_near",
+ * "too_bright", "weak", "overflow" or "error". NULL if the beam has a reading or does not exist.
  */
 static inline const char *scanhub_code(const struct scanhub_sample *scan, unsigned i)
 {
@@ -802,7 +803,7 @@ static inline const char *scanhub_code(const struct scanhub_sample *scan, unsign
     return words[0xFFFFu - range < 7u ? 0xFFFFu - range : 7];
 }
 
-/* The intensity of beam i; -1 if the sensor does not send it, or the beam does not exist. */
+/* Returns the intensity of beam i; -1 if the scanner does not send it, or the beam does not exist. */
 static inline int32_t scanhub_intensity(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -815,21 +816,21 @@ static inline int32_t scanhub_intensity(const struct scanhub_sample *scan, unsig
     return -1;
 }
 
-/* Points that were dropped because another point has the same beam. Points without a return count, too. */
+/* Returns the number of points that were dropped because another point has the same beam. Points without a return count too. */
 static inline unsigned scanhub_collisions(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
     return head == NULL ? 0 : head->collisions;
 }
 
-/* 1: packets of the turn are missing. Their points are not measured. */
+/* Returns 1 if packets of the revolution are missing. Their points are not measured. */
 static inline int scanhub_is_incomplete(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
     return head != NULL && (head->flags & 1) != 0;
 }
 
-/* The time at which beam i was measured, in ns of CLOCK_MONOTONIC; 0 if the sample is not a scan. */
+/* Returns the time at which beam i was measured, in ns of CLOCK_MONOTONIC; 0 if the sample is not a scan. */
 static inline uint64_t scanhub_beam_stamp_ns(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -845,7 +846,7 @@ static inline uint64_t scanhub_beam_stamp_ns(const struct scanhub_sample *scan, 
  * Samples of SCANHUB_TOPIC_FOREGROUND and SCANHUB_TOPIC_BACKGROUND.
  */
 
-/* Whether there is all that the head of a foreground says. */
+/* Returns whether the payload has all arrays that the head of a foreground requires. */
 static inline int scanhub_foreground_is_whole(const struct scanhub_sample *foreground)
 {
     const struct scanhub_foreground_v2 *head = (const struct scanhub_foreground_v2 *)foreground->payload;
@@ -855,7 +856,7 @@ static inline int scanhub_foreground_is_whole(const struct scanhub_sample *foreg
     return foreground->length >= before + 2 * (((size_t)head->count + 15) / 16) + 2 * (size_t)head->count;
 }
 
-/* The segments, as many as `segments`; NULL if the sample is none. */
+/* Returns the `segments` segments; NULL if the sample is not a foreground. */
 static inline const struct scanhub_segment_v2 *scanhub_segments(const struct scanhub_sample *foreground)
 {
     if (!scanhub_foreground_is_whole(foreground))
@@ -864,8 +865,8 @@ static inline const struct scanhub_segment_v2 *scanhub_segments(const struct sca
     return (const struct scanhub_segment_v2 *)at;
 }
 
-/* 1: segment i has several beams, or the foreground of the scan before was near it. 0: it may be an edge that flickers, or
- * there is no such segment. */
+/* Returns 1 if segment i is supported: it has several beams, or the foreground of the previous scan was near it. Returns 0 if
+ * it may be a flickering edge, or does not exist. */
 static inline int scanhub_has_support(const struct scanhub_sample *foreground, unsigned i)
 {
     const struct scanhub_foreground_v2 *head = (const struct scanhub_foreground_v2 *)foreground->payload;
@@ -874,7 +875,7 @@ static inline int scanhub_has_support(const struct scanhub_sample *foreground, u
     return (int)(head->supported >> i & 1);
 }
 
-/* 1: beam i of the scan is in the foreground. */
+/* Returns 1 if beam i of the scan is in the foreground. */
 static inline int scanhub_in_foreground(const struct scanhub_sample *foreground, unsigned i)
 {
     const struct scanhub_segment_v2 *segments = scanhub_segments(foreground);
@@ -883,7 +884,7 @@ static inline int scanhub_in_foreground(const struct scanhub_sample *foreground,
     return ((const uint8_t *)(const void *)(segments + SCANHUB_FOREGROUND_SEGMENTS))[i / 8] >> (i % 8) & 1;
 }
 
-/* The ranges of the beams in the foreground, in their order, as many as `beams`, in device units; NULL if the sample is none. */
+/* Returns the ranges of the `beams` foreground beams, in their order, in device units; NULL if the sample is not a foreground. */
 static inline const uint16_t *scanhub_foreground_ranges(const struct scanhub_sample *foreground)
 {
     const struct scanhub_segment_v2 *segments = scanhub_segments(foreground);
@@ -894,8 +895,8 @@ static inline const uint16_t *scanhub_foreground_ranges(const struct scanhub_sam
 }
 
 /*
- * The ranges of a background, as many as `count`, in device units: 0 not known, 65535 beyond what the sensor measures; NULL if
- * the sample is none.
+ * Returns the `count` ranges of a background in device units: 0 if unknown, 65535 if beyond the maximum range. NULL if the
+ * sample is not a background.
  */
 static inline const uint16_t *scanhub_background_ranges(const struct scanhub_sample *background)
 {
@@ -905,7 +906,7 @@ static inline const uint16_t *scanhub_background_ranges(const struct scanhub_sam
     return (const uint16_t *)(const void *)(head + 1);
 }
 
-/* The points of a cloud, as many as `count`; NULL if the sample is none. */
+/* Returns the `count` points of a cloud; NULL if the sample is not a cloud. */
 static inline const struct scanhub_cloud_point_v2 *scanhub_cloud_points(const struct scanhub_sample *cloud)
 {
     const struct scanhub_cloud_v2 *head = (const struct scanhub_cloud_v2 *)cloud->payload;
@@ -915,7 +916,7 @@ static inline const struct scanhub_cloud_point_v2 *scanhub_cloud_points(const st
     return (const struct scanhub_cloud_point_v2 *)(const void *)(head + 1);
 }
 
-/* A compiler with another layout than the hub's stops here. */
+/* Compilation fails here if the compiler's layout differs from that of the hub. */
 #if defined(__cplusplus)
 #define SCANHUB_MUST(name, what) static_assert(what, #name)
 #elif defined(__STDC_VERSION__) && __STDC_VERSION__ >= 201112L

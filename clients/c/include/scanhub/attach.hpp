@@ -1,9 +1,9 @@
 /*
- * The same for C++11 and later: what scanhub_open opens and scanhub_take lends is given back at the end of its scope, and a
- * refusal is an exception. <scanhub/attach.h> has the words. C++17 adds functions that return std::optional, and a library
- * with std::span adds functions that return the arrays of a sample.
+ * Wrapper of <scanhub/attach.h> for C++11 and later. Handles are closed and samples are released at the end of their scope,
+ * and a refusal is an exception. <scanhub/attach.h> describes the functions. With C++17, some functions also return
+ * std::optional. With std::span, functions return the arrays of a sample.
  *
- * An object belongs to the thread that made it, and so do its samples: another thread may read a sample, but not release it.
+ * An object and its samples belong to the thread that created the object. Another thread may read a sample, but not release it.
  *
  *     scanhub::Attachment scans("front", SCANHUB_TOPIC_SCAN);
  *     while (scanhub::Sample sample = scans.next())
@@ -28,7 +28,7 @@
 
 namespace scanhub {
 
-/* A call that was refused: what() says why and what to do. */
+/* Error of a call that was refused. what() returns the reason and the remedy. */
 class Refused : public std::runtime_error {
 public:
     explicit Refused(int number) : std::runtime_error(scanhub_error()), number_(number) {}
@@ -66,7 +66,7 @@ template <> struct TopicOf<scanhub_obstacles_v2> { enum { number = SCANHUB_TOPIC
 /* End of topics. */
 template <> struct TopicOf<scanhub_robot> { enum { number = 0 }; };
 
-/* A sample, or none; given back when it goes out of scope. */
+/* A sample, or none. It is released when it goes out of scope. */
 class Sample {
 public:
     Sample() : sample_(), topic_() {}
@@ -85,7 +85,7 @@ public:
     /* Its fields: header, length, missed, restarted, stale. */
     const scanhub_sample *operator->() const { return &sample_; }
     const scanhub_sample &operator*() const { return sample_; }
-    /* The payload, or what it begins with, of the type that belongs to the topic. */
+    /* The payload, or its head, of the type that belongs to the topic. */
     template <typename Payload> const Payload &as() const
     {
         if (sample_.length < sizeof(Payload) || topic_ != TopicOf<Payload>::number)
@@ -107,7 +107,7 @@ struct Silence {
     std::string text;
 };
 
-/* A topic that is followed, in the thread that made it. */
+/* A subscription to a topic, for the thread that created it. */
 class Attachment {
 public:
     explicit Attachment(const char *sensor, int topic, int wait = SCANHUB_WAIT_DOORBELL, const char *domain = nullptr)
@@ -122,7 +122,7 @@ public:
         check(scanhub_open_robot(&all.handle_, domain, sensors, wait));
         return all;
     }
-    /* The same with early warnings, as scanhub_open_robot_early. */
+    /* The verdict with early warnings, as scanhub_open_robot_early. */
     static Attachment robot_early(
         const char *sensors = nullptr, int wait = SCANHUB_WAIT_DOORBELL, const char *domain = nullptr)
     {
@@ -139,10 +139,10 @@ public:
     }
     Attachment(const Attachment &) = delete;
     Attachment &operator=(const Attachment &) = delete;
-    /* Samples that are still lent end with it. */
+    /* Samples that are still lent become invalid. */
     ~Attachment() { scanhub_close(handle_); }
 
-    /* The next sample if there is one; never waits. */
+    /* Returns the next sample, or none if no sample waits. Never waits. */
     Sample take()
     {
         Sample sample;
@@ -150,7 +150,7 @@ public:
         check(scanhub_take(handle_, &sample.sample_));
         return sample;
     }
-    /* Waits for the next sample; none if `timeout_ms` are over (negative: never). */
+    /* Waits for the next sample. Returns none after `timeout_ms`; a negative timeout never expires. */
     Sample next(int timeout_ms = -1)
     {
         return check(scanhub_wait(handle_, timeout_ms)) == 1 ? take() : Sample();
