@@ -1,7 +1,7 @@
-"""The datagrams of `scanhub gateway` for programs in Python: checks one, and tells what it says.
+"""Reader of the datagrams of `scanhub gateway` for programs in Python: it checks a datagram and decodes its payload.
 
-Refuses to know sockets and what is missing between two datagrams. Needs Python 3.9 and nothing else; with numpy the
-ranges of a scan are a view into the datagram. docs/datagram.md has the bytes.
+The program receives the datagrams, and detects gaps by `sequence`. The module needs only Python 3.9. With numpy, the ranges
+of a scan are a view into the datagram. docs/datagram.md has the bytes.
 
     import socket, struct, scanhub_lan
 
@@ -70,7 +70,7 @@ AUTHENTICATED, SIMULATED, REPLAYED, STAMP_ESTIMATED, SUSPECT = 1, 2, 4, 8, 16
 
 
 class Refused(ValueError):
-    """A datagram that is none, or is not for us; `reason` is one word."""
+    """Refusal of a datagram that is invalid or not accepted. `reason` is one word."""
 
     def __init__(self, reason: str):
         super().__init__(f"refused: {reason}")
@@ -78,7 +78,7 @@ class Refused(ValueError):
 
 
 def group(topic: str) -> str:
-    """The address of the group that a topic goes to."""
+    """Returns the address of the group to which a topic is sent."""
     return f"239.255.76.{dict(zip(TOPICS, _GROUPS)).get(topic, 81)}"
 
 
@@ -94,7 +94,7 @@ class Announced:
 
 @dataclass(frozen=True)
 class Announce:
-    """Who a sensor is and what goes out of it; `boot` is the hub's life."""
+    """Announcement of a sensor and its topics. `boot` is the ID of the hub's run."""
 
     boot: int
     sensor: str
@@ -104,8 +104,8 @@ class Announce:
 
 @dataclass(frozen=True)
 class Telegram:
-    """What a sensor sent, as it came: of an LMS a telegram, STX to CRC; of other families whole packets that arrived
-    together, `packets` of them (None of an LMS). `family` is None if it is not known here."""
+    """Bytes of a sensor as they arrived: for an LMS a telegram, from STX to CRC; for other families complete packets that
+    arrived together. `packets` is their number, None for an LMS. `family` is None if this version does not support it."""
 
     telegram: bytes
     family: Optional[str]
@@ -670,10 +670,12 @@ Payload = Union[
 class Datagram:
     """A datagram whose header, lengths and checksum are right.
 
-    `hub` is the gateway, `epoch` its life (a greater one ends the one before), `sequence` the number of the sample among
-    those of this sensor and topic (modulo 2^32: a gap is what was lost), `counter` the same in all that came from one
-    telegram, `stamp_ns` the wall clock of the telegram's first byte. `part` of `parts`, from 0: a sample that is longer
-    than a datagram comes in several, see `Parts`. `family` is the number of the sensor's. `authenticated`: a key was given, and the MAC is of it.
+    - `hub` is the number of the gateway, and `epoch` that of its run. A greater epoch ends the run before.
+    - `sequence` is the number of the sample in its sensor and topic, modulo 2^32. A gap means lost samples.
+    - `counter` is the same in all datagrams of one telegram. `stamp_ns` is the wall clock of the telegram's first byte.
+    - `part` counts the `parts` of a sample from 0. A sample that is too long for a datagram has several, see `Parts`.
+    - `family` is the number of the scanner's family.
+    - `authenticated` is True if a key was given and the MAC was computed with it.
     """
 
     number: int
@@ -693,12 +695,12 @@ class Datagram:
 
     @property
     def topic(self) -> Optional[str]:
-        """Its name, None if it is not known here."""
+        """Name of the topic; None if this version does not know it."""
         return TOPICS[self.number] if self.number < len(TOPICS) else None
 
     def unpack(self) -> Payload:
-        """What the payload says; Refused: `skipped` if the topic is not known, `payload` if it contradicts itself or is a
-        part by itself."""
+        """Returns the decoded payload. Raises Refused: `skipped` if this version does not know the topic, `payload` if the
+        payload contradicts itself or is only a part."""
         if self.number >= len(TOPICS):
             raise Refused("skipped")
         if self.revision == 0 or self.parts != 1:
@@ -714,7 +716,7 @@ class Datagram:
 
 
 def read(data: bytes, key: Optional[bytes] = None) -> Datagram:
-    """Checks `data`, a whole datagram as it was received. With a key only what has its MAC is taken."""
+    """Checks `data`, a complete datagram as it was received. With a `key`, accepts only datagrams with its MAC."""
     data = bytes(data)
     if len(data) < _DATAGRAM.size:
         raise Refused("short")
@@ -743,8 +745,8 @@ def read(data: bytes, key: Optional[bytes] = None) -> Datagram:
 
 
 def read_key(path: str) -> bytes:
-    """The key in a file of `scanhub key new`, for `read`: 32 bytes, or 64 hex digits. ValueError if it is none, or if others
-    can use it."""
+    """Returns the key in a file of `scanhub key new`, for `read`: 32 bytes, or 64 hex digits. Raises ValueError if the file
+    contains no key, or if other users can access it."""
     with open(path, "rb") as file:
         mode = os.fstat(file.fileno()).st_mode
         if mode & 0o077:
@@ -760,30 +762,31 @@ def read_key(path: str) -> bytes:
 
 
 class Guard:
-    """What is new, and not of a recording, of what was read with a key.
+    """Filter of datagrams that were read with a key. It accepts only new ones, and no replayed recordings.
 
         datagram = guard.take(scanhub_lan.read(data, key))
 
-    A sensor is believed from an announcement on that is stamped within 5 s of our clock; from then on numbers and epochs only
-    go forward. `epochs` has the greatest epoch of each gateway: keep it over restarts, and begin with it. It knows no
-    senders. Parts are judged, and not counted: `take` the sample again when `Parts` has made it whole.
+    A sensor is accepted from an announcement on that is stamped within 5 s of this machine's clock. From then on, sequence
+    numbers and epochs only increase. `epochs` has the greatest epoch of each gateway: save it, and start with it after a
+    restart. Senders are not distinguished. Parts are checked but not counted: call `take` again with the complete sample of
+    `Parts`.
     """
 
     STREAMS = 1024
-    """The most topics of all sensors."""
+    """Maximum number of topics of all sensors."""
 
     def __init__(self, epochs: "Optional[dict[int, int]]" = None):
         self.epochs: "dict[int, int]" = dict(epochs or {})
-        # By hub, sensor and topic: the lowest number that is believed, the highest that came, those of the window that did.
+        # By hub, sensor and topic: the lowest accepted number, the highest that arrived, and those of the window that arrived.
         self._streams: "dict[tuple[int, int, int], tuple[int, Optional[int], set[int]]]" = {}
-        # By hub: the epoch of which the streams are.
+        # By hub: the epoch to which the streams belong.
         self._lives: "dict[int, int]" = {}
 
     def take(self, datagram: Datagram, wall_ns: Optional[int] = None) -> Datagram:
-        """`datagram`, if it is to be believed; `wall_ns` is our clock, ns since 1970.
+        """Returns `datagram` if it is accepted. `wall_ns` is this machine's clock, ns since 1970; None means now.
 
-        Refused: `unauthenticated` if it was read without a key, `untimely`, `epoch`, `stale`, `capacity`, and `duplicate` if
-        it came before."""
+        Raises Refused: `unauthenticated` if the datagram was read without a key, `untimely`, `epoch`, `stale`, `capacity`, and
+        `duplicate` if it arrived before."""
         if not datagram.authenticated:
             raise Refused("unauthenticated")
         hub, sensor = datagram.hub, datagram.sensor
@@ -817,7 +820,7 @@ class Guard:
     def _count(self, datagram: Datagram) -> None:
         key = datagram.hub, datagram.sensor, datagram.number
         lowest, highest, seen = self._streams[key]
-        # The number without wrapping: the nearest to what is known.
+        # The number without wrapping is the one nearest to the known numbers.
         known = lowest if highest is None else highest
         number = known + (datagram.sequence - known + 0x80000000) % 0x100000000 - 0x80000000
         if number < lowest:
@@ -834,23 +837,23 @@ class Guard:
         self._streams[key] = lowest, highest, seen
 
 
-# Numbers below the highest that are still kept apart.
+# Sequence numbers up to the highest one that are distinguished. Older ones are stale.
 _WINDOW = 1024
 
 
 class Parts:
-    """Puts together what comes in parts, of one sender: of each hub, sensor and topic at most four samples wait for parts
-    that did not come, and no more than 64 in all; the oldest make room."""
+    """Reassembles samples that one sender sends in parts. At most four samples of a hub, sensor and topic wait for missing
+    parts, and at most 64 in all. The oldest are evicted."""
 
     def __init__(self):
         self._unfinished: "dict[tuple[Datagram, int], dict[int, bytes]]" = {}
 
     def take(self, datagram: Datagram) -> Optional[Datagram]:
-        """The sample that is whole with this datagram; None as long as parts of it are missing."""
+        """Returns the sample that is complete with this datagram; None while parts of it are missing."""
         if datagram.parts == 1:
             return datagram
         head = replace(datagram, part=0, parts=1, payload=b"")
-        # What waits for longest stands first.
+        # The sample that has waited for longest is first.
         parts = self._unfinished.pop((head, datagram.parts), {})
         parts[datagram.part] = datagram.payload
         if len(parts) == datagram.parts:

@@ -22,14 +22,14 @@ except ImportError:
 
 
 def points_m(ranges_m: NDArray[np.float64], angles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points from the sensor, ahead and to the left."""
+    """Returns points in the sensor's frame: ahead and to the left, in meters."""
     return ranges_m * np.cos(angles), ranges_m * np.sin(angles)
 
 
 def scan_and_background(
     file: str, sensor: str | None, config: str | None, at_s: float
 ) -> tuple[scanhub.Scan | None, scanhub.Background | None]:
-    """The scan at `at_s` seconds after the first one, or the last one before, and the background as of then."""
+    """Returns the scan at `at_s` seconds after the first one, or the last one before, and the background at that time."""
     scan, background, begin_ns = None, None, None
     with scanhub.read(file, topics=["scan", "background"], sensor=sensor, config=config) as recording:
         # Without a choice, the first sensor.

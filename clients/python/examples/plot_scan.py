@@ -19,7 +19,7 @@ except ImportError:
 
 
 def points_m(scan: scanhub.Scan) -> "tuple[np.ndarray, np.ndarray]":
-    """Where the beams ended, from the sensor: ahead and to the left."""
+    """Returns the ends of the beams in the sensor's frame: ahead and to the left, in meters."""
     angles, ranges = scan.angles, scan.ranges_m
     return ranges * np.cos(angles), ranges * np.sin(angles)
 
@@ -53,7 +53,7 @@ def main() -> None:
         if options.output:
             figure.savefig(options.output, dpi=120)
             break
-        # Drawing takes longer than a scan: what comes meanwhile is counted as missed, and nobody waits for it.
+        # Drawing takes longer than a scan period. Scans that arrive in the meantime count as missed.
         plt.pause(0.001)
         if not plt.fignum_exists(figure.number):
             break

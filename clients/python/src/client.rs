@@ -465,8 +465,8 @@ impl SharedPayload {
     /// Returns the used bytes, and those that fill the last word of a payload of variable length.
     pub(crate) fn words(&self) -> &[u8] {
         let len = if self.is_slice { self.len.next_multiple_of(8) } else { self.len };
-        // SAFETY: `_sample` is kept until `self` is dropped. Until then, its payload in shared memory does not move, and
-        // the hub does not write it. A payload of variable length consists of whole words of 8 bytes.
+        // SAFETY: `_sample` is kept until `self` is dropped. Until then, its payload in shared memory does not move,
+        // and the hub does not write it. A payload of variable length consists of whole words of 8 bytes.
         unsafe { std::slice::from_raw_parts(ptr::with_exposed_provenance(self.address), len) }
     }
 }

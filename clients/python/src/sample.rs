@@ -117,7 +117,8 @@ getters! {
     flags: PyResult<Bound<'py, PyFrozenSet>> = PyFrozenSet::new(slf.py(), Flags::names(header.flags));
     /// Nominal period of the scans in microseconds; None if unknown.
     period_us: Option<u32> = Some(header.period_us).filter(|period_us| *period_us != 0);
-    /// Time from the telegram's last byte until the sample was sent, in steps of 256 ns; None if unknown or more than 4 s.
+    /// Time from the telegram's last byte until the sample was sent, in steps of 256 ns; None if unknown or more than 4
+    /// s.
     hub_time_ns: Option<u64> = header.hub_time_ns();
 
     + {

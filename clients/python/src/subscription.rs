@@ -113,7 +113,7 @@ macro_rules! follower {
                 py.detach(|| self.source.with(PollableSource::leave));
             }
 
-            /// Whether a hub or listener publishes in the domain, as of the last look.
+            /// Whether a hub or listener publishes in the domain, as of the last check.
             #[getter]
             fn hub_is_running(&self, py: Python<'_>) -> bool {
                 // A waiting thread can hold the lock for a tenth of a second.

@@ -1,5 +1,5 @@
-//! Classes of the samples, one for each topic. Scalars are read from shared memory, and arrays are views of it. Lists and tables
-//! are copies, whose elements are the named tuples of `scanhub.values`.
+//! Classes of the samples, one for each topic. Scalars are read from shared memory, and arrays are views of it. Lists
+//! and tables are copies, whose elements are the named tuples of `scanhub.values`.
 
 use bytemuck::cast_slice;
 use pyo3::prelude::*;

@@ -1,5 +1,5 @@
-"""Follows topics and prints each sample as `scanhub echo --json` does, and notices: arguments are domain, root, topics.
-Ends by Ctrl-C, and says so."""
+"""Subscribes to topics, and prints each sample as `scanhub echo --json` does, and notices. Arguments are domain, root and
+topics. Ctrl-C ends the program, which prints that."""
 
 import json
 import math
@@ -114,7 +114,7 @@ def events(sample: scanhub.Event) -> dict:
 
 
 def rounded(value: float, digits: int) -> float:
-    """Halves away from 0, as Rust rounds."""
+    """Rounds halves away from 0, as Rust does."""
     return math.copysign(math.floor(abs(value) * 10**digits + 0.5), value) / 10**digits
 
 
@@ -173,7 +173,7 @@ def status(sample: scanhub.Status) -> dict:
 
 
 def say(line: dict) -> None:
-    """With one system call that Ctrl-C does not interrupt, so that a full pipe gets no half of it."""
+    """Writes with one system call that Ctrl-C does not interrupt, so that a full pipe gets no partial line."""
     written = (json.dumps(line) + "\n").encode()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     assert os.write(sys.stdout.fileno(), written) == len(written)

@@ -1,5 +1,5 @@
-"""Programs that publish under names of their own, how they come and go: arguments are domain and root, of which nobody else
-knows."""
+"""Tests of programs that publish under their own names, start and end. Arguments are domain and root of a domain that no
+other program uses."""
 
 import contextlib
 import os

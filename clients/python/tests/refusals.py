@@ -1,4 +1,5 @@
-"""What cannot be followed, and what is said of it: arguments are domain and root, of which nobody else knows."""
+"""Tests of subscriptions that are refused, and of the messages. Arguments are domain and root of a domain that no other
+program uses."""
 
 import asyncio
 import fcntl
@@ -233,7 +234,7 @@ def finds_resource_shortages() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     mount = publish("other")
     subscription = scanhub.subscribe("other/tilt", domain=domain, root=root, timeout=1)
-    # Fewer than one more port takes.
+    # One more port needs more than these.
     resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 6, before[1]))
     refused = [refusal(scanhub.Short, lambda: next(subscription)), refusal(scanhub.Short, publish)]
     resource.setrlimit(resource.RLIMIT_NOFILE, before)

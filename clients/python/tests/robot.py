@@ -1,6 +1,6 @@
-"""Follows the verdict of a robot and prints each as a line of JSON: arguments are domain, root, sensors, before them perhaps
-`--early`. Each tenth is also asked for by `now`, which never waits. Ends by Ctrl-C, and says so. With `--asked` in place of
-sensors: what `now` says for each line of stdin."""
+"""Subscribes to the verdict of a robot, and prints each verdict as a line of JSON. Arguments are domain, root and sensors,
+and optionally `--early` before them. One in ten verdicts is also requested with `now`, which never waits. Ctrl-C ends the program,
+which prints that. With `--asked` in place of sensors, prints the result of `now` for each line of stdin."""
 
 import json
 import os
@@ -12,7 +12,7 @@ import scanhub
 
 
 def say(line: dict) -> None:
-    """With one system call, so that Ctrl-C leaves no half of it."""
+    """Writes with one system call, so that Ctrl-C leaves no partial line."""
     written = (json.dumps(line) + "\n").encode()
     assert os.write(sys.stdout.fileno(), written) == len(written)
 

@@ -73,7 +73,7 @@ def a_view_keeps_its_sample(scans: scanhub.Subscriber) -> None:
     kept, before = scan.ranges[100:200], scan.ranges[100:200].copy()
     seq = scan.topic_seq
     del scan
-    # Far more than the hub has places for, were they not taken anew: the sample's own is not among them.
+    # Far more than the hub has slots, unless they are released in between. The sample's own slot is not one of them.
     for scan in scans:
         assert scan.ranges.ctypes.data + 200 != kept.ctypes.data
         if scan.topic_seq > seq + 60:

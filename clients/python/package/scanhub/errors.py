@@ -1,10 +1,10 @@
-"""The errors: each has a message, and a remedy for the user."""
+"""Errors. Each has a message, and a remedy for the user."""
 
 from __future__ import annotations
 
 
 class Failure(Exception):
-    """What happened, and in `remedy` how to fix it; the remedy may be empty."""
+    """Any error of this package. `message` says what happened, and `remedy` how to fix it; the remedy may be empty."""
 
     def __init__(self, message: str, remedy: str = "") -> None:
         super().__init__(message)
@@ -25,11 +25,11 @@ class RecordingWarning(UserWarning):
 
 
 class Unreadable(Failure, OSError):
-    """There is no such file, it cannot be read, or it is not a recording."""
+    """The file does not exist, cannot be read, or is not a recording."""
 
 
 class NoHub(Failure):
-    """No hub lives in the domain, or it went away before it answered."""
+    """No hub runs in the domain, or it ended before it replied."""
 
 
 class NoTopic(Failure):
@@ -37,7 +37,7 @@ class NoTopic(Failure):
 
 
 class Silent(Failure, TimeoutError):
-    """There is a hub, but no sample came within the timeout."""
+    """A hub runs, but no sample arrived within the timeout."""
 
 
 class Mismatch(Failure):
@@ -45,7 +45,7 @@ class Mismatch(Failure):
 
 
 class Denied(Failure):
-    """The domain is another user's."""
+    """The domain belongs to another user."""
 
 
 class Short(Failure):
