@@ -60,7 +60,7 @@ impl Options {
 
 /// Results of the run.
 #[derive(Default)]
-struct WarningRun {
+struct RoomRun {
     /// Every position that was background at any time.
     models: Vec<Position>,
     /// Every position that was foreground at any time.
@@ -72,9 +72,9 @@ struct WarningRun {
     scan: Box<Scan>,
 }
 
-impl WarningRun {
-    fn new(options: &Options) -> WarningRun {
-        let mut run = WarningRun::default();
+impl RoomRun {
+    fn new(options: &Options) -> RoomRun {
+        let mut run = RoomRun::default();
         let beams = Variant::HALF.beams();
         let mut model =
             BackgroundModel::new(Settings { method: options.method, ..Settings::default() }, beams);
@@ -89,7 +89,7 @@ impl WarningRun {
             model.write(&mut background);
             let ranges = background.ranges();
             if ranges != run.after {
-                run.models.extend(fill_slots(&scan, ranges));
+                run.models.extend(positions(&scan, ranges));
                 run.after = ranges.to_vec();
             }
             run.foreground.extend(foreground.readings().map(|(i, range)| Position::of(&scan, i, range)));
@@ -119,13 +119,13 @@ impl WarningRun {
 
     fn before(&self) -> FloorPlan {
         let mut picture = FloorPlan::new("the model before anything changed");
-        picture.dots("background", &fill_slots(&self.scan, &self.before));
+        picture.dots("background", &positions(&self.scan, &self.before));
         picture
     }
 
     fn after(&self) -> FloorPlan {
         let mut picture = FloorPlan::new("the model at the end, and what is different");
-        picture.dots("background", &fill_slots(&self.scan, &self.after));
+        picture.dots("background", &positions(&self.scan, &self.after));
         picture.dots("gone", &self.differences(&self.after, &self.before));
         picture.dots("new", &self.differences(&self.before, &self.after));
         picture
@@ -134,7 +134,7 @@ impl WarningRun {
     fn snapshot(&self) -> FloorPlan {
         let mut picture = FloorPlan::new("one scan: foreground before its model, in segments");
         if let Some((model, foreground)) = &self.snapshot {
-            picture.dots("background", &fill_slots(&self.scan, model));
+            picture.dots("background", &positions(&self.scan, model));
             let dots = foreground.readings().map(|(i, range)| Position::of(&self.scan, i, range));
             picture.dots("foreground", &dots.collect::<Vec<_>>());
             for segment in foreground.segments() {
@@ -155,12 +155,12 @@ fn is_known(range: u16) -> bool {
     range != Background::UNKNOWN && range != Background::FAR
 }
 
-fn fill_slots(scan: &Scan, ranges: &[u16]) -> Vec<Position> {
+fn positions(scan: &Scan, ranges: &[u16]) -> Vec<Position> {
     let known = ranges.iter().enumerate().filter(|(_, range)| is_known(**range));
     known.map(|(i, &range)| Position::of(scan, i, range)).collect()
 }
 
-fn draw(run: &WarningRun, directory: &Path) -> std::io::Result<()> {
+fn draw(run: &RoomRun, directory: &Path) -> std::io::Result<()> {
     std::fs::create_dir_all(directory)?;
     for (name, picture) in [
         ("overlay", run.overlay()),
@@ -184,7 +184,7 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    let run = WarningRun::new(&options);
+    let run = RoomRun::new(&options);
     let known = |model: &[u16]| model.iter().filter(|range| is_known(**range)).count();
     println!("fig8, seed {}, {:?}, {} scans", options.seed, options.method, SCAN_COUNT);
     println!("  foreground readings in all      {:>6}", run.foreground.len());

@@ -66,7 +66,7 @@ fn measure(options: &Options) -> Outcome<()> {
             "ages",
             environment.domain.name(),
             SENSOR,
-            &(count + SETTLE_TIME).to_string(),
+            &(count + SKIPPED_SCANS).to_string(),
         ])
     };
     let mut figures = Vec::new();
@@ -74,7 +74,7 @@ fn measure(options: &Options) -> Outcome<()> {
         let Some(words) = subscriber()? else { continue };
         let own = || {
             let last =
-                [environment.domain.name(), SENSOR, &(count + SETTLE_TIME).to_string()].map(str::to_owned);
+                [environment.domain.name(), SENSOR, &(count + SKIPPED_SCANS).to_string()].map(str::to_owned);
             Child::start(&words[0], &[&words[1..], &last].concat())
         };
         let (mut others, mut baselines) = (Vec::new(), Vec::new());
@@ -101,7 +101,7 @@ fn measure(options: &Options) -> Outcome<()> {
 /// Returns the ages of `count` scans in us, sorted. Drops the first scans.
 fn ages(subscriber: &Child, count: usize) -> Outcome<Vec<f64>> {
     let lines = subscriber.lines_until("end", STEP_TIMEOUT + Duration::from_millis(50) * count as u32)?;
-    let aged = lines.iter().filter(|line| line.text.starts_with("aged")).skip(SETTLE_TIME);
+    let aged = lines.iter().filter(|line| line.text.starts_with("aged")).skip(SKIPPED_SCANS);
     let mut ages: Vec<f64> = aged.map(|line| Ok(line.number(2)? as f64 / 1e3)).collect::<Outcome<_>>()?;
     ages.sort_by(f64::total_cmp);
     Ok(ages)
@@ -238,4 +238,4 @@ const SENSOR: &str = "front";
 /// Sensors in the recording.
 const RECORDED: [&str; 2] = ["front", "rear"];
 /// Scans at the start of a run that do not count.
-const SETTLE_TIME: usize = 40;
+const SKIPPED_SCANS: usize = 40;

@@ -39,7 +39,7 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
     let sent = sent.collect::<Outcome<Vec<_>>>()?;
     let mut latencies = Vec::new();
     for (round, runs) in rounds.iter().enumerate() {
-        let of = |(number, run): (usize, &WarningRun)| {
+        let of = |(number, run): (usize, &ReceivedTelegrams)| {
             let is_hub = comparison.programs[number].is_hub();
             run.latencies(&sent[comparison.line_index(number, round)], shared_span(runs), is_hub)
         };
@@ -72,7 +72,7 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
 }
 
 /// Telegrams received through one program in a round.
-struct WarningRun(Vec<ReceivedTelegram>);
+struct ReceivedTelegrams(Vec<ReceivedTelegram>);
 
 struct ReceivedTelegram {
     sensor: usize,
@@ -83,7 +83,7 @@ struct ReceivedTelegram {
     at_ns: u64,
 }
 
-impl WarningRun {
+impl ReceivedTelegrams {
     /// Returns the time from which the run counts, and its end. The start is that of the sensor that started to stream
     /// last, and the end that of the sensor that ended first.
     fn span(&self) -> (u64, u64) {
@@ -118,8 +118,8 @@ impl WarningRun {
 }
 
 /// Returns the span in which all runs of a round count.
-fn shared_span(runs: &[WarningRun]) -> (u64, u64) {
-    let spans = runs.iter().map(WarningRun::span);
+fn shared_span(runs: &[ReceivedTelegrams]) -> (u64, u64) {
+    let spans = runs.iter().map(ReceivedTelegrams::span);
     spans.fold((0, u64::MAX), |all, span| (all.0.max(span.0), all.1.min(span.1)))
 }
 
@@ -131,7 +131,7 @@ struct Latencies {
 }
 
 /// Runs all programs until each has received `count` telegrams of each sensor after the start. Returns these telegrams.
-fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome<Vec<WarningRun>> {
+fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome<Vec<ReceivedTelegrams>> {
     let count = count + (SETTLE_TIME.as_millis() as u64 * SCAN_RATE_MHZ / 1_000_000) as usize;
     let start = |(number, candidate): (usize, &MeasuredProgram)| -> Outcome<_> {
         let program = candidate.start(
@@ -162,8 +162,8 @@ fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome
     Ok(runs)
 }
 
-fn through_hub(subscribers: &[Child], count: usize) -> Outcome<WarningRun> {
-    let mut run = WarningRun(Vec::new());
+fn through_hub(subscribers: &[Child], count: usize) -> Outcome<ReceivedTelegrams> {
+    let mut run = ReceivedTelegrams(Vec::new());
     for (sensor, subscriber) in subscribers.iter().enumerate() {
         for line in subscriber.lines_until("end", timeout(count))? {
             if let ["telegram", _, _, _, _, _, hash, _] = line.words()[..] {
@@ -175,13 +175,13 @@ fn through_hub(subscribers: &[Child], count: usize) -> Outcome<WarningRun> {
     Ok(run)
 }
 
-fn through_baseline(baseline: &Child, sensors: usize, count: usize) -> Outcome<WarningRun> {
+fn through_baseline(baseline: &Child, sensors: usize, count: usize) -> Outcome<ReceivedTelegrams> {
     let lines = baseline.lines_until("end", timeout(count))?;
     let of = |description: &str, sensor: usize| -> Vec<&OutputLine> {
         let number = sensor.to_string();
         lines.iter().filter(|line| line.words().get(..2) == Some(&[description, &number])).collect()
     };
-    let mut run = WarningRun(Vec::new());
+    let mut run = ReceivedTelegrams(Vec::new());
     for sensor in 0..sensors {
         // The wake-up carries no bytes: the nth one belongs to the nth telegram.
         for (read, woken) in of("read", sensor).into_iter().zip(of("woken", sensor)) {

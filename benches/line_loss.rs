@@ -32,8 +32,8 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options) -> Outcome<()> {
     let telegrams = options.count(TELEGRAM_COUNT);
-    let runs: Vec<WarningRun> =
-        (0..options.pairs() as u64).map(|seed| WarningRun::new(telegrams, seed)).collect();
+    let runs: Vec<LineRun> =
+        (0..options.pairs() as u64).map(|seed| LineRun::new(telegrams, seed)).collect();
     if !options.json {
         println!(
             "{telegrams} telegrams a line, {} lines; the paper lost 0.135 % of bytes, 40.8 % of telegrams",
@@ -46,13 +46,13 @@ fn measure(options: &Options) -> Outcome<()> {
 }
 
 /// A line, and the counts of each parser.
-struct WarningRun {
+struct LineRun {
     bytes_lost_percent: f64,
     stats: [TelegramCounts; 3],
 }
 
-impl WarningRun {
-    fn new(telegrams: usize, seed: u64) -> WarningRun {
+impl LineRun {
+    fn new(telegrams: usize, seed: u64) -> LineRun {
         let line = SimulatedLine::new(LineContent::Furnished, telegrams, seed);
         let mut accounts = [TelegramCounts::default(); 3];
         let [discarding, rewinding, speculative] = &mut accounts;
@@ -60,7 +60,7 @@ impl WarningRun {
         rewinding.run_parser(&line, &mut RewindingParser::new(line.header));
         speculative.run_parser(&line, &mut framer(&line));
         let lost = line.sent.len() - line.received.len();
-        WarningRun { bytes_lost_percent: lost as f64 * 100.0 / line.sent.len() as f64, stats: accounts }
+        LineRun { bytes_lost_percent: lost as f64 * 100.0 / line.sent.len() as f64, stats: accounts }
     }
 }
 
@@ -70,7 +70,7 @@ fn percent(stats: &TelegramCounts, of: u64) -> f64 {
 }
 
 /// Returns the figures of the hub's parser, starting with those of the line itself, as in the paper's columns.
-fn figures(runs: &[WarningRun]) -> Vec<Figure> {
+fn figures(runs: &[LineRun]) -> Vec<Figure> {
     let figure = |name, unit, hub: Vec<f64>, target| Figure { name, unit, hub, baseline: Vec::new(), target };
     let ours =
         |value: fn(&TelegramCounts) -> f64| runs.iter().map(|run| value(&run.stats[HUB_PARSER])).collect();
@@ -85,7 +85,7 @@ fn figures(runs: &[WarningRun]) -> Vec<Figure> {
 }
 
 /// Returns a row for each parser.
-fn cells(runs: &[WarningRun]) -> Vec<Cell> {
+fn cells(runs: &[LineRun]) -> Vec<Cell> {
     type Column = (&'static str, &'static str, fn(&TelegramCounts) -> f64);
     const COLUMNS: [Column; 7] = [
         ("damaged", "1", |stats| stats.damaged as f64),

@@ -304,7 +304,7 @@ fn coalesce(revolution_len: usize, ports: &[&str]) -> Outcome<()> {
     let mut readers = Vec::new();
     for (number, port) in ports.iter().enumerate() {
         let mut ends: Vec<OwnedFd> = Vec::new();
-        for _ in 0..SUBSCRIBER_COUNTS {
+        for _ in 0..SUBSCRIBERS_PER_SENSOR {
             let wake = eventfd(0, EventfdFlags::CLOEXEC)?;
             sleepers.push(baseline::start_sleeper(number, 0, wake.try_clone()?)?);
             ends.push(wake);
@@ -342,7 +342,7 @@ fn read_revolutions(line: &PtyLine, ends: &[OwnedFd], revolution_len: usize) -> 
 }
 
 /// Number of subscribers to a scanner.
-const SUBSCRIBER_COUNTS: usize = 2;
+const SUBSCRIBERS_PER_SENSOR: usize = 2;
 /// Time for which the hub leaves packets in the line, in ns.
 const READ_INTERVAL_NS: u64 = 5_000_000;
 

@@ -80,7 +80,7 @@ fn measure(options: &Options) -> Outcome<()> {
                     eprintln!("{} of {pairs}: {count} subscribers, {}", pair + 1, setup.name());
                 }
                 let load = setup.start(count)?.measure(span)?;
-                runs.push(WarningRun {
+                runs.push(MeasuredLoad {
                     set_up: setup,
                     count,
                     host: load.of_host((setup == Setup::Datagrams).then_some(deaf)),
@@ -94,7 +94,7 @@ fn measure(options: &Options) -> Outcome<()> {
 }
 
 /// One run of a setup.
-struct WarningRun {
+struct MeasuredLoad {
     set_up: Setup,
     count: usize,
     host: Host,
@@ -103,7 +103,7 @@ struct WarningRun {
 
 /// All runs.
 struct Tables<'a> {
-    runs: &'a [WarningRun],
+    runs: &'a [MeasuredLoad],
     counts: &'a [usize],
     processors: usize,
 }
@@ -117,11 +117,11 @@ struct Table {
 }
 
 /// Function that returns the value of a run for a table.
-type Value = fn(&WarningRun) -> f64;
+type Value = fn(&MeasuredLoad) -> f64;
 
 impl<'a> Tables<'a> {
     /// Creates the tables of runs with these numbers of subscribers.
-    fn of(runs: &'a [WarningRun], counts: &'a [usize]) -> Outcome<Tables<'a>> {
+    fn of(runs: &'a [MeasuredLoad], counts: &'a [usize]) -> Outcome<Tables<'a>> {
         Ok(Tables { runs, counts, processors: cpu_time::processors()? })
     }
 
@@ -180,7 +180,7 @@ impl<'a> Tables<'a> {
         self.chosen(set_up, count).map(value).collect()
     }
 
-    fn chosen(&self, set_up: Setup, count: usize) -> impl Iterator<Item = &WarningRun> {
+    fn chosen(&self, set_up: Setup, count: usize) -> impl Iterator<Item = &MeasuredLoad> {
         self.runs.iter().filter(move |run| run.set_up == set_up && run.count == count)
     }
 }

@@ -173,9 +173,9 @@ mod on_x86_64 {
             let mut steps = Vec::new();
             let mut of_status = Vec::new();
             let mut cost = stepper.step_telegram(|address, calls, system_call| {
-                let environment = profile.stage(address, calls.iter().map(|call| call.function));
-                steps.push((address, environment));
-                of_status.extend(system_call.filter(|_| environment == profile::PathStage::Status));
+                let stage = profile.stage(address, calls.iter().map(|call| call.function));
+                steps.push((address, stage));
+                of_status.extend(system_call.filter(|_| stage == profile::PathStage::Status));
             })?;
             for call in of_status {
                 cost.system_calls.entry(call).and_modify(|count| *count -= 1);
@@ -238,8 +238,8 @@ mod on_x86_64 {
                 add(table, row, column, vec![(count as f64 / telegrams * 10.0).round() / 10.0]);
             }
         };
-        for (environment, sum) in &profile.by_stage {
-            rows("by stage, mean", environment.name(), sum);
+        for (stage, sum) in &profile.by_stage {
+            rows("by stage, mean", stage.name(), sum);
         }
         for (name, sum) in sorted(&profile.by_crate, |sum| sum.instructions) {
             rows("by crate, mean", name, &sum);

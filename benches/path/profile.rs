@@ -184,7 +184,7 @@ impl PathStage {
         if STATUS_SUFFIXES.iter().any(|end| name.ends_with(end)) {
             return Some(PathStage::Status);
         }
-        STAGES.iter().find(|(part, _)| name.contains(part)).map(|(_, environment)| *environment)
+        STAGES.iter().find(|(part, _)| name.contains(part)).map(|(_, stage)| *stage)
     }
 }
 
@@ -258,11 +258,11 @@ impl<'a> Profile<'a> {
     pub(crate) fn stage(&mut self, address: u64, calls: impl DoubleEndedIterator<Item = u64>) -> PathStage {
         let mut found = self.stage_of(address);
         for function in calls.rev() {
-            let environment = self.stage_of(function);
-            if environment == Some(PathStage::Status) {
+            let stage = self.stage_of(function);
+            if stage == Some(PathStage::Status) {
                 return PathStage::Status;
             }
-            found = found.or(environment);
+            found = found.or(stage);
         }
         found.unwrap_or(PathStage::Other)
     }
@@ -277,16 +277,16 @@ impl<'a> Profile<'a> {
         let mut all = Steps::default();
         let mut by_stage = HashMap::<PathStage, Steps>::new();
         let (mut by_crate, mut by_function) = (HashMap::<&str, Steps>::new(), HashMap::<&str, Steps>::new());
-        for (address, environment) in steps {
-            by_stage.entry(environment).or_default().add(address);
+        for (address, stage) in steps {
+            by_stage.entry(stage).or_default().add(address);
             if let Some((index, _)) = self.code.function(address) {
-                let order = &mut self.first_steps[usize::from(environment == PathStage::Status)];
+                let order = &mut self.first_steps[usize::from(stage == PathStage::Status)];
                 let function = self.code.functions[index].0;
                 if !order.contains(&function) {
                     order.push(function);
                 }
             }
-            if environment == PathStage::Status {
+            if stage == PathStage::Status {
                 continue;
             }
             all.add(address);

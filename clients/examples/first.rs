@@ -1,4 +1,4 @@
-//! The program of docs/first-consumer.md, which shows all below this: `cargo run --release -p scanhub-client --example first`.
+//! The program of docs/first-program.md, which shows all below this: `cargo run --release -p scanhub-client --example first`.
 
 use std::time::Duration;
 

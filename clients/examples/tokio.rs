@@ -9,7 +9,7 @@ use tokio::time::timeout;
 
 const SILENCE_TIMEOUT: Duration = Duration::from_millis(500);
 
-async fn subscribe_marks(sensor: &str) -> Result<(), Error> {
+async fn print_scans(sensor: &str) -> Result<(), Error> {
     let mut scans = Subscriber::<Scan>::builder(sensor).open_pollable()?;
     loop {
         // The timeout drops the future; no scan is lost by that.
@@ -25,7 +25,7 @@ async fn subscribe_marks(sensor: &str) -> Result<(), Error> {
 pub(crate) async fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut tasks = JoinSet::new();
     for sensor in ["front", "rear"] {
-        tasks.spawn(subscribe_marks(sensor));
+        tasks.spawn(print_scans(sensor));
     }
     tokio::select! {
         ended = tokio::signal::ctrl_c() => ended?,

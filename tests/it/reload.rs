@@ -13,7 +13,7 @@ use serde_json::Value;
 const STREAM_FLAGS: [&str; 2] = ["--seed=71", "--baud=500000"];
 /// Minimum time from the stamp of the last scan to that of the unknown zones that the hub sends in a silence, in ns. A
 /// verdict is valid for two periods of 26.6 ms and 20 ms.
-const MAX_SILENCE_NS: u64 = 70_000_000;
+const MIN_SILENCE_NS: u64 = 70_000_000;
 
 /// Writes the configuration of one link with `settings` after it, and returns the flag for the file.
 fn configure(env: &TestEnv, settings: &str) -> String {
@@ -77,7 +77,7 @@ fn circles_change_in_a_stream_without_a_gap() {
     let mut last_ns = 0;
     verdicts.retain(|line| {
         let stamp_ns = number(line, "stamp_ns");
-        let is_silence = line["verdict"] == "unknown" && stamp_ns > last_ns + MAX_SILENCE_NS;
+        let is_silence = line["verdict"] == "unknown" && stamp_ns > last_ns + MIN_SILENCE_NS;
         last_ns = if is_silence { last_ns } else { stamp_ns };
         !is_silence
     });

@@ -19,7 +19,7 @@ fn marks_with_count(count: u8) -> Marks {
 }
 
 /// Returns the properties of the next sample: missed, restarted, number, marks.
-fn next_pair(subscriber: &mut Subscriber<Marks>) -> (u64, bool, u64, u8) {
+fn next_sample(subscriber: &mut Subscriber<Marks>) -> (u64, bool, u64, u8) {
     let sample = subscriber.next().unwrap().expect("a sample in time");
     (sample.missed, sample.restarted, sample.header().topic_seq, sample.count)
 }
@@ -48,7 +48,7 @@ fn publishes_without_a_hub_and_skips_count_as_missed() {
         );
         for count in 0..3 {
             near.send(|sample| *sample = marks_with_count(count)).unwrap();
-            assert_eq!(next_pair(&mut subscriber), (0, false, count.into(), count));
+            assert_eq!(next_sample(&mut subscriber), (0, false, count.into(), count));
         }
         near.skip(4);
         let before_ns = near.header().stamp_last_ns;
@@ -75,7 +75,7 @@ fn samples_that_are_sent_together_wake_once() {
     assert_eq!(near.send_with(&header, |sample| *sample = marks_with_count(1)).unwrap(), 1);
     assert_eq!(zones.send_with(&header, |sample| *sample = Zones::unknown()).unwrap(), 0);
     sensor.wake(WakeEvent::Telegram).unwrap();
-    assert_eq!(next_pair(&mut subscriber), (0, false, 0, 1));
+    assert_eq!(next_sample(&mut subscriber), (0, false, 0, 1));
     // A late joiner gets the samples that the topic stores.
     let mut late =
         Subscriber::<Zones>::builder("tracker.near").in_domain(&test_domain.domain).open().unwrap();
@@ -100,7 +100,7 @@ fn another_life_begins_again() {
     let mut subscriber = subscribe_marks(&test_domain, "tracker.near");
     assert!(subscriber.try_next().unwrap().is_none());
     near.send(|sample| *sample = marks_with_count(1)).unwrap();
-    assert_eq!(next_pair(&mut subscriber), (0, false, 0, 1));
+    assert_eq!(next_sample(&mut subscriber), (0, false, 0, 1));
     drop(near);
     let mut near = open();
     // The subscriber must find the topic first.
@@ -109,7 +109,7 @@ fn another_life_begins_again() {
         near.subscribers() == 1
     });
     near.send(|sample| *sample = marks_with_count(2)).unwrap();
-    assert_eq!(next_pair(&mut subscriber), (0, true, 0, 2));
+    assert_eq!(next_sample(&mut subscriber), (0, true, 0, 2));
 }
 
 #[test]
@@ -124,7 +124,7 @@ fn refused_duplicate_topic_does_not_break_wakeups() {
     let mut subscriber = subscribe_marks(&test_domain, "tracker.near");
     assert!(subscriber.try_next().unwrap().is_none());
     near.send(|sample| *sample = marks_with_count(1)).unwrap();
-    assert_eq!(next_pair(&mut subscriber), (0, false, 0, 1));
+    assert_eq!(next_sample(&mut subscriber), (0, false, 0, 1));
 }
 
 #[test]

@@ -65,7 +65,7 @@ fn join_with_or(names: &[&str]) -> String {
 }
 
 /// Returns the example and the comment of `key`, if the link of `family` shows it.
-fn value_and_source(family: Family, key: &Key) -> Option<(String, String)> {
+fn default_of_family(family: Family, key: &Key) -> Option<(String, String)> {
     let Features { models, modes, keys, .. } = features(family);
     let models: Vec<_> = [AUTO].into_iter().chain(models.iter().map(|model| model.name)).collect();
     let comment = paragraphs(key)[0].clone();
@@ -111,7 +111,7 @@ fn reference_file() -> String {
                 lines.push(format!("family = \"{}\"", family.name()));
                 let shown = keys_of_link
                     .iter()
-                    .filter_map(|(key, _)| Some((key.name, value_and_source(family, key)?)));
+                    .filter_map(|(key, _)| Some((key.name, default_of_family(family, key)?)));
                 let settings = shown.map(|(key, (example, comment))| {
                     line(&format!("# {key} = {example}"), &comment).split_off(2)
                 });

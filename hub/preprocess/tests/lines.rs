@@ -114,7 +114,7 @@ fn slow_line(beams: &[(f64, f64)]) -> f64 {
 }
 
 /// Returns the minimum sum of squares for `count` lines, by trying all cuts.
-fn reference_match(scan: &Scan, count: usize) -> f64 {
+fn slow_error(scan: &Scan, count: usize) -> f64 {
     let beams: Vec<(f64, f64)> =
         (0..scan.beams()).filter_map(|i| Some((scan.angle(i), scan.distance_m(i)?))).collect();
     let n = beams.len();
@@ -162,7 +162,7 @@ fn all_cuts_find_little_better() {
             beams >= 57 && of_refined <= 1.000_1 * of_plain,
             "one in twenty may be left out, {beams} are not: {of_refined} of {of_plain}"
         );
-        let of_best = reference_match(&scan, 8);
+        let of_best = slow_error(&scan, 8);
         assert!(of_plain >= 0.999 * of_best, "nothing is better than the best: {of_plain}, {of_best}");
         plain += of_plain.sqrt();
         refined += of_refined.sqrt();

@@ -273,7 +273,7 @@ struct ScanResult {
 }
 
 /// Returns the results of all scans, in the order of the hub.
-fn estimate_motion(scans: &[Box<Scan>]) -> Vec<ScanResult> {
+fn process_all(scans: &[Box<Scan>]) -> Vec<ScanResult> {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
     let mut finder = LineFinder::new(Pose::default(), lines::Settings::default(), beams);
     let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), beams);
@@ -322,7 +322,7 @@ fn lifting_the_scanner_is_refused_or_uncertain() {
                 for scan in &mut drive.scans[20..30] {
                     change_ranges(scan, |i, range| range * (factor + tilt * (i as f64 / 360.0 - 0.5)));
                 }
-                let results = estimate_motion(&drive.scans);
+                let results = process_all(&drive.scans);
                 let place = format!("seed {seed}, {factor} as far, tilt {tilt}");
                 for (at, result) in
                     results.iter().enumerate().skip(1).filter(|(_, result)| result.motion.has_step())
@@ -359,7 +359,7 @@ fn where_little_returns_nothing_moves() {
                 .filter(|_| random.u8(..10) != 0)
                 .for_each(|range| *range = no_return);
         }
-        let results = estimate_motion(&drive.scans);
+        let results = process_all(&drive.scans);
         for (at, result) in results.iter().enumerate().skip(1) {
             if result.motion.has_step() {
                 let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
@@ -386,7 +386,7 @@ fn impossible_times_of_beams_are_ignored() {
         (scan.beam_time_ns, scan.turn_ns) = (random.u32(..), random.u32(..));
         scan.first_beam_ns = random.i32(..);
     }
-    let results = estimate_motion(&jumping.scans);
+    let results = process_all(&jumping.scans);
     for (at, result) in results.iter().enumerate().skip(1) {
         let truth = drive.poses[at - 1].inverse().then(&drive.poses[at]);
         let off =

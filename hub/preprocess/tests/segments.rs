@@ -31,7 +31,7 @@ fn point(scan: &Scan, pose: &Pose, i: usize, range: u16) -> (f64, f64) {
     (1000.0 * pose.x_m + range_mm * angle.cos(), 1000.0 * pose.y_m + range_mm * angle.sin())
 }
 
-fn pose_difference(a: (f64, f64), b: (f64, f64)) -> f64 {
+fn distance(a: (f64, f64), b: (f64, f64)) -> f64 {
     (a.0 - b.0).hypot(a.1 - b.1)
 }
 
@@ -77,7 +77,7 @@ fn segments_are_those_of_the_formula() {
             let step = (scan.angle(b.0) - scan.angle(a.0)).rem_euclid(std::f64::consts::TAU);
             let step = if is_exact { step } else { even };
             let range_mm = f64::from(a.1) * f64::from(unit_mm);
-            let apart_mm = pose_difference(point(&scan, &pose, a.0, a.1), point(&scan, &pose, b.0, b.1));
+            let apart_mm = distance(point(&scan, &pose, a.0, a.1), point(&scan, &pose, b.0, b.1));
             a.0 + 1 == b.0 && apart_mm <= limit_mm(range_mm, step)
         };
         let expected: Vec<_> = ranges.chunk_by(together).collect();
@@ -100,7 +100,7 @@ fn segments_are_those_of_the_formula() {
             assert_eq!(Some(segment.nearest), beams.iter().map(|beam| beam.1).min());
             let points = || beams.iter().map(|&(i, range)| point(&scan, &pose, i, range));
             let mean = |part: fn((f64, f64)) -> f64| points().map(part).sum::<f64>() / beams.len() as f64;
-            let width = pose_difference(point(&scan, &pose, first, a), point(&scan, &pose, last, b))
+            let width = distance(point(&scan, &pose, first, a), point(&scan, &pose, last, b))
                 / f64::from(unit_mm);
             for (reported, exact) in [
                 (f64::from(segment.width), width),
@@ -157,7 +157,7 @@ fn several_beams_or_the_scan_before_support_a_segment() {
             for (i, segment) in out.segments().iter().enumerate() {
                 let beam = ranges.iter().position(|&(beam, _)| beam == usize::from(segment.first)).unwrap();
                 let nearest_mm =
-                    before.iter().map(|&other| pose_difference(points[beam], other)).reduce(f64::min);
+                    before.iter().map(|&other| distance(points[beam], other)).reduce(f64::min);
                 let is_near = nearest_mm.is_some_and(|nearest_mm| nearest_mm < 300.0);
                 // The two versions compute sine and cosine differently, so skip distances at the limit.
                 if nearest_mm.is_some_and(|nearest_mm| (nearest_mm - 300.0).abs() < 1e-6) {

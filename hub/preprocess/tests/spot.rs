@@ -35,7 +35,7 @@ fn wide_and_narrow(name: &str) -> [Room; 2] {
 }
 
 /// Returns the scan that the hub publishes, and what its beams met.
-fn update_times(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
+fn scan_and_targets(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
     let look = room.labeled_scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, number * SCAN_PERIOD_NS);
     (decoded_scan::scan(&look.words, Unit::Mm), look.truth)
 }
@@ -48,7 +48,7 @@ fn false_segments(room: &Room) -> [usize; 2] {
     let (mut segmenter, mut foreground) = (Segmenter::new(Pose::default(), beams), Foreground::of(beams));
     let (mut all, mut supported) = (0, 0);
     for number in 1..2_000 {
-        let (scan, target) = update_times(room, number);
+        let (scan, target) = scan_and_targets(room, number);
         model.update(&scan, &mut foreground);
         segmenter.update(&scan, &mut foreground);
         // The first 600 scans learn the background.
@@ -91,7 +91,7 @@ fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
     let mut lines = Lines::default();
     let mut counts = [0; 3];
     for number in (1..2_000).step_by(20) {
-        let ((scan, target), (exact, _)) = (update_times(room, number), update_times(exact, number));
+        let ((scan, target), (exact, _)) = (scan_and_targets(room, number), scan_and_targets(exact, number));
         finder.update(&scan, &mut lines);
         for line in lines.lines() {
             let beams = usize::from(line.first)..=usize::from(line.last);
@@ -155,7 +155,7 @@ fn mark_errors(width_mm: f64, range_mm: f64, layers: NoiseModel, random: &mut Rn
     let (mut of_angle, mut of_range, mut missing) = (0.0, 0.0, 0);
     for seed in 0..u64::from(TRIAL_COUNT) {
         let angle_deg = -70.0 + 140.0 * random.f64();
-        let (scan, _) = update_times(&strip(width_mm, range_mm, angle_deg, layers, seed), 1);
+        let (scan, _) = scan_and_targets(&strip(width_mm, range_mm, angle_deg, layers, seed), 1);
         detector.update(&scan, &mut marks);
         match marks.marks() {
             [] => missing += 1,

@@ -132,7 +132,7 @@ enum BeamReading {
     Nothing,
 }
 
-fn count_moving(scan: &Scan, i: usize, no_return_is_far: bool) -> BeamReading {
+fn beam_reading(scan: &Scan, i: usize, no_return_is_far: bool) -> BeamReading {
     match max(scan) - scan.ranges()[i] {
         8 => BeamReading::Far,
         0 if no_return_is_far => BeamReading::Far,
@@ -152,7 +152,7 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> CaseTally {
         let (u, own) = case.beam(scan, i);
         let can_violate = case.can_violate(scan, u, own);
         telling += u16::from(can_violate);
-        let range = match count_moving(scan, i, case.settings.no_return_is_far) {
+        let range = match beam_reading(scan, i, case.settings.no_return_is_far) {
             BeamReading::Range(range) => range,
             BeamReading::Far => continue,
             BeamReading::Nothing => {
@@ -596,11 +596,11 @@ fn changing_speed_does_not_interrupt_scan_counting() {
 }
 
 const BEAM_COUNT: usize = 100;
-const FAR_RANGE: u16 = 5000;
+const FAR_MM: u16 = 5000;
 
 /// Returns a scan of 180 degrees, in which only `near` beams have short ranges.
 fn random_scan(random: &mut Rng, near: usize) -> Box<Scan> {
-    let mut scan = Scan::of(ScanHead::lms(BEAM_COUNT, -90_000, 1800, 1, 13), &[FAR_RANGE; BEAM_COUNT]);
+    let mut scan = Scan::of(ScanHead::lms(BEAM_COUNT, -90_000, 1800, 1, 13), &[FAR_MM; BEAM_COUNT]);
     (0..near).for_each(|_| scan.arrays().ranges[random.usize(..BEAM_COUNT)] = random.u16(..1200));
     scan
 }
@@ -637,7 +637,7 @@ fn partial_scan_warns_and_complete_scan_confirms() {
             for received in [0, 1, random.usize(..BEAM_COUNT), random.usize(..BEAM_COUNT), BEAM_COUNT] {
                 let early = check.check_partial(BEAM_COUNT, 1000, &whole.ranges()[..received], &[]);
                 let mut part = whole.clone();
-                part.arrays().ranges[received..].fill(FAR_RANGE);
+                part.arrays().ranges[received..].fill(FAR_MM);
                 scans.push(part);
                 let zones = zones_of(pose, &settings, &scans);
                 scans.pop();

@@ -106,9 +106,9 @@ fn nothing_promises_safety() {
 }
 
 #[test]
-fn the_first_consumer_is_compiled() {
-    assert_rule(pages::the_first_consumer_is_compiled, |tree| {
-        let (page, example) = ("docs/first-consumer.md", "clients/examples/first.rs");
+fn the_first_program_is_compiled() {
+    assert_rule(pages::the_first_program_is_compiled, |tree| {
+        let (page, example) = ("docs/first-program.md", "clients/examples/first.rs");
         let (shown, compiled) = (tree.text(page), tree.text(example));
         vec![
             tree.with(page, &shown.replace("from_millis(500)", "from_secs(5)")),
