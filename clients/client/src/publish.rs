@@ -144,7 +144,7 @@ impl PublishSession {
             if let Some(pid) = hub_pid(domain.root())? {
                 return Err(name_taken(name, pid).into());
             }
-            let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
+            let what = format!("{name:?} cannot be published: it is a sensor of the hub");
             return Err(Error::new(Kind::Configuration, what, "any other name, for example house"));
         }
         PublishSession::create(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock).sensor(name)
@@ -185,7 +185,7 @@ impl PublishSession {
         check_any_sensor(name)?;
         let is_own = matches!(&self.0.lock, DomainLock::OwnName { name: own, .. } if own == name);
         if !is_own && !is_remote(name) {
-            let what = format!("{name:?} is no name to publish under: it may be a sensor of the hub");
+            let what = format!("{name:?} cannot be published: it may be a sensor of the hub");
             return Err(Error::new(Kind::Configuration, what, "OWNER.NAME, for example tracker.near"));
         }
         let mut sensors = locked(&self.0.sensors);
