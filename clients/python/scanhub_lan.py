@@ -757,7 +757,7 @@ def read_key(path: str) -> bytes:
     except ValueError:
         key = b""
     if len(key) != 32:
-        raise ValueError(f"{path}: its {len(content)} bytes are no key: 32 bytes, or 64 hex digits")
+        raise ValueError(f"{path}: its {len(content)} bytes are not a key: 32 bytes, or 64 hex digits")
     return key
 
 

@@ -117,7 +117,7 @@ fn a_key_file_that_others_can_use_is_refused() {
         .expect("the file belongs to this user");
     let missing = env.path_argument("missing");
     for (file, message, code) in
-        [(&short, "are no key", 78), (&open, "its mode is 0644", 78), (&missing, "No such file", 66)]
+        [(&short, "are not a key", 78), (&open, "its mode is 0644", 78), (&missing, "No such file", 66)]
     {
         for verb in [&["listen"][..], &["gateway", "--interface=lo", "--no-system-config"]] {
             let refused = env.run(&[verb, &[&format!("--key-file={file}")]].concat());

@@ -108,7 +108,7 @@ pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
     let bytes = regular_file::read_all(&mut file, MAX_FILE_LEN).map_err(unreadable)?;
     let key = parse(&bytes).ok_or_else(|| {
         refuse(
-            format!("its {} bytes are no key", about.len()),
+            format!("its {} bytes are not a key", about.len()),
             "32 bytes, or 64 hex digits; `scanhub key new FILE` makes one",
         )
     })?;

@@ -96,17 +96,17 @@ pub struct RemoteReceiver<'a> {
     unreadable: Option<Failure>,
 }
 
-const OTHER_VERSION: &str = "somebody sends datagrams of another version, which are refused: install the same version of \
-                             scanhub on both machines";
-const NEWER_TOPIC: &str = "somebody sends topics that this version does not know, which are left out: install the same \
-                           version of scanhub on both machines";
+const OTHER_VERSION: &str =
+    "datagrams of another version were refused: install the same version of scanhub on both machines";
+const NEWER_TOPIC: &str = "samples of topics that this version does not know were left out: install the same version of \
+                           scanhub on both machines";
 const NO_ROOM: &str = "samples of remote sensors were not published, because these need more shared memory than --memory \
                        allows: use a greater --memory; if someone invents sensors, use --key-file, or --hub to receive only \
                        those that it names";
-const CLOCK_AHEAD: &str = "a gateway has the key, and its clock is more than 5 s ahead of this machine's: it is not believed; \
-                           set the clocks";
-const CLOCK_BEHIND: &str = "a gateway has the key, and its clock is more than 5 s behind this machine's, or somebody sends \
-                            again what was recorded: it is not believed; set the clocks";
+const CLOCK_AHEAD: &str = "a gateway with the right key was refused because its clock is more than 5 s ahead of this machine's: \
+                           synchronize the clocks";
+const CLOCK_BEHIND: &str = "a gateway with the right key was refused because its clock is more than 5 s behind this \
+                            machine's, or because recorded datagrams were sent again: synchronize the clocks";
 /// Maximum number of problems that are reported. A sender may cause ever new ones.
 const MAX_REPORTED: usize = 16;
 
@@ -386,9 +386,9 @@ impl CapacityReporter {
         }
         let before = std::mem::replace(&mut self.reported, so_far);
         let parts = [
-            (so_far.gateways - before.gateways, "gateways were given up for others"),
+            (so_far.gateways - before.gateways, "gateways were evicted for others"),
             (so_far.refused - before.refused, "datagrams of others were refused"),
-            (so_far.sensors - before.sensors, "published sensors were put out for others"),
+            (so_far.sensors - before.sensors, "published sensors were evicted for others"),
             (so_far.samples - before.samples, "samples of other sensors were not published"),
         ];
         let parts = parts.iter().filter(|(count, _)| *count > 0);
@@ -396,7 +396,7 @@ impl CapacityReporter {
         self.reported_at = Some(now);
         Some(format!(
             "more is sent than there is room for ({MAX_RUNS} gateways, {MAX_ROWS} of their sensors and topics; {MAX_SENSORS} \
-             published sensors): {}; gateways that are known to deliver stay. If somebody invents them, use --hub to receive \
+             published sensors): {}; gateways that are known to deliver stay. If someone invents them, use --hub to receive \
              only those that it names",
             parts.join(", ")
         ))

@@ -68,7 +68,7 @@ impl Host {
         }
         let address = choose(&found, None).ok_or_else(|| {
             let hint = "the groups get everything anyway; name single hosts only";
-            refuse(format!("cannot send to {text}: it is no host"), hint)
+            refuse(format!("cannot send to {text}: it is not a host"), hint)
         })?;
         if matches!(address, SocketAddr::V6(six) if six.ip().is_unicast_link_local() && six.scope_id() == 0) {
             let hint = "add the interface to the address, as in [fe80::7%eth0]:22200";

@@ -250,7 +250,7 @@ fn no_socket(error: &io::Error) -> Failure {
     Failure::new(Kind::Failed, format!("no socket for datagrams: {error}"), "")
 }
 
-const NO_RECEIVER: &str = "nobody is there";
+const NO_RECEIVER: &str = "no program receives there";
 /// Number of checks without a failure after which a destination has recovered. The network reports the errors of a host
 /// without a receiver at most once a second.
 const RECOVERY_CHECKS: u32 = 2;

@@ -84,7 +84,7 @@ impl<'a> Report<'a> {
             return self.out.json(&ReadyJson::new(interfaces, domain, key));
         }
         self.notes.line(|line| match key {
-            Some(key) => write!(line, "only datagrams with key {key} are believed"),
+            Some(key) => write!(line, "only datagrams with key {key} are accepted"),
             None => write!(
                 line,
                 "no key: any machine on this network can send false data; see `scanhub key new` and --key-file"
