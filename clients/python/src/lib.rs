@@ -161,7 +161,7 @@ impl Publication {
     ) -> PyResult<()> {
         let in_range = |stamp: Bound<'_, PyAny>| match stamp.extract::<u64>() {
             Err(error) if error.is_instance_of::<pyo3::exceptions::PyOverflowError>(stamp.py()) => {
-                let what = format!("stamp_ns {stamp} is no time");
+                let what = format!("stamp_ns {stamp} is not a time");
                 Err(Error::new("Impossible", what, "a time of time.monotonic_ns(), or None for now").into())
             }
             stamp_ns => stamp_ns,
