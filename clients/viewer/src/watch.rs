@@ -69,7 +69,7 @@ impl WatchArgs {
         if json || !can_show_pictures() {
             let sensor = self.sensors.first().map_or("robot/zones".to_owned(), |name| format!("{name}/scan"));
             let hint = format!("lines for files and programs: scanhub echo {sensor}, with --json as objects");
-            let what = if json { "a picture is no JSON" } else { "the picture needs a terminal" };
+            let what = if json { "`watch` has no JSON output" } else { "the picture needs a terminal" };
             return Err(Failure::new(Kind::Usage, what, hint));
         }
         self.show("", &locations, &mut context.out, &stop)

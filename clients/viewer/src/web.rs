@@ -157,7 +157,7 @@ impl WebArgs {
                 Ok(Ok(())) => verb_result(end),
                 Ok(Err(failure)) => Err(failure),
                 // The panic has printed its reason.
-                Err(_) => Err(Failure::new(Kind::Failed, "what serves the viewers ended", "start it again")),
+                Err(_) => Err(Failure::new(Kind::Failed, "the server thread ended", "start it again")),
             }
         })
     }
@@ -512,7 +512,7 @@ mod tests {
         });
         assert!(sent.is_ok(), "{sent:?}");
         let failure = end.unwrap_err();
-        assert_eq!((failure.kind, &failure.message[..]), (Kind::Failed, "what serves the viewers ended"));
+        assert_eq!((failure.kind, &failure.message[..]), (Kind::Failed, "the server thread ended"));
         assert_eq!(failure.hint, "start it again");
     }
 

@@ -299,7 +299,7 @@ impl Problem {
     /// Returns why `sensor`, whose link has this status, sends no scans. The link's own error takes precedence.
     fn of_silent(sensor: &str, status: Option<&Status>) -> Problem {
         let Some(status) = status else {
-            return Problem { description: "nothing was heard of it yet".into(), remedy: String::new() };
+            return Problem { description: "no data from it yet".into(), remedy: String::new() };
         };
         let port = status.port();
         let check = || format!("scanhub doctor {port}");
@@ -422,7 +422,7 @@ mod tests {
 
     #[test]
     fn link_error_takes_precedence_over_state_problems() {
-        assert_eq!(Problem::of_silent("front", None).description, "nothing was heard of it yet");
+        assert_eq!(Problem::of_silent("front", None).description, "no data from it yet");
         let mut status = Status { state: State::Silent as u8, ..Status::default() };
         status.set_port("/dev/ttyUSB0");
         let silent = Problem::of_silent("front", Some(&status));
