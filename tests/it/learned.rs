@@ -111,7 +111,7 @@ fn unusable_or_unwanted_background_is_not_loaded() {
         assert_eq!(fs::read(file(&env)).expect("the file still exists"), kept, "{flags:?}");
     };
     empty(&["--set=link.front.pose.x=0.2"], "the background starts empty: ");
-    empty(&["--set=link.front.pose.yaw=0.1"], "is of another pose");
+    empty(&["--set=link.front.pose.yaw=0.1"], "belongs to another pose");
     empty(
         &["--set=link.front.unit=cm"],
         "361 beams in units of 1 mm, the link is configured for 361 beams in units of 10 mm",

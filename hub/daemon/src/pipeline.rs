@@ -249,7 +249,9 @@ impl Pipeline {
             Verb::Freeze => stage.model.freeze(),
             Verb::Thaw => stage.model.thaw(),
             Verb::Load if stage.is_moving() => {
-                let message = format!("{sensor}: background.method is \"moving\": a model is of one place");
+                let message = format!(
+                    "{sensor}: background.method is \"moving\": a saved background belongs to one position"
+                );
                 let hint = "load models of sensors that stand: of methods multi and paper";
                 return Err(Failure::new(Kind::Configuration, message, hint));
             }

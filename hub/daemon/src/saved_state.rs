@@ -505,7 +505,11 @@ fn background_text(sensor: &str, pose: Pose, model: &Background, wall_ns: u64) -
     let text = BackgroundText { model: as_json(sensor, model), context: BackgroundContext { pose, wall_ns } };
     let written = serde_json::to_string(&text);
     written.map(|text| text + "\n").map_err(|error| {
-        Failure::new(Kind::Failed, format!("the background of {sensor} is no JSON: {error}"), "")
+        Failure::new(
+            Kind::Failed,
+            format!("the background of {sensor} cannot be written as JSON: {error}"),
+            "",
+        )
     })
 }
 
@@ -532,7 +536,7 @@ fn read_background(text: &str, location: &str, link: &Link) -> Result<(Box<Backg
     let is_near = |saved: f64, configured: f64| (saved - configured).abs() < POSE_TOLERANCE;
     let is_at_pose = is_near(pose.x, x_m) && is_near(pose.y, y_m) && is_near(pose.yaw, yaw_rad);
     if !is_at_pose || pose.upside_down != (upside_down != 0) {
-        return Err(format!("{location} is of another pose: the sensor was moved"));
+        return Err(format!("{location} belongs to another pose: the sensor was moved"));
     }
     Ok((model, wall_ns))
 }
