@@ -302,7 +302,7 @@ impl<P, F: FnMut(&P) -> bool> Task<P> for Procedure<F> {
 
 /// Remedy for a line that damages bytes.
 pub(crate) const LINE_REMEDY: &str =
-    "a shorter or shielded cable, ground beside the signal, 3.3 V levels; another adapter";
+    "a shorter or shielded cable, ground next to the signal, 3.3 V levels; another adapter";
 /// Maximum share of damaged bytes on a good line.
 const MAX_DAMAGED: f64 = 0.01;
 /// Share of damaged bytes that makes conclusions from the others unreliable.
@@ -431,7 +431,7 @@ fn port_lost(port: &Port, error: &std::io::Error) -> Failure {
     if let Port::Tcp(_) = port {
         return Failure::new(
             Kind::PortBusy,
-            format!("the connection is over: {error}"),
+            format!("the connection was closed: {error}"),
             "a serial server has one client at a time: end the other program that is connected to it, such as a hub, and try \
              again; if there is none, was the server switched off?",
         );

@@ -236,7 +236,7 @@ fn parse_hex(text: &str) -> Result<Vec<u8>, String> {
                     pair.and_then(|pair| u8::from_str_radix(pair, 16).ok())
                 });
                 let pairs = pairs.collect::<Option<Vec<_>>>();
-                bytes.extend(pairs.ok_or_else(|| format!("line {}: {word:?} is no byte", line + 1))?);
+                bytes.extend(pairs.ok_or_else(|| format!("line {}: {word:?} is not a byte", line + 1))?);
             }
         }
     }
@@ -621,7 +621,7 @@ mod tests {
         let wrong = all(b"02 80\n03 4").unwrap_err();
         assert_eq!(
             (wrong.kind(), wrong.to_string().as_str()),
-            (ErrorKind::InvalidData, "line 2: \"4\" is no byte")
+            (ErrorKind::InvalidData, "line 2: \"4\" is not a byte")
         );
         assert!(all(b"hello").is_err() && all(b"+1").is_err());
     }

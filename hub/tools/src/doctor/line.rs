@@ -83,7 +83,7 @@ pub(crate) fn check_port(
         }
         return Ok(());
     }
-    report(Finding::ok("holder", "nobody has it open"));
+    report(Finding::ok("holder", "no process has it open"));
     if !subject.is_named {
         // Opening the port would restart some devices.
         report(if candidate.is_none_or(|candidate| candidate.is_permitted) {

@@ -230,7 +230,7 @@ pub(crate) fn check_rotating(scanner: &DetectedScanner, link: Option<&Link>) -> 
 /// Checks the health that the scanner reports, and whether it measures.
 fn reported_health(introduction: &DeviceInfo, scanner: &DetectedScanner) -> Finding {
     const NAME: &str = "health";
-    let remedy = "see whether its head turns freely; power it off and on again; if it stays so, a repair";
+    let remedy = "see whether its head rotates freely; power it off and on again; if it stays so, a repair";
     match introduction.condition {
         ReportedHealth::Good | ReportedHealth::Warning | ReportedHealth::Unknown if scanner.packets == 0 => {
             let problem = scanner.problem.as_deref().unwrap_or("it does not measure");
@@ -282,12 +282,12 @@ fn rotation(scanner: &DetectedScanner) -> Finding {
     if scanner.revolutions_per_second > 0.0 {
         return Finding::ok(NAME, format!("{:.1} turns a second", scanner.revolutions_per_second));
     }
-    let what = scanner.problem.as_deref().unwrap_or("packets come, but no turn was whole");
+    let what = scanner.problem.as_deref().unwrap_or("packets arrive, but no revolution was complete");
     let (what, _) = what.split_once(": ").unwrap_or((what, ""));
     Finding::failed(
         NAME,
         what,
-        "see whether its head turns freely, and whether it gets 5 V; power it off and on again",
+        "see whether its head rotates freely, and whether it gets 5 V; power it off and on again",
     )
 }
 
