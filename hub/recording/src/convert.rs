@@ -326,7 +326,7 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
     }
     if !contents.is_lms() && target == Target::Recording(Form::Carmen) {
         let message = format!(
-            "{} is of a scanner that looks all around, which a CARMEN log has no place for",
+            "{} is of a rotating scanner, which a CARMEN log cannot hold",
             recording.path().display()
         );
         let hint = "name OUT.mcap with --ros2, or OUT.csv";
@@ -334,7 +334,8 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
     }
     if recording.family().is_none() && !matches!(target, Target::Recording(_)) {
         let (place, number) = (recording.path().display(), contents.family);
-        let message = format!("{place} is of a scanner of family number {number}, which is not known here");
+        let message =
+            format!("{place} is of a scanner of family number {number}, which this version does not know");
         return Err(Failure::new(Kind::Input, message, "a later version of scanhub recorded it: use that"));
     }
     let mode = contents.readable_mode();

@@ -451,7 +451,7 @@ pub(crate) fn unreadable(path: &Path, error: &io::Error) -> Failure {
     let hint = match error.kind() {
         io::ErrorKind::NotFound => "give the path of an existing recording",
         io::ErrorKind::PermissionDenied => "the file must be readable by this user",
-        io::ErrorKind::UnexpectedEof => "the gzip file is cut: `zcat FILE > WHOLE` saves what is there",
+        io::ErrorKind::UnexpectedEof => "the gzip file is cut: `zcat FILE > WHOLE` saves the intact part",
         io::ErrorKind::Unsupported => "`mcap compress --compression none IN -o OUT` (of mcap.dev) unpacks it",
         io::ErrorKind::FileTooLarge => {
             "`zcat FILE > WHOLE` unpacks a packed file; `mcap filter --output-compression none IN -o OUT` (of mcap.dev) \
