@@ -27,7 +27,7 @@ use delivery_stats::{DeliveryStats, Sensor, counted};
 use environment::{ChildEvent, DemoEnvironment};
 use participants::{Families, World};
 
-/// Run simulated sensors, the hub and a subscriber for each in one terminal
+/// Run simulated sensors, the hub and a subscriber for each sensor in one terminal
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Demo {
@@ -44,7 +44,7 @@ pub(crate) struct Demo {
     /// Seed of rooms and people
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Of which family the sensors are; mixed: one of each family
+    /// Family of the sensors; mixed: one of each family
     #[arg(long, default_value = Family::ALL[0].name(), value_name = "FAMILY", value_parser = families())]
     family: Families,
 }
@@ -100,7 +100,7 @@ impl Demo {
             return Err(Failure::new(Kind::Check, loss, "is the machine too busy to run all processes?"));
         }
         if end == EndReason::Stopped && self.run_for.is_some() {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before the time was over", ""));
+            return Err(Failure::new(Kind::Interrupted, "interrupted before the end of the time", ""));
         }
         Ok(())
     }
@@ -382,7 +382,7 @@ fn ended(child: usize) -> Failure {
     let process = match child {
         HUB => "the hub",
         SIMULATOR => "a simulator",
-        TILTED => "what sees in three dimensions",
+        TILTED => "the assembler of tilted scans",
         TRACKER => "the tracker of people",
         WEB => "the picture for browsers",
         _ => "a subscriber",

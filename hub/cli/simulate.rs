@@ -38,7 +38,7 @@ pub(crate) struct Simulate {
     /// reflectivity, installation; or starting, if power comes on now
     #[arg(long, default_value = "idle", value_name = "STATE")]
     state: String,
-    /// Time from power-on to the banner
+    /// Time from power-on to the boot message
     #[arg(long, default_value = "2s", value_name = "DURATION", value_parser = duration::parse)]
     boot: Duration,
     /// The sensors' own address, 0 to 127; they answer to 0 too
@@ -56,7 +56,7 @@ pub(crate) struct Simulate {
     /// an MCAP file or raw bytes. Not available for rplidar
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
-    /// Which sensor of the recording, if it has several: one for all ports, or one for each in their order
+    /// Sensor of the recording, if it has several: one for all ports, or one for each in their order
     #[arg(long, value_name = "NAME")]
     sensor: Vec<String>,
     /// Start the recording again at its end
