@@ -36,7 +36,7 @@ use udp_destination::{DestinationEvent, UdpDestination};
 #[derive(Args, Clone, Debug, Default)]
 #[command(after_help = after_help())]
 pub struct GatewayArgs {
-    /// Network interface for the groups: everybody on that network can read what is sent. Without it, nothing is sent
+    /// Network interface for the groups: everyone on that network can read what is sent. Without it, nothing is sent
     /// to groups, and --to must name hosts. lo: this machine only
     #[arg(long, value_name = "NAME")]
     pub interface: Option<String>,

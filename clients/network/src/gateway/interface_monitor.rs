@@ -150,7 +150,7 @@ fn must_choose(all: &[Interface]) -> Failure {
     };
     let list = all.iter().map(describe).collect::<Vec<_>>().join(", ");
     let hint = format!(
-        "everybody on the interface can read what is sent there: name one with --interface, or as `interface` under \
+        "everyone on the interface can read what is sent there: name one with --interface, or as `interface` under \
          [gateway]; there are {list}; or name hosts with --to"
     );
     Failure::new(Kind::Configuration, "no interface is named for the groups, and no host", hint)

@@ -90,7 +90,7 @@ pub fn received_topics(texts: &[String]) -> Result<Vec<Topic>, Failure> {
         if pattern.sensor.is_some() {
             let topic = pattern.topic.map_or("*", Topic::name);
             let hint = format!("*/{topic} is received of all sensors, of those hubs that --hub names");
-            return refuse("is of one sensor, and --publish takes topics of all", &hint);
+            return refuse("names one sensor, and --publish takes topics of all sensors", &hint);
         }
         selected
             .extend(Topic::ALL.into_iter().filter(|topic| pattern.topic.is_none_or(|named| named == *topic)));
