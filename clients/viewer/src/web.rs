@@ -47,7 +47,7 @@ pub struct WebArgs {
     /// --token-file
     #[arg(long, value_name = "WORD", env = "SCANHUB_WEB_TOKEN", hide_env_values = true, value_parser = token)]
     token: Option<String>,
-    /// File with the word as its only line, which only this user can read. It goes before --token
+    /// File with the word as its only line, which only this user can read. It takes precedence over --token
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
     /// Serve everyone who can reach the address, without a token
