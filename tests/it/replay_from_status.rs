@@ -79,7 +79,7 @@ fn ambiguous_packets_need_a_configured_model_or_mode() {
         for words in [vec!["replay", "--no-system-config", &recording], vec!["convert", &recording, &rows]] {
             let outcome = env.run(&words);
             assert_eq!(outcome.exit_code, Some(66), "{model}: {outcome}");
-            let messages = ["does not tell of which kind its packets are", "link.NAME.model or mode is set"];
+            let messages = ["does not say which kind of packets it has", "link.NAME.model or mode is set"];
             assert!(messages.iter().all(|words| outcome.stderr.contains(words)), "{model}: {outcome}");
         }
         // The remedy in the error message works.

@@ -188,7 +188,7 @@ impl Recording {
         if let Some(missing) = missing.filter(|_| model.is_none() && self.contents.mode_name.is_none()) {
             return Err(Failure::new(
                 Kind::Input,
-                format!("recording {} does not tell of which kind its packets are", self.path.display()),
+                format!("recording {} does not say which kind of packets it has", self.path.display()),
                 format!("`scanhub replay` plays it where link.NAME.{missing} is set"),
             ));
         }
