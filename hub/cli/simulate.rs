@@ -112,7 +112,7 @@ pub(crate) struct Simulate {
     /// Transparency of the front window in percent: a warning below 75, an error below 30
     #[arg(long, default_value_t = 100, value_name = "PERCENT")]
     pollution: u16,
-    /// In which pieces bytes arrive: uart (16 bytes) or usb (62)
+    /// Size of the pieces in which bytes arrive: uart (16 bytes) or usb (62)
     #[arg(long, default_value = "uart", value_name = "KIND")]
     chunk: String,
     /// Let the sensors wait while the hub does not read. On a real line, bytes are lost then. For tests on a busy machine

@@ -373,12 +373,12 @@ fn check_family(recording: &Recording, link: &Link) -> Result<Family, Failure> {
     }
     let (path, number) = (recording.path().display(), recording.contents().family);
     let Some(family) = recording.family() else {
-        let message = format!("recording {path} is of a scanner of family number {number}");
+        let message = format!("recording {path} has a scanner of family number {number}");
         let hint = "a later version of scanhub recorded it: replay it with that";
         return Err(Failure::new(Kind::Input, message, hint));
     };
     let message = format!(
-        "recording {path} is of a scanner of family {}, and link {} is of family {}",
+        "recording {path} has a scanner of family {}, and link {} is of family {}",
         family.name(),
         link.name,
         set.map_or("auto", Family::name)
