@@ -103,8 +103,8 @@ const NEWER_TOPIC: &str = "samples of topics that this version does not know wer
 const NO_ROOM: &str = "samples of remote sensors were not published, because these need more shared memory than --memory \
                        allows: use a greater --memory; if someone invents sensors, use --key-file, or --hub to receive only \
                        those that it names";
-const CLOCK_AHEAD: &str = "a gateway with the right key was refused because its clock is more than 5 s ahead of this machine's: \
-                           synchronize the clocks";
+const CLOCK_AHEAD: &str = "a gateway with the right key was refused because its clock is more than 5 s ahead of this \
+                           machine's: synchronize the clocks";
 const CLOCK_BEHIND: &str = "a gateway with the right key was refused because its clock is more than 5 s behind this \
                             machine's, or because recorded datagrams were sent again: synchronize the clocks";
 /// Maximum number of problems that are reported. A sender may cause ever new ones.

@@ -639,8 +639,8 @@ int scanhub_fd(struct scanhub_attachment *handle);
 int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
 
 /*
- * Lends the next sample and returns 1. If no sample waits, returns 0, and *sample is empty. Never waits. Four samples can be lent at a time. The
- * memory that a sample points to is valid until it is released.
+ * Lends the next sample and returns 1. If no sample waits, returns 0, and *sample is empty. Never waits. Four samples can be
+ * lent at a time. The memory that a sample points to is valid until it is released.
  *
  * For zones, it is a copy of the latest sample. When that sample becomes too old, because sensor, hub or machine stopped, one
  * more sample follows, without header and with the verdict unknown (`stale`). A program that acts on zones needs no timer.
