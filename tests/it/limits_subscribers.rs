@@ -118,7 +118,7 @@ fn refusal_on_a_remote_topic_names_the_listener_flag() {
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
         assert!(error["message"].as_str().is_some_and(|text| text.contains("has 2 subscribers")), "{error}");
-        assert!(error["hint"].as_str().is_some_and(|text| text.contains("greater --subscribers")), "{error}");
+        assert!(error["hint"].as_str().is_some_and(|text| text.contains("larger --subscribers")), "{error}");
         drop((subscribers, topic, node));
         assert_eq!(program.end(TERM).exit_code, Some(0));
     });

@@ -113,7 +113,7 @@ fn suggests_a_larger_within_for_a_distant_body() {
     await_verdict(&env, "slow");
     let outcome = mask(&env, &[]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
-    assert!(outcome.stderr.contains("the largest circle is violated") && outcome.stderr.contains("--within"));
+    assert!(outcome.stderr.contains("the largest zone is violated") && outcome.stderr.contains("--within"));
     assert!(!outcome.stderr.contains("no mask is needed"), "{outcome}");
     let outcome = mask(&env, &["--within", "1.5"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");

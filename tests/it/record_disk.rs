@@ -306,7 +306,7 @@ fn recorder_fails_if_its_reader_closes_the_pipe() {
     let refused = |outcome: std::process::Output| {
         let errors = String::from_utf8_lossy(&outcome.stderr).into_owned();
         assert_eq!(outcome.status.code(), Some(1), "{errors}");
-        assert!(errors.contains("the reader of the recording is gone"), "{errors}");
+        assert!(errors.contains("the reader of the recording has exited"), "{errors}");
     };
     let begin = |words: &[&str], writer: io::PipeWriter| {
         let mut command = env.command(&[&["record", "-o", "-"], words].concat());

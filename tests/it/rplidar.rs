@@ -267,7 +267,7 @@ fn doctor_reports_health_of_the_scanner() {
     let health_of_faulty = health(5);
     assert!(
         text(&health_of_faulty, "state") == "failed"
-            && text(&health_of_faulty, "finding").contains("does not measure"),
+            && text(&health_of_faulty, "finding").contains("has stopped measuring"),
         "{health_of_faulty}"
     );
 }
@@ -281,7 +281,7 @@ fn clears_resettable_error_and_reports_persistent_one() {
     env.kill_port_simulator(cleared, "front");
     env.await_info("front", |info| info["state"] == "absent");
     let persistent = simulator(&env, "a1", &["--fault=health=2,stubborn=1"]);
-    let info = env.await_info("front", |info| text(info, "last_error").contains("does not measure"));
+    let info = env.await_info("front", |info| text(info, "last_error").contains("has stopped measuring"));
     assert_ne!(info["state"], "streaming", "{info}");
     // A healthy scanner streams again without a restart of the hub.
     env.kill_port_simulator(persistent, "front");
