@@ -42,7 +42,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("client", &[]),
     ("came", &[]),
     ("clients", &[]),
-    // Allowed for a check that was not made and for a topic that the receiver does not support.
+    // Allowed for a topic that the receiver does not support.
     ("skipped", &["lan_refused listen"]),
     ("well", &[]),
     // Allowed for people who returned through a door.
