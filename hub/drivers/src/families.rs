@@ -68,7 +68,7 @@ macro_rules! families {
             }
         }
 
-        /// Evaluates an expression with the session inside, for any family.
+        /// Evaluates an expression with the session that a [`Session`] contains, whatever its family is.
         macro_rules! each {
             ($of:expr, $session:ident => $value:expr) => {
                 match $of { $(Session::$Family($session) => $value,)* }
@@ -84,8 +84,8 @@ families! {
 }
 
 /// Returns all scan heads that a scanner of `family` with these `settings` may have. All of them have the same number
-/// of beams. For a revolution, this is the number in the settings, the maximum of the settings, or the default of the
-/// family.
+/// of beams. For a rotating scanner, it is the number in the settings, the maximum of the settings, or the default of
+/// the family.
 pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
     match family {
         Family::Lms => lms::scan_heads(settings),
@@ -96,7 +96,7 @@ pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
     }
 }
 
-/// Returns the settings of a session with a scanner of `family`, after checking those of `request`.
+/// Checks the settings in `request`, and returns the settings of a session with a scanner of `family`.
 pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Settings, Refusal> {
     match family {
         Family::Lms => lms::check(request),
@@ -105,7 +105,7 @@ pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Setting
 }
 
 /// Creates the inquiry of a scanner of `family`. The port is open at `rate`, in bits per second. `rate` is `None` for a
-/// serial server, whose baud rate is set there. Returns `None` for a family [without an
+/// serial server, because the user sets its baud rate there. Returns `None` for a family [without an
 /// inquiry](Features::has_inquiry).
 pub fn inquiry(family: Family, rate: Option<u32>, now: Nanos) -> Option<Inquiry> {
     match family {
@@ -114,11 +114,11 @@ pub fn inquiry(family: Family, rate: Option<u32>, now: Nanos) -> Option<Inquiry>
     }
 }
 
-/// Features of a link with `family = "auto"`, with enough space for every scanner.
+/// Features of a link with `family = "auto"`. Its limits are sufficient for every scanner.
 pub const ANY_FAMILY: Features = {
     let mut any = Features {
         models: &[],
-        // Enough for every model.
+        // Sufficient for every model.
         defaults: Model { name: "auto", baud: FIRST_RATE, beams: 3_240 },
         modes: &[],
         keys: &[],
@@ -148,7 +148,7 @@ impl Session {
     }
 }
 
-/// Defines methods that call the same method of the session inside.
+/// Defines methods that call the method with the same name of the session that a [`Session`] contains.
 macro_rules! delegate {
     ($Trait:ident & $(fn $name:ident($($arg:ident: $Arg:ty),*) $(-> $Ret:ty)?;)*) => {
         $(fn $name(&self $(, $arg: $Arg)*) $(-> $Ret)? {

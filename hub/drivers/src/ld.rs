@@ -22,7 +22,7 @@ pub use session::{LdSession, Problem};
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &MODELS,
-    // Enough for every model except the STL27L.
+    // Sufficient for every model except the STL27L.
     defaults: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
     modes: &[],
     keys: &[],
@@ -77,7 +77,7 @@ impl Model {
         }
     }
 
-    /// Returns the number of points that the scanner measures per second. It is the same at any speed of the head.
+    /// Returns the number of points that the scanner measures per second. It does not depend on the speed of the head.
     pub const fn points_per_second(self) -> u32 {
         match self {
             Model::Stl27l => 21_600,
@@ -103,8 +103,8 @@ impl Model {
         }
     }
 
-    /// Returns the model that measures `points_per_second`. If several models cannot be distinguished, returns the best
-    /// known one.
+    /// Returns the model that measures `points_per_second`. Several models may measure the same number. The result is
+    /// then the best-known model.
     pub(crate) fn of_point_rate(points_per_second: f32) -> Model {
         match points_per_second {
             rate if rate > 10_000.0 => Model::Stl27l,
@@ -189,6 +189,6 @@ const APPROACH: Approach = Approach {
     max_transmission: PACKET_LEN,
     advice: "it streams by itself once it has 5 V and its head rotates",
 };
-/// Number of packets in sequence that prove an LDROBOT scanner. The header and the checksum of a packet have 24 bits in
-/// total, and its angles and its clock must continue those of the previous packet.
+/// Number of consecutive packets that prove an LDROBOT scanner. The header and the checksum of a packet have 24 bits in
+/// total. The angles and the clock of each packet must also continue those of the previous packet.
 const MIN_PROOF_PACKETS: u32 = 4;

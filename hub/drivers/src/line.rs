@@ -24,18 +24,18 @@ pub use session::{
 };
 pub use stream::{ReadScheduler, StreamCounters, Watchdog};
 
-/// Bits of `reasons`, which give the reasons why a telegram or packet is suspect. Each family sets the bits that it can
+/// Bits of `reasons`. Each bit is a reason why a telegram or packet is suspect. Each family sets the bits that it can
 /// detect.
 pub mod suspect {
     use super::Reasons;
 
     /// The kernel's error counters of the line have increased.
     pub const LINE_ERROR: u8 = Reasons::LINE_ERROR;
-    /// Bytes before the packet were not part of another one, so the neighboring packet was damaged.
+    /// Bytes before the packet did not belong to another packet, so the neighboring packet was damaged.
     pub const NEIGHBOUR: u8 = Reasons::NEIGHBOUR;
     /// The bytes took longer than usual to arrive.
     pub const SLOW: u8 = Reasons::SLOW;
-    /// Bits are set that no scanner sets.
+    /// The bytes have bits set that no scanner sets.
     pub const FORBIDDEN_BITS: u8 = Reasons::FORBIDDEN_BITS;
     /// The bytes contain another valid header.
     pub const HEADER_INSIDE: u8 = Reasons::HEADER_INSIDE;

@@ -11,11 +11,12 @@ use crate::line::{self, Buffer, Point, suspect};
 pub const PACKET_LEN: usize = 47;
 /// Number of points in a packet.
 pub const POINTS_PER_PACKET: usize = 12;
-/// First two bytes of every packet: the start byte, and the byte with the kind of packet and the number of points.
+/// First two bytes of every packet. The first one marks the start. The second one contains the kind of packet and the
+/// number of points.
 pub const HEADER: [u8; 2] = [0x54, 0x2C];
-/// Angle of a revolution, in hundredths of a degree, which is the unit of angles in a packet.
+/// Full circle in hundredths of a degree, the unit of angles in a packet.
 pub const FULL_CIRCLE: u16 = 36_000;
-/// Period of the clock in packets, in milliseconds. The clock then restarts at 0.
+/// Time after which the clock in packets restarts at 0, in milliseconds.
 pub const CLOCK_PERIOD_MS: u16 = 30_000;
 /// Maximum angle from the first to the last point of a packet, in hundredths of a degree. Bytes with a larger angle are
 /// not a packet.
@@ -90,7 +91,7 @@ impl<'a> Packet<'a> {
     }
 
     /// Returns the angle of point `i` in hundredths of a degree, clockwise. It may exceed [`FULL_CIRCLE`]. A packet
-    /// contains only the angles of its first and last point. The other points are evenly spaced between them.
+    /// contains only the angles of its first and last point. The points between them are evenly spaced.
     pub fn angle(&self, i: usize) -> f32 {
         f32::from(self.start()) + f32::from(self.span()) * i as f32 / (POINTS_PER_PACKET - 1) as f32
     }
@@ -114,7 +115,7 @@ impl<'a> Packet<'a> {
     }
 }
 
-/// Values of a packet, from which [`PacketContents::encode`] creates its bytes.
+/// Values from which [`PacketContents::encode`] creates a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PacketContents {
     /// Speed of the head in degrees per second.
@@ -149,7 +150,7 @@ impl PacketContents {
     }
 }
 
-/// Returns the CRC-8 of `bytes`, with the polynomial 4Dh, the initial value 0, and without reflection.
+/// Returns the CRC-8 of `bytes`. The polynomial is 4Dh and the initial value is 0. Bits are not reflected.
 pub fn crc(bytes: &[u8]) -> u8 {
     bytes.iter().fold(0, |crc, byte| CRC_TABLE[usize::from(crc ^ byte)])
 }
@@ -174,8 +175,8 @@ const END_OFFSET: usize = FIRST_POINT_OFFSET + 3 * POINTS_PER_PACKET;
 /// Radians per hundredth of a degree.
 const RADIANS_PER_UNIT: f32 = core::f32::consts::PI / 18_000.0;
 
-/// Consecutive packets without other bytes between them. They stay in the framer's buffer until the next bytes are
-/// committed.
+/// Consecutive packets without other bytes between them. They stay in the framer's buffer until the caller commits more
+/// bytes.
 #[derive(Clone, Copy, Debug)]
 pub struct Span {
     at: usize,
@@ -254,7 +255,7 @@ impl Framer {
         self.is_damaged = false;
     }
 
-    /// Discards the first open byte, and the bytes after it up to the next one that may begin a packet.
+    /// Discards the first open byte and the bytes after it, up to the next byte that may begin a packet.
     fn discard(&mut self, rejected: Option<Reject>) {
         if rejected == Some(Reject::Checksum) {
             self.buffer.reject_checksum();
@@ -266,9 +267,10 @@ impl Framer {
     }
 }
 
-/// Capacity of the buffer: the bytes that a tty can buffer while the hub does not read, and two incomplete packets.
+/// Capacity of the buffer, in bytes. It holds the bytes that a tty can buffer while the hub does not read, and two
+/// incomplete packets.
 const CAPACITY: usize = 4_096 + 2 * PACKET_LEN;
-/// Time without a byte after which no byte of a packet is in flight. A packet takes 2.04 ms at 230,400 baud.
+/// Time without a byte after which no byte of a packet can still arrive. A packet takes 2.04 ms at 230,400 baud.
 const HOLD_TIME: Nanos = 4 * MILLIS;
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! Measurement of the number of points per revolution. While a head spins up, it rotates more slowly and a revolution
-//! has more points. Only revolutions at a constant speed therefore count.
+//! Measures the number of points per revolution. A head rotates more slowly while it spins up, so a revolution has more
+//! points. Only revolutions at a constant speed therefore count.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -10,11 +10,11 @@ use crate::ld::sequence::PacketPosition;
 /// Measurement in progress, updated with every packet.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct PointCount {
-    /// Number of packets in sequence.
+    /// Number of packets in the current sequence.
     packets: u32,
     revolution: Option<Revolution>,
     steady: Option<SteadySpeed>,
-    /// Time of the last packet in the scanner's clock; `angle` is the angle of its first point, in degrees over all
+    /// Time of the last packet, in the scanner's clock. `angle` is the angle of its first point, in degrees over all
     /// revolutions.
     time: Nanos,
     angle: f64,
@@ -23,10 +23,10 @@ pub(crate) struct PointCount {
 /// Revolution that is being measured.
 #[derive(Clone, Copy, Debug)]
 struct Revolution {
-    /// Angle at its start, in degrees over all revolutions.
+    /// Angle at the start of the revolution, in degrees over all revolutions.
     angle: f64,
     packets: u32,
-    /// Sum of the speeds of the packets that arrived, in degrees per second, and the number of these packets.
+    /// Sum of the speeds in the packets that arrived, in degrees per second, and the number of these packets.
     speeds: (f64, u32),
     slowest: u16,
     fastest: u16,
@@ -43,18 +43,18 @@ struct SteadySpeed {
 /// Result for a complete revolution.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CountedRevolution {
-    /// Number of packets in sequence up to the end of the revolution.
+    /// Number of packets in the sequence up to the end of the revolution.
     pub(crate) packets: u32,
     pub(crate) points_per_revolution: f64,
     pub(crate) revolutions_per_second: f64,
-    /// Time for which the speed has been constant; 0 if the speed changed in this revolution.
+    /// Time for which the speed has been constant. It is 0 if the speed changed in this revolution.
     pub(crate) steady_time: Nanos,
     /// Time at the end of the revolution, in the scanner's clock.
     pub(crate) at: Nanos,
 }
 
 impl PointCount {
-    /// Adds a packet at its position in the sequence. Returns the revolution that it completes.
+    /// Adds a packet that is at `position` in the sequence. Returns the revolution that the packet completes.
     pub(crate) fn note_packet(
         &mut self,
         packet: &Packet<'_>,
@@ -86,8 +86,8 @@ impl PointCount {
         }
     }
 
-    /// Returns the model and its number of beams as soon as the first packets of a revolution match a model: the head
-    /// rotates at the model's usual speed and measures its usual number of points.
+    /// Returns the model and its number of beams once the first packets of a revolution match a model. They match if
+    /// the head rotates at the model's usual speed and measures the model's usual number of points.
     pub(crate) fn typical_model(&self) -> Option<(Model, usize)> {
         let revolution = self.revolution.filter(|revolution| revolution.packets >= MIN_TYPICAL)?;
         let counted = revolution.count_until(self.angle);
@@ -120,7 +120,7 @@ impl Revolution {
         Revolution { angle, packets: 0, speeds: (f64::from(speed), 1), slowest: speed, fastest: speed }
     }
 
-    /// Returns the result for the packets up to one whose first point is at `angle`.
+    /// Returns the result for the packets before a packet whose first point is at `angle`.
     fn count_until(&self, angle: f64) -> CountedRevolution {
         let (sum, count) = self.speeds;
         let points_per_turn =
@@ -139,7 +139,8 @@ impl Revolution {
         f64::from(self.fastest) <= f64::from(self.slowest) * (1.0 + MAX_SPEED_VARIATION)
     }
 
-    /// Adds a packet that follows `missing` missing ones. Its own points belong to the interval up to the next packet.
+    /// Adds `packet`. `missing` is the number of missing packets before it. The points of `packet` belong to the
+    /// interval up to the next packet.
     fn add(&mut self, packet: &Packet<'_>, missing: u32) {
         let speed = packet.speed();
         self.packets += 1 + missing;
@@ -149,48 +150,49 @@ impl Revolution {
 }
 
 impl CountedRevolution {
-    /// Returns the model that measures this number of points per second. If several models cannot be distinguished,
-    /// returns one of them.
+    /// Returns the model that measures this number of points per second. Several models may measure the same number.
+    /// The result is then one of them.
     pub(crate) fn model(&self) -> Model {
         Model::of_point_rate((self.points_per_revolution * self.revolutions_per_second) as f32)
     }
 
-    /// Returns the number of beams for these points. It is the model's number if the number of points is close to it.
+    /// Returns the number of beams for this number of points. It is the model's number of beams if the two numbers are
+    /// close.
     pub(crate) fn beams(&self) -> usize {
         let of_model = self.model().beams();
         let is_close = (self.points_per_revolution / of_model as f64 - 1.0).abs() <= MAX_COUNT_DEVIATION;
         if is_close { of_model } else { (self.points_per_revolution + 0.5) as usize }
     }
 
-    /// Returns whether the number of points is reliable. If the speed is not the usual one of the model, the head may
-    /// still be spinning up slowly, so the speed must be constant for longer.
+    /// Returns whether the number of points is reliable. At a speed that is not usual for the model, the head may still
+    /// be spinning up slowly. The speed must then be constant for longer.
     pub(crate) fn is_final(&self) -> bool {
         self.packets >= MIN_PACKETS && self.steady_time >= if self.is_usual() { 1 } else { SLOW_SPIN_UP_TIME }
     }
 
-    /// Returns whether the head rotates at the usual speed of its model.
+    /// Returns whether the head rotates at the model's usual speed.
     fn is_usual(&self) -> bool {
         let usual_speed = f64::from(self.model().revolutions_per_second());
         (self.revolutions_per_second / usual_speed - 1.0).abs() <= MAX_SPEED_DEVIATION
     }
 
-    /// Returns whether `beams` no longer fits the number of points.
+    /// Returns whether the number of points no longer fits `beams`.
     pub(crate) fn differs_from(&self, beams: usize) -> bool {
         (self.points_per_revolution / beams as f64 - 1.0).abs() > MAX_COUNT_DEVIATION
     }
 }
 
-/// Minimum number of packets in sequence for a reliable number of points.
+/// Minimum number of packets in a sequence for a reliable number of points.
 const MIN_PACKETS: u32 = 64;
-/// Minimum number of packets of a revolution that can match a model.
+/// Minimum number of packets of a revolution for a comparison with the models.
 const MIN_TYPICAL: u32 = 16;
-/// Maximum number of missing packets within a sequence. The count of more missing packets is uncertain.
+/// Maximum number of consecutive missing packets within a sequence. The hub cannot count more missing packets exactly.
 const MAX_MISSING: u32 = 8;
-/// Maximum variation of a constant speed, as a ratio. The speed of real scanners varies by 1 %.
+/// Maximum variation of a speed that counts as constant, as a ratio. The speed of real scanners varies by 1 %.
 const MAX_SPEED_VARIATION: f64 = 0.02;
-/// Maximum deviation of the speed from the usual speed of the model, as a ratio.
+/// Maximum deviation from the model's usual speed, as a ratio.
 const MAX_SPEED_DEVIATION: f64 = 0.015;
 /// Maximum deviation of the number of points from the number of beams, as a ratio.
 const MAX_COUNT_DEVIATION: f64 = 0.03;
-/// Time for which an unusual speed must be constant.
+/// Time for which a speed must be constant if it is not usual for the model.
 const SLOW_SPIN_UP_TIME: Nanos = 3_000 * MILLIS;

@@ -2,7 +2,7 @@
 //!
 //! An 8-bit checksum alone does not prove a packet, so the angles, the speed and the milliseconds of consecutive
 //! packets must also agree. The sequencer counts missing packets. It also computes times in the scanner's clock that
-//! are finer than the milliseconds of the packets. The clock starts at 0 with the scanner, so it also shows
+//! are finer than the milliseconds in the packets. The clock starts at 0 when the scanner starts, so it also shows
 //! [restarts](Restarts).
 
 use scanhub_schema::{MILLIS, Nanos};
@@ -13,7 +13,7 @@ use crate::ld::packet::{CLOCK_PERIOD_MS, FULL_CIRCLE, POINTS_PER_PACKET, Packet}
 #[derive(Clone, Debug)]
 pub(crate) struct PacketSequencer {
     last: Option<LastPacket>,
-    /// Last packet that did not continue the sequence. The next packet may continue it.
+    /// Last packet that did not continue the sequence. The next packet may continue from it.
     outlier: Option<LastPacket>,
     /// Number of consecutive outliers.
     outliers: u32,
@@ -49,9 +49,9 @@ pub(crate) enum PacketPosition {
     },
     /// The packet continues the sequence.
     Next {
-        /// As in [`PacketPosition::First`].
+        /// Time of the packet's last point, in the scanner's clock.
         time: Nanos,
-        /// As in [`PacketPosition::First`].
+        /// Angle of the packet's first point, in degrees clockwise over all revolutions.
         angle: f64,
         /// Number of packets that are missing between the previous packet and this one.
         missing: u32,
@@ -77,9 +77,11 @@ impl PacketPosition {
 
 /// Difference between two packets of a sequence.
 struct PacketStep {
-    /// Number of packets from the first to the second: 1 if the second one is next, 0 if both are the same.
+    /// Number of packets from the first to the second packet. It is 1 if the second packet is the next one, and 0 if
+    /// both are the same.
     packets: u32,
-    /// Angle between their first points, in hundredths of a degree.
+    /// Angle from the first point of the first packet to the first point of the second packet, in hundredths of a
+    /// degree.
     advance: f32,
     millis: u16,
 }
@@ -113,8 +115,8 @@ impl PacketSequencer {
         if self.learned_packets > 0 { 1e9 / self.points_per_second } else { 0.0 }
     }
 
-    /// Returns the last known time from one packet to the next, in nanoseconds; 0 if it is unknown. The value stays
-    /// after the stream has ended.
+    /// Returns the last known time from one packet to the next, in nanoseconds. It is 0 if no time is known. The value
+    /// stays valid after the end of the stream.
     pub(crate) fn packet_ns(&self) -> f64 {
         if self.points_per_second > 0.0 {
             POINTS_PER_PACKET as f64 * 1e9 / f64::from(self.points_per_second)
@@ -162,7 +164,7 @@ impl PacketSequencer {
         }
         let whole = last.whole + Nanos::from(step.millis) * MILLIS;
         let passed = self.point_ns() * (POINTS_PER_PACKET as u32 * step.packets) as f32;
-        // The clock in packets is truncated to milliseconds, but points are evenly spaced in time.
+        // The clock in packets has whole milliseconds, but points are evenly spaced in time.
         let time = (last.time + passed as Nanos).clamp(whole, whole + MILLIS - 1);
         self.lost += u64::from(missing.saturating_sub(self.outliers));
         (self.outlier, self.outliers) = (None, 0);
@@ -202,7 +204,7 @@ impl PacketSequencer {
         Some(PacketStep { packets: (packets + 0.5).max(0.0) as u32, advance, millis })
     }
 
-    /// Updates the estimate of the points per second with the speed of `packet` and the angle between its points.
+    /// Updates the estimated number of points per second with the speed in `packet` and the angle between its points.
     fn estimate_rate(&mut self, packet: &Packet<'_>) {
         if packet.span() == 0 || packet.speed() == 0 {
             return;
@@ -229,10 +231,12 @@ impl LastPacket {
     }
 }
 
-/// Number of packets after which the rate of points is known; below it, the number of packets in the moving average.
+/// Number of packets after which the number of points per second is known. Before that, the moving average covers all
+/// packets so far.
 const LEARNING_PACKETS: u32 = 16;
 const WINDOW_PACKETS: u32 = 256;
-/// Gap in milliseconds from which on packets are counted by the clock. It is a tenth of a revolution or more.
+/// Minimum duration of a gap whose missing packets are counted with the clock, in milliseconds. A tenth of a revolution
+/// or more passes in this time.
 const LONG_GAP_MS: u16 = 30;
 /// Maximum gap within a sequence, in milliseconds. A session restarts after one second without a packet, so a later
 /// packet belongs to a new stream.
@@ -241,17 +245,18 @@ const MAX_GAP_MS: u16 = 1_500;
 /// Detector that counts the restarts of a scanner.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Restarts {
-    /// Clock of the last packet of a sequence in milliseconds, and the hub's time at which the packet had arrived.
+    /// Clock of the last packet of a sequence in milliseconds, and the time of the hub's clock by which the packet had
+    /// arrived.
     last: Option<(u16, Nanos)>,
-    /// Whether the new sequence does not fit the previous one. The second packet of the new sequence confirms the
+    /// Whether the new sequence does not fit the previous one. The second packet of the new sequence then confirms the
     /// restart.
     is_suspected: bool,
     pub(crate) count: u64,
 }
 
 impl Restarts {
-    /// Handles the first packet of a sequence, whose clock shows `millis`. `arrival` has the earliest and the latest
-    /// time at which the packet can have arrived. It is `None` if these are unknown.
+    /// Handles the first packet of a sequence. The clock in the packet shows `millis`. `arrival` contains the earliest
+    /// and the latest time at which the packet can have arrived. It is `None` if these times are unknown.
     pub(crate) fn note_first(&mut self, millis: u16, arrival: Option<(Nanos, Nanos)>) {
         let known = self.last.zip(arrival);
         self.is_suspected = known.is_some_and(|((last, at), (earliest, latest))| {
@@ -260,15 +265,17 @@ impl Restarts {
         });
     }
 
-    /// Handles a packet that continues a sequence. Its clock shows `millis`, and it had arrived at `at`.
+    /// Handles a packet that continues a sequence. The clock in the packet shows `millis`. The packet had arrived by
+    /// the time `at`.
     pub(crate) fn note_next(&mut self, millis: u16, at: Nanos) {
         self.count += u64::from(core::mem::take(&mut self.is_suspected));
         self.last = Some((millis, at));
     }
 }
 
-/// Returns whether a scanner's clock restarted between two packets. It showed `last` milliseconds first, and `millis`
-/// milliseconds after a time between `min_passed` and `max_passed` nanoseconds.
+/// Returns whether a scanner's clock restarted between two packets. The clock showed `last` milliseconds in the first
+/// packet and `millis` milliseconds in the second one. The time between the packets was `min_passed` to `max_passed`
+/// nanoseconds.
 fn has_restarted(last: u16, millis: u16, (min_passed, max_passed): (Nanos, Nanos)) -> bool {
     let clock_period = Nanos::from(CLOCK_PERIOD_MS) * MILLIS;
     let tolerance = ARRIVAL_JITTER + max_passed / DRIFT_DIVISOR;
@@ -279,9 +286,9 @@ fn has_restarted(last: u16, millis: u16, (min_passed, max_passed): (Nanos, Nanos
     began_since && continued > max_passed + tolerance
 }
 
-/// Maximum error of an arrival time and of truncated milliseconds.
+/// Maximum error of the difference between an arrival time and the milliseconds in a packet.
 const ARRIVAL_JITTER: Nanos = 30 * MILLIS;
-/// Inverse of the maximum drift between two clocks.
+/// Inverse of the maximum drift between the scanner's clock and the hub's clock.
 const DRIFT_DIVISOR: Nanos = 100;
 
 #[cfg(test)]
@@ -289,7 +296,7 @@ mod tests {
     use super::*;
     use crate::ld::packet::{PACKET_LEN, PacketContents};
 
-    /// Returns packet number `n` of a scanner that rotates 10 times and measures 4500 points per second.
+    /// Returns packet number `n` of a scanner that rotates 10 times per second and measures 4500 points per second.
     fn packet(n: u32) -> [u8; PACKET_LEN] {
         let start = n * 960;
         PacketContents {
@@ -413,11 +420,12 @@ mod tests {
 
     #[test]
     fn bytes_that_waited_in_the_host_are_not_a_restart() {
-        // The host was stopped for 9 s and then read a packet that was measured at some time in between.
+        // The hub's process was stopped for 9 s and then read a packet. The scanner measured it at an unknown time in
+        // these 9 s.
         for advance in [100, 2_000, 8_900] {
             assert!(!has_restarted(1_000, 1_000 + advance, (0, 9 * SECOND)), "{advance}");
         }
-        // The host was suspended, so its own clock did not count the time.
+        // The host was suspended, so the host's clock did not count the time.
         assert!(!has_restarted(1_000, 17_000, after(500 * MILLIS)));
     }
 

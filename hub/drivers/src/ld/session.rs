@@ -1,6 +1,6 @@
-//! Session with an LDROBOT scanner, which streams without a request. The session only receives. It listens at the
-//! model's baud rate, or at both rates in turn until packets arrive. It measures the number of points per second, and
-//! returns packets as they arrive, and revolutions.
+//! Session with an LDROBOT scanner, which streams without a request. The session sends nothing. It listens at the
+//! model's baud rate, or alternates between both rates until packets arrive. It measures the number of points per
+//! second. It returns packets as they arrive, and complete revolutions.
 
 use core::fmt;
 
@@ -24,36 +24,36 @@ pub struct LdSession {
     framer: Framer,
     reads: ReadScheduler,
     clock: SensorClock,
-    /// Index of the first packet of a new sequence among the packets returned last, and the clock of the packets before
-    /// it. `None` if no sequence started in these packets.
+    /// Index of the first packet of a new sequence among the packets that were returned last, and the clock for the
+    /// packets before it. `None` if no sequence started in these packets.
     clock_before: Option<(usize, SensorClock)>,
     sequencer: PacketSequencer,
     revolutions: RevolutionAssembler<MAX_POINTS>,
-    /// Speed of the head in the packet whose points were added last.
+    /// Speed of the head according to the packet whose points were added last.
     rotation_rate: Option<RotationRate>,
     phase: Phase,
     baud: u32,
     change_baud: bool,
     point_count: PointCount,
-    /// Model and number of beams according to the measured points. A power cycle does not change them.
+    /// Model and number of beams that the session derived from the measured points. They stay the same after a power
+    /// cycle.
     measured: Option<(Model, usize)>,
-    /// Time from which packets have arrived without a decision about the number of beams.
+    /// Time since which packets have been arriving although the number of beams is undecided.
     undecided_since: Nanos,
-    /// Different number of beams that fits the recent revolutions, and the time of the scanner's clock at which they
-    /// started.
+    /// New number of beams that fits the recent revolutions, and the time of the scanner's clock from which it fits.
     other_beams: Option<(usize, Nanos)>,
     /// Last change of the number of beams, and the time until which the session reports it.
     beams_change: Option<(Problem, Nanos)>,
     /// Number of beams of a scan.
     beams: Option<usize>,
-    /// Whether the number of points per second of this stream is known.
+    /// Whether the number of points per second is known for this stream.
     is_rate_known: bool,
     scanner_time: Option<Nanos>,
     /// Returned packets whose points have not been added to revolutions yet.
     current: Option<PendingPackets>,
     now: Nanos,
     problem: Option<Problem>,
-    /// Time from which no packet has arrived.
+    /// Time since which no packet has arrived.
     no_packet_since: Nanos,
     counters: StreamCounters,
     restarts: Restarts,
@@ -69,12 +69,12 @@ enum Phase {
     Paused,
 }
 
-/// Packets whose points the session adds to revolutions.
+/// Packets that were returned, and whose points the session is adding to revolutions.
 #[derive(Clone, Copy, Debug)]
 struct PendingPackets {
     span: Span,
     positions: [PacketPosition; MAX_PACKETS_PER_SAMPLE],
-    /// Index of the first packet that is not finished.
+    /// Index of the first packet whose points are not completely processed.
     packet: usize,
     /// Whether the points of this packet were added.
     is_added: bool,
@@ -124,8 +124,8 @@ impl LdSession {
         Model::of(&self.settings).or(self.measured.map(|(model, _)| model))
     }
 
-    /// Returns the number of beams for scans. In this order, it is the number in the settings, the default of the
-    /// configured model, or the measured number.
+    /// Returns the number of beams of a scan. It is the number in the settings. If that is missing, it is the default
+    /// of the configured model, and otherwise the measured number.
     fn known_beams(&self) -> Option<usize> {
         let of_model = || Model::of(&self.settings).map(Model::beams);
         let measured = || self.measured.map(|(_, beams)| beams);
@@ -133,9 +133,9 @@ impl LdSession {
         Some(beams.min(self.settings.max_beams.unwrap_or(usize::MAX)))
     }
 
-    /// Updates the measured model and number of beams with a revolution, for a scanner without a configured model. The
-    /// first reliable number of points decides. Later, only a number that has been different for a long time changes
-    /// them.
+    /// Updates the measured model and number of beams with a revolution, if no model is configured. The first reliable
+    /// number of points determines both. Later, they change only if the number of points has been different for a long
+    /// time.
     fn update_beams(&mut self, counted: CountedRevolution) {
         let Some((_, beams)) = self.measured else {
             self.measured = counted.is_final().then(|| (counted.model(), counted.beams()));
@@ -145,7 +145,7 @@ impl LdSession {
             self.other_beams = None;
             return;
         }
-        // The clock of a scanner that has restarted starts at 0, so the earlier time is not comparable.
+        // If the scanner restarts, its clock restarts at 0. An earlier time is then not comparable.
         let is_same = |&(other, since): &(usize, Nanos)| !counted.differs_from(other) && since <= counted.at;
         let known = self.other_beams.filter(is_same);
         let (other, since) = *self.other_beams.insert(known.unwrap_or((counted.beams(), counted.at)));
@@ -160,7 +160,7 @@ impl LdSession {
         }
     }
 
-    /// Returns the model of the scanner if it is not the configured one. Models with the same number of points per
+    /// Returns the scanner's model if it differs from the configured one. Models with the same number of points per
     /// second cannot be distinguished.
     fn unexpected_model_by_rate(&self) -> Option<Model> {
         let configured = Model::of(&self.settings)?;
@@ -195,7 +195,7 @@ impl LdSession {
         if self.settings.model.is_some() || self.settings.fixed_rate { &BOTH[at..=at] } else { &BOTH }
     }
 
-    /// Ends the stream and waits for packets. `shown` is the state of the session meanwhile.
+    /// Ends the stream and waits for packets. `shown` is the session's state until packets arrive.
     fn listen(&mut self, shown: State) {
         self.phase = Phase::Listening { shown, next_at: self.now + LISTEN_TIME };
         self.no_packet_since = self.now;
@@ -206,7 +206,8 @@ impl LdSession {
         self.reads.cancel_wait();
     }
 
-    /// Changes to the other baud rate, because no packet arrived at this one. Updates the duration in the problem.
+    /// Changes to the other baud rate because no packet arrived at the present one. Updates the duration in the
+    /// problem.
     fn listen_at_next_rate(&mut self, shown: State) {
         self.phase = Phase::Listening { shown, next_at: self.now + LISTEN_TIME };
         let rates = self.rates();
@@ -235,7 +236,7 @@ impl LdSession {
                 self.problem = match self.counters.damaged_percent(self.framer.buffer.byte_counters()) {
                     0 | 1 => Some(Problem::HeadBlocked),
                     2..=50 => Some(Problem::DamagedRevolutions),
-                    // The hub reports such a line itself.
+                    // The hub itself reports a line that damages more bytes.
                     _ => None,
                 };
             }
@@ -302,8 +303,8 @@ impl LdSession {
         let latest = self.reads.read_log().latest(last_byte, line_rate);
         let last = stamp(span.packets - 1).map_or(latest, |at| at + packet_time);
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
-        // A repeated packet is stamped by its arrival, and the next one by the scanner's clock. The first stamp may be
-        // the later one.
+        // The stamp of a repeated packet is its arrival time. The stamp of the next packet comes from the scanner's
+        // clock, and may be earlier.
         let last = self.reads.stamp_packet(last.max(at));
         self.current = Some(PendingPackets { span, positions, packet: 0, is_added: false });
         self.counters.note_packets(self.framer.buffer.byte_counters(), span.packets);
@@ -329,7 +330,7 @@ impl LdSession {
         }
     }
 
-    /// Starts the stream after its first packets, or extends it after later ones.
+    /// Starts the stream after its first packets, or continues it after later packets.
     fn continue_stream(&mut self) {
         match &mut self.phase {
             Phase::Streaming(watchdog) => {
@@ -360,7 +361,7 @@ impl LdSession {
         }
     }
 
-    /// Adds the points of the current packets to revolutions, until one is complete. Returns that revolution.
+    /// Adds the points of the current packets to revolutions until a revolution is complete. Returns that revolution.
     fn advance_revolutions(&mut self) -> Option<ClosedRevolution> {
         while let Some(current) = &mut self.current {
             let (bytes, _) = self.framer.bytes(current.span).as_chunks::<PACKET_LEN>();
@@ -377,7 +378,8 @@ impl LdSession {
                 if let PacketPosition::Next { angle, missing, from, .. } = position
                     && missing > 0
                 {
-                    // No point between the two angles arrived. They may be in a revolution that has not started yet.
+                    // No point between the two angles arrived. The missing points may be in a revolution that has not
+                    // started yet.
                     self.revolutions.mark_gap(from + rotation_rate.step, angle - rotation_rate.step);
                     // Use the speed before the gap for the revolution that ends here, because the head may rotate more
                     // slowly now.
@@ -416,7 +418,7 @@ impl LdSession {
         self.to_scan(revolution)
     }
 
-    /// Converts a revolution to a scan with stamps of the hub's clock.
+    /// Converts a revolution to a scan whose stamps are in the hub's clock.
     fn to_scan(&self, revolution: ClosedRevolution) -> RawScan<'_> {
         let packet = self.current.map_or(usize::MAX, |current| current.packet);
         let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
@@ -563,16 +565,16 @@ pub enum Problem {
     NoPackets {
         /// The only baud rate at which the session listened. `None` if it listened at both.
         baud: Option<u32>,
-        /// Duration in seconds, rounded down to 1, 2, 4, ..
+        /// Time without a packet in seconds, rounded down to 1, 2, 4, ..
         seconds: u32,
     },
     /// No packet arrived for one second.
     Silence,
     /// Packets arrive, but the head does not rotate.
     HeadBlocked,
-    /// No revolution is complete, because bytes are damaged on the line.
+    /// No revolution is complete, because the line damages bytes.
     DamagedRevolutions,
-    /// The number of points per revolution has changed, and with it the number of beams.
+    /// The number of points per revolution has changed, so the number of beams has changed too.
     BeamsChanged {
         /// Previous number of beams.
         from: usize,
@@ -641,17 +643,19 @@ fn add_points(
     }
 }
 
-/// Returns the maximum number of packets that are returned together. They arrive in 10 ms.
+/// Returns the maximum number of packets that are returned together. These packets arrive within 10 ms.
 const fn max_packets_per_sample(baud: u32) -> usize {
     if baud > 500_000 { MAX_PACKETS_PER_SAMPLE } else { 3 }
 }
 
-/// Maximum number of points in a revolution. An STL27L measures fewer points even at five revolutions per second.
+/// Maximum number of points in a revolution. An STL27L measures fewer points per revolution, even at five revolutions
+/// per second.
 const MAX_POINTS: usize = 4_400;
 /// Time for which the session listens at one baud rate. A stream has a packet at least every 3 ms.
 const LISTEN_TIME: Nanos = 300 * MILLIS;
-/// Time after which the session uses the number of beams of the model that fits the points per second. This is for a
-/// scanner whose speed is never constant, or whose sequence has a gap in every revolution.
+/// Time after which the session uses the default number of beams of the model that fits the number of points per
+/// second. Some scanners need it, because their speed is never constant or their sequence has a gap in every
+/// revolution.
 const DECISION_TIMEOUT: Nanos = 10_000 * MILLIS;
 /// Time for which the number of points per revolution must be different before the number of beams changes.
 const CHANGE_DELAY: Nanos = 10_000 * MILLIS;

@@ -1,4 +1,5 @@
-//! Bounds for the arrival time of a byte. A port reports only when a read returned, and how many bytes the read had.
+//! Bounds for the arrival time of a byte. A port reports only the time at which a read returned, and the number of
+//! bytes in the read.
 
 use scanhub_schema::{Nanos, line_time};
 
@@ -11,21 +12,21 @@ pub struct ReadLog {
     total: u64,
 }
 
-/// Timing of a stream. Bytes are `byte_ns` nanoseconds apart on average. The bytes of one packet may arrive all
-/// together, or at the bit rate of a line.
+/// Timing of a stream. Bytes are `byte_ns` nanoseconds apart on average. The bytes of one packet may arrive all at
+/// once, or at the bit rate of a line.
 #[derive(Clone, Copy, Debug)]
 pub struct StreamTiming {
     /// Mean time from one byte to the next, in nanoseconds.
     pub byte_ns: f64,
     /// Length of a packet, in bytes.
     pub packet_len: usize,
-    /// Bit rate of the line, in bits per second; `None` if the bytes of a packet may arrive all together.
+    /// Bit rate of the line, in bits per second. `None` if the bytes of a packet may arrive all at once.
     pub line_rate: Option<u32>,
 }
 
 impl ReadLog {
-    /// Number of stored reads. They cover a packet that arrives in pieces of 16 bytes, and the next packet, which may
-    /// begin inside it.
+    /// Number of stored reads. A packet may arrive in pieces of 16 bytes, and the next packet may begin inside it. The
+    /// log covers both packets.
     const CAPACITY: usize = 8;
 
     /// Adds a read of `len` bytes that returned at `now`. Ignores an empty read.
@@ -42,8 +43,8 @@ impl ReadLog {
         self.total
     }
 
-    /// Returns the latest time at which the byte at `offset` can have arrived. The bytes after it in the same read took
-    /// their time on a line of `line_rate` bits per second. None of them had arrived at the previous read.
+    /// Returns the latest time at which the byte at `offset` can have arrived. The later bytes of the same read came
+    /// after it, at `line_rate` bits per second. None of them had arrived at the previous read.
     pub fn latest(&self, offset: u64, line_rate: Option<u32>) -> Nanos {
         let oldest = self.next.saturating_sub(ReadLog::CAPACITY);
         let mut latest = Nanos::MAX;
@@ -60,11 +61,11 @@ impl ReadLog {
     }
 
     /// Returns the earliest time at which the byte at `offset` can have arrived. Returns `None` if it is unknown,
-    /// because the log has no read before, or because the byte may have been in a backlog. A read has backlogged bytes
+    /// because the log has no earlier read, or because the byte may have been in a backlog. A read contains a backlog
     /// if it has more bytes than the scanner can have sent since the previous read.
     pub fn earliest(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
-        // The last read of a backlog in a full tty is shorter than the others, and the tty may return some more bytes a
-        // moment later.
+        // The last read of a backlog in a full tty is shorter than the reads before it. The tty may return some more
+        // bytes a moment later.
         let is_backlog_end = |n: usize| {
             n > self.oldest() + 2
                 && self.read(n - 2).0 - self.read(n - 3).0 >= MAX_TTY_READ as u64
@@ -74,9 +75,9 @@ impl ReadLog {
         self.earliest_in_read(n, offset, timing)
     }
 
-    /// Returns the [`earliest`](Self::earliest) arrival of the byte at `offset`, which follows missing bytes and does
-    /// not belong to the end of a backlog. If a full tty had a backlog and almost no bytes follow the byte, the time is
-    /// known: the byte arrived when the tty had space again, or shortly before.
+    /// Returns the [`earliest`](Self::earliest) arrival time of the byte at `offset`, if bytes are missing before it.
+    /// This byte does not belong to the end of a backlog. If a full tty had a backlog, and almost no bytes follow this
+    /// byte, its time is known: it arrived when the tty had space again, or shortly before.
     pub fn earliest_after_gap(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         let n = self.read_containing(offset)?;
         self.earliest_in_read(n, offset, timing).or_else(|| {
@@ -100,8 +101,8 @@ impl ReadLog {
         self.reads[n % ReadLog::CAPACITY]
     }
 
-    /// Returns the index of the read that contains the byte at `offset`, or of the newest read if the byte has not been
-    /// read. Returns `None` if the log has no entry before that read.
+    /// Returns the index of the read that contains the byte at `offset`. If this byte has not been read, returns the
+    /// index of the newest read. Returns `None` if the log has no earlier read.
     fn read_containing(&self, offset: u64) -> Option<usize> {
         (self.oldest() + 1..self.next).rev().find(|&n| self.read(n - 1).0 <= offset)
     }
@@ -112,8 +113,8 @@ impl ReadLog {
         (end - begin) as f64 * timing.byte_ns > 1.25 * now.saturating_sub(before) as f64
     }
 
-    /// Returns the earliest time at which the byte at `offset`, which is in read `n`, can have arrived. Returns `None`
-    /// if read `n` may contain backlogged bytes.
+    /// Returns the earliest time at which the byte at `offset`, in read `n`, can have arrived. Returns `None` if read
+    /// `n` may contain a backlog.
     fn earliest_in_read(&self, n: usize, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
         let is_backlog_end = n > self.oldest() + 1 && begin - self.read(n - 2).0 >= MAX_TTY_READ as u64;
@@ -124,10 +125,10 @@ impl ReadLog {
         }
         let line_time = |bytes: u64| timing.line_rate.map_or(0, |baud| line_time(bytes as usize, baud));
         let packet = timing.packet_len as u64;
-        // The bytes of this packet that are in this read took their time on the line.
+        // The line needed time for the bytes of this packet that are in this read.
         let before = (before + line_time((offset + 1 - begin).min(packet))).min(now);
-        // Every adapter can buffer this number of bytes. If the adapter had dropped bytes after this one, it would have
-        // dropped this one as well.
+        // Every adapter can buffer `ADAPTER_BUFFER_LEN` bytes. If the adapter had dropped bytes after this byte, it
+        // would have dropped this byte as well.
         let idle = (packet as f64 * timing.byte_ns) as Nanos;
         let delay =
             ((end - offset) as f64 * timing.byte_ns) as Nanos + idle.saturating_sub(line_time(packet));
@@ -201,11 +202,11 @@ mod tests {
         assert_eq!(arrivals.earliest(167, flow), None);
         assert_eq!(arrivals.earliest(167, packets), Some(at(1_500)), "at once, and nothing since");
         assert_eq!(arrivals.earliest(167, on_a_line), Some(at(1_500) + line_time(68, 400_000)));
-        // The bytes after a full read were buffered, no matter how few they are.
+        // The bytes after a full read were buffered, even if there are only a few.
         arrivals.note_read(at(2_500), 4_095);
         arrivals.note_read(at(2_501), 60);
         assert_eq!(arrivals.earliest(4_300, packets), None);
-        // The same applies to the bytes after the last read of a backlog, which is shorter than a full read.
+        // The same applies to bytes after the last read of a backlog, which is shorter than a full read.
         arrivals.note_read(at(3_500), 4_095);
         arrivals.note_read(at(3_501), 4_056);
         arrivals.note_read(at(3_507), 70);
@@ -220,7 +221,7 @@ mod tests {
         let packets = StreamTiming { packet_len: 84, ..evenly(15_000.0) };
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note_read(at(1_000), 420);
-        // A tty may need some time to return more.
+        // A tty may need some time before it returns more bytes.
         let reads = [(1_500, 4_095), (1_501, 4_095), (1_502, 900), (1_507, 4_095)];
         reads.iter().for_each(|&(ms, len)| arrivals.note_read(at(ms), len));
         let end = 420 + 3 * 4_095 + 900;

@@ -1,6 +1,5 @@
-//! Description of a scanner family: its models and settings, and the steps by which the search recognizes one of its
-//! scanners on a line. [`crate::search`] runs the steps of an [`Approach`] and passes the received bytes to a
-//! [`Probe`].
+//! Description of a scanner family: its models and settings, and the steps with which the search recognizes a scanner
+//! of the family. [`crate::search`] runs the steps of an [`Approach`] and passes the received bytes to a [`Probe`].
 
 use core::fmt;
 
@@ -13,10 +12,10 @@ use crate::settings::Key;
 pub struct Features {
     /// The family's models. Empty if the scanner reports its model.
     pub models: &'static [Model],
-    /// Values for a scanner whose model is unknown: the first baud rate to use, and the number of beams to reserve
-    /// space for.
+    /// Values for a scanner whose model is unknown: the baud rate that the hub uses first, and the number of beams for
+    /// which it reserves space.
     pub defaults: Model,
-    /// Names of the scan modes. Empty if the family has only one.
+    /// Names of the scan modes. Empty if the family has only one mode.
     pub modes: &'static [&'static str],
     /// Settings that only this family has.
     pub keys: &'static [Key],
@@ -29,9 +28,9 @@ pub struct Features {
     pub has_whole_telegrams: bool,
     /// Whether the scanner reports its settings outside a session, in reply to an [inquiry](crate::inquiry).
     pub has_inquiry: bool,
-    /// Arrays of a scan: bits of [`scanhub_schema::ArrayFlags`].
+    /// Flags for the arrays that a scan contains: bits of [`scanhub_schema::ArrayFlags`].
     pub array_flags: u8,
-    /// Maximum length in bytes of a telegram, or of packets that arrive together.
+    /// Maximum length of a telegram, or of packets that arrive together, in bytes.
     pub max_telegram: usize,
 }
 
@@ -84,10 +83,10 @@ pub(crate) use table;
 
 /// Recognizer of one family's scanners in the bytes of a line.
 pub trait Probe: fmt::Debug + Send {
-    /// Returns the rates, steps and requests by which the search may find this family.
+    /// Returns the rates, steps and requests with which the search may find this family.
     fn approach(&self) -> &'static Approach;
 
-    /// Discards all bytes after a change of the baud rate, and expects no reply.
+    /// Discards all bytes, because the baud rate has changed. After the call, the probe expects no reply.
     fn clear(&mut self);
 
     /// Sets whether a reply to the family's own request is expected.
@@ -98,13 +97,13 @@ pub trait Probe: fmt::Debug + Send {
     /// Handles bytes from the line.
     fn receive(&mut self, bytes: &[u8]);
 
-    /// Returns how long the line must be idle before [`release`](Self::release) may accept bytes that are still
-    /// ambiguous. Returns `None` if there are no such bytes.
+    /// Returns how long the line must be idle before [`release`](Self::release) may accept ambiguous bytes. Returns
+    /// `None` if no bytes are ambiguous.
     fn hold(&self) -> Option<Nanos> {
         None
     }
 
-    /// Handles a read that returned no bytes. No byte has arrived for `idle`.
+    /// Handles a read that returned no bytes. `idle` is the time since the last byte.
     fn release(&mut self, idle: Nanos) {
         let _ = idle;
     }
@@ -113,18 +112,18 @@ pub trait Probe: fmt::Debug + Send {
     fn evidence(&self) -> Evidence;
 }
 
-/// Evidence that received bytes give about the scanner.
+/// What the received bytes prove about the scanner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Evidence {
     /// The bytes prove nothing.
     None,
-    /// The bytes may be a damaged transmission of the family. The search should send the request again.
+    /// The bytes may be a damaged transmission of the family. The search should repeat the request.
     Damaged,
     /// The bytes may be the start of a transmission of the family. The search should wait for its end.
     Partial,
-    /// The bytes look like a stream of the family. Only a reply can prove it.
+    /// The bytes look like a stream of the family. Only a reply can prove the family.
     Stream,
-    /// The scanner belongs to the family. Contains the model if the scanner has reported it.
+    /// The scanner belongs to the family. Contains the model, if the scanner has reported one.
     Found(Option<&'static str>),
 }
 
@@ -135,13 +134,14 @@ pub struct Approach {
     pub family: Family,
     /// Steps that only listen, in the order in which they run.
     pub listen_steps: &'static [ListenStep],
-    /// Steps that send requests. `None` for a family that never receives bytes.
+    /// Steps that send requests. `None` for a family whose scanners accept no requests.
     pub request_steps: Option<RequestSteps>,
     /// Baud rate at which a scanner sends its boot message, in bits per second. The search pauses at this rate.
     pub boot_rate: Option<u32>,
-    /// Maximum length of a transmission, in bytes.
+    /// Maximum length of a transmission from the scanner, in bytes.
     pub max_transmission: usize,
-    /// Part of a message for a search without success: properties of the scanner that the user should check.
+    /// Part of the message for a search that found no scanner: the properties of the scanner that the user should
+    /// check.
     pub advice: &'static str,
 }
 
@@ -164,11 +164,11 @@ pub struct ListenStep {
     pub rate: u32,
     /// Duration of the step.
     pub duration: Nanos,
-    /// Whether a round skips the step if no byte has arrived in it.
+    /// Whether a search round skips the step if no byte has arrived in this round.
     pub needs_bytes: bool,
 }
 
-/// Steps that send requests, at one baud rate after the other.
+/// Steps that send requests, at each baud rate.
 #[derive(Clone, Copy, Debug)]
 pub struct RequestSteps {
     /// Baud rates in bits per second, the most likely one first.
@@ -177,19 +177,19 @@ pub struct RequestSteps {
     pub settle_time: Nanos,
     /// Request that stops a stream. The search sends it before any other request.
     pub stop: Option<StopRequest>,
-    /// Requests that the scanner replies to. Every round uses the next one.
+    /// Requests to which the scanner replies. Each round of the search uses the next request.
     pub requests: &'static [&'static [u8]],
     /// Minimum and maximum time between the end of one byte of a request and the start of the next. `None` if the
     /// scanner accepts any gap, so that one write can send the whole request.
     pub gap: Option<(Nanos, Nanos)>,
     /// Maximum time from the last byte of the request to the first byte of the reply.
     pub reply_timeout: Nanos,
-    /// Extra time for the reply in every second round, for slow scanners.
+    /// Additional time for the reply in every second round, for slow scanners.
     pub extra_reply_time: Nanos,
-    /// Extra time for a reply that has [begun](Evidence::Partial).
+    /// Additional time for the rest of a reply that has [begun](Evidence::Partial).
     pub extra_partial_time: Nanos,
-    /// Number of times that every second round sends the request. In every round, the search sends a request again if
-    /// its reply may have been [damaged](Evidence::Damaged).
+    /// Number of times that the search sends the request in every second round. In any round, the search also repeats a
+    /// request if the reply may have been [damaged](Evidence::Damaged).
     pub repeats: u8,
 }
 
@@ -200,7 +200,7 @@ pub struct StopRequest {
     pub request: &'static [u8],
     /// Time without a byte after which the stream has ended.
     pub quiet_time: Nanos,
-    /// Maximum time to wait for the end of the stream. After it, the search sends its request although bytes still
-    /// arrive.
+    /// Maximum time to wait for the end of the stream. After this time, the search sends its request even if bytes
+    /// still arrive.
     pub max_wait: Nanos,
 }
