@@ -1,8 +1,8 @@
 //! Framing of packets that have a fixed length, in a stream that may lack bytes.
 //!
 //! An 8-bit checksum is right by chance in 1 of 256 cases, and a packet that lost bytes contains the beginning of the
-//! next one. A packet that contains another header is therefore accepted only if a header follows it, or if the bytes
-//! from the inner header on are not a packet.
+//! next packet. The framer therefore accepts a packet that contains another header only in two cases: a header follows
+//! the packet, or the bytes from the inner header on are not a packet.
 
 use scanhub_schema::Nanos;
 
@@ -30,15 +30,16 @@ pub trait Format {
 pub enum FrameCheck<R> {
     /// The bytes are a packet.
     Packet,
-    /// The bytes are not a packet. Contains the reason if they begin with a header but the check of the packet failed.
+    /// The bytes are not a packet. Contains the reason if the bytes begin with a header but [`Format::check`] failed.
     NoPacket(Option<R>),
     /// The packet is not complete yet.
     Incomplete,
-    /// The bytes are a packet, unless another packet begins inside it. The framer needs more bytes to decide.
+    /// The bytes are a packet, unless another packet begins inside them. The framer needs more bytes to decide.
     Held,
 }
 
-/// Checks whether a packet begins at the first byte of `open`. If `is_released`, ignores incomplete packets inside it.
+/// Checks whether a packet begins at the first byte of `open`. If `is_released`, ignores incomplete packets inside this
+/// packet.
 fn check_frame<F: Format>(format: &F, open: &[u8], is_released: bool) -> FrameCheck<F::Reject> {
     let len = format.packet_len();
     if !format.begins(open) {
@@ -73,35 +74,37 @@ pub struct ByteCounters {
     pub discarded: u64,
     /// Returned packets.
     pub packets: u64,
-    /// Headers that the framer discarded because the checksum of their packet was wrong.
+    /// Headers that the framer discarded because the checksum of the packet was wrong.
     pub rejected_checksum: u64,
 }
 
-/// Buffer of a framer, with room for `N` open bytes. An open byte is neither part of a returned packet nor discarded.
+/// Buffer of a framer, with room for `N` open bytes. An open byte has not been discarded, and is not part of a returned
+/// packet.
 #[derive(Clone, Debug)]
 pub struct Buffer<const N: usize> {
     bytes: [u8; N],
     /// The open bytes are `bytes[start..end]`.
     start: usize,
     end: usize,
-    /// Time without a byte after which no more bytes are in flight.
+    /// Time without a byte after which no byte can still arrive from the line.
     hold: Nanos,
-    /// Whether the framer holds a packet back because another one may begin inside it.
+    /// Whether the framer holds a packet back because another packet may begin inside it.
     is_held: bool,
-    /// Whether the line has been idle for long enough to stop holding packets back.
+    /// Whether the line has been idle long enough that the framer no longer holds packets back.
     is_released: bool,
     counters: ByteCounters,
 }
 
 impl<const N: usize> Buffer<N> {
-    /// Creates an empty buffer. It releases a packet that it holds back after the line was idle for `hold`.
+    /// Creates an empty buffer. If the framer holds a packet back, the buffer releases it after the line was idle for
+    /// `hold`.
     pub fn new(hold: Nanos) -> Self {
         let counters = ByteCounters::default();
         Buffer { bytes: [0; N], start: 0, end: 0, hold, is_held: false, is_released: false, counters }
     }
 
-    /// Returns the free space for the next bytes. The caller writes to its beginning and then calls [`Buffer::commit`].
-    /// Positions from [`Buffer::take`] become invalid.
+    /// Returns the free space for the next bytes. The caller writes to the beginning of this space and then calls
+    /// [`Buffer::commit`]. Positions that [`Buffer::take`] returned become invalid.
     pub fn read_buffer(&mut self) -> &mut [u8] {
         self.bytes.copy_within(self.start..self.end, 0);
         self.end -= self.start;
@@ -139,7 +142,7 @@ impl<const N: usize> Buffer<N> {
         self.is_held.then_some(self.hold)
     }
 
-    /// Handles a read that returned no bytes. No byte has arrived for `idle`.
+    /// Handles a read that returned no bytes. `idle` is the time since the last byte.
     pub fn release(&mut self, idle: Nanos) {
         self.is_released |= self.is_held && idle >= self.hold;
     }

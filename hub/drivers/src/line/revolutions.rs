@@ -1,9 +1,9 @@
-//! Assembly of points into revolutions.
+//! Assembles points into revolutions.
 //!
 //! A revolution begins half a grid step before the scanner's zero, so that all points of the beam ahead belong to the
 //! same revolution. A point belongs to the revolution that contains its angle, and may arrive after points with larger
-//! angles. A revolution is therefore complete only when the head is past its end by more than a point can be late.
-//! Until then, two revolutions are open. Times are in the scanner's clock.
+//! angles. A revolution is therefore complete only when the angle between its end and the head is greater than the
+//! maximum lateness of a point. Until then, two revolutions are open. Times are in the scanner's clock.
 
 use crate::line::{NO_RETURN, Point};
 use scanhub_schema::Nanos;
@@ -15,11 +15,13 @@ pub struct RevolutionAssembler<const N: usize> {
     /// Index of the buffer that holds the points of the first open revolution.
     at: usize,
     open: [OpenRevolution; 2],
-    /// Index of the first open revolution since the sequence of angles began. `None` before the first point.
+    /// Index of the first open revolution, counted from the start of the sequence of angles. `None` before the first
+    /// point.
     number: Option<i64>,
-    /// Serial number of the first open revolution among all revolutions. The second one has the next number.
+    /// Serial number of the first open revolution among all revolutions. The second open revolution has the next
+    /// number.
     serial: u64,
-    /// Index of the last revolution that has missing points.
+    /// Index of the last revolution that lacks points.
     last_incomplete: i64,
     /// Angle from the edge of a revolution to the scanner's zero, in degrees.
     edge: f64,
@@ -29,7 +31,7 @@ pub struct RevolutionAssembler<const N: usize> {
 #[derive(Clone, Copy, Debug, Default)]
 struct OpenRevolution {
     len: usize,
-    /// Time at the edge in nanoseconds; `last` is the time of the last point.
+    /// Time at the edge, in nanoseconds. `last` is the time of the last point.
     first: Option<f64>,
     last: f64,
     incomplete: bool,
@@ -39,7 +41,7 @@ struct OpenRevolution {
 /// A complete revolution, in time of the scanner's clock. Its points stay valid until the next point is added.
 #[derive(Clone, Copy, Debug)]
 pub struct ClosedRevolution {
-    /// Serial number. No other revolution has it, not even a discarded one.
+    /// Serial number. No other revolution has the same number, not even a discarded revolution.
     pub number: u64,
     points: usize,
     len: usize,
@@ -68,7 +70,7 @@ pub struct RevolutionCounts {
     pub missed: u64,
 }
 
-/// Speed of the head, per point.
+/// Speed of the head, as the angle and the time from one point to the next.
 #[derive(Clone, Copy, Debug)]
 pub struct RotationRate {
     /// Angle from one point to the next, in degrees.
@@ -117,7 +119,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         self.counts
     }
 
-    /// Returns the first open revolution with the points so far. Returns `None` if it has no point.
+    /// Returns the first open revolution with its points so far. Returns `None` if it has no point.
     pub fn partial_revolution(&self, rate: RotationRate) -> Option<ClosedRevolution> {
         let open = &self.open[0];
         Some(self.close(open, open.first?, rate.revolution_ns()))
@@ -136,8 +138,8 @@ impl<const N: usize> RevolutionAssembler<N> {
         (self.number, self.last_incomplete) = (None, i64::MIN);
     }
 
-    /// Adds a point. `angle` is in degrees, clockwise, and increases over all revolutions. `time` is in nanoseconds,
-    /// and `range` in millimeters. `reasons` are bits of [`crate::line::suspect`].
+    /// Adds a point. `angle` is in degrees, clockwise, and increases beyond 360 degrees. `time` is in nanoseconds, and
+    /// `range` in millimeters. `reasons` are bits of [`crate::line::suspect`].
     pub fn add_point(
         &mut self,
         angle: f64,
@@ -148,8 +150,8 @@ impl<const N: usize> RevolutionAssembler<N> {
         rate: RotationRate,
     ) {
         let revolution = self.revolution_at(angle);
-        // The first point is somewhere in its revolution, so the next revolution is the first whose points are all
-        // measured.
+        // The first point is somewhere inside its revolution. The next revolution is therefore the first one with all
+        // points.
         let number = *self.number.get_or_insert(revolution + 1);
         let Some(which) = usize::try_from(revolution - number).ok().filter(|which| *which < 2) else {
             // The caller added the points of this revolution before it called `close_before`.
@@ -167,7 +169,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         open.len += 1;
         open.last = open.last.max(time);
         open.reasons |= reasons;
-        // Extrapolate the time at the edge, because the first points may be missing.
+        // Extrapolate the time at the edge, because the first points of the revolution may be missing.
         let edge = self.edge;
         open.first.get_or_insert_with(|| {
             let points = if rate.step > 0.0 { (within + edge) / rate.step } else { 0.0 };
@@ -190,8 +192,8 @@ impl<const N: usize> RevolutionAssembler<N> {
         self.open[0].incomplete |= self.number.is_some();
     }
 
-    /// Closes a revolution that ends before `angle`, in degrees, because all points before this angle have been added.
-    /// The caller repeats the call until it returns `None`.
+    /// Closes the first open revolution if it ends before `angle`, in degrees. All points before this angle must have
+    /// been added. The caller repeats the call until it returns `None`.
     pub fn close_before(&mut self, angle: f64, rate: RotationRate) -> Option<ClosedRevolution> {
         let revolution = self.revolution_at(angle);
         while let Some(number) = self.number.filter(|number| revolution > *number) {
@@ -248,7 +250,8 @@ impl<const N: usize> RevolutionAssembler<N> {
 
     fn revolution_at(&self, angle: f64) -> i64 {
         let revolutions = (angle + self.edge) / 360.0;
-        // A conversion rounds toward zero. Round down instead, so that angles below zero belong to revolution -1.
+        // The conversion to an integer rounds toward zero. Round down, so that angles below zero belong to revolution
+        // -1.
         let whole = revolutions as i64;
         if (whole as f64) > revolutions { whole - 1 } else { whole }
     }
@@ -282,7 +285,7 @@ mod tests {
             (from..to).map(f64::from).for_each(|at| turns.add_point(at, 1e6 * at, 1_000, 0, 0, pace));
         };
         put(&mut turns, 0, 600);
-        // A gap that contains an edge, and points on both sides of the next edge.
+        // The gap contains an edge. The next edge has points on both sides.
         turns.mark_gap(601.0, 1_074.0);
         put(&mut turns, 1_075, 1_086);
         let (mut closed_turns, mut count) = ([(0, false); 2], 0);

@@ -1,5 +1,5 @@
-//! A scan in the buffer of a session, complete or still arriving, and the grid of beams to which the points of a
-//! revolution are assigned. [`RawScan::write`] converts the received values to ranges, directly in the shared memory
+//! A scan in the buffer of a session, complete or still arriving. Also the grid of beams to which a session assigns the
+//! points of a revolution. [`RawScan::write`] converts the received values to ranges, directly in the shared memory
 //! that subscribers read.
 
 use core::f32::consts::TAU;
@@ -11,12 +11,13 @@ use crate::line::ClosedRevolution;
 /// Scan as the session received it.
 #[derive(Clone, Copy, Debug)]
 pub struct RawScan<'a> {
-    /// Serial number among the scans of the session. Scans that are not returned also have a number.
+    /// Serial number among all scans of the session, including scans that the session does not return.
     pub number: u64,
-    /// Time at which beam 0 was measured, even if it has no point. For fixed angles, the time at which the first byte
-    /// arrived.
+    /// Time at which beam 0 was measured, even if beam 0 has no point. For a scan with fixed angles, the time at which
+    /// the first byte arrived.
     pub first: Nanos,
-    /// Time at which the last point was measured. For fixed angles, the time at which the last byte arrived.
+    /// Time at which the last point was measured. For a scan with fixed angles, the time at which the last byte
+    /// arrived.
     pub last: Nanos,
     /// Time from one scan to the next in nanoseconds; 0 if it is unknown.
     pub period: Nanos,
@@ -33,7 +34,7 @@ pub struct RawScan<'a> {
 /// Values of a scan, in the format of the scanner.
 #[derive(Clone, Copy, Debug)]
 pub enum Values<'a> {
-    /// Little-endian words of the first beams of a scan, whose beams have fixed angles.
+    /// Little-endian words of a scan whose beams have fixed angles. The words belong to the first beams.
     Words {
         /// The words, two bytes for each beam.
         bytes: &'a [u8],
@@ -50,8 +51,9 @@ pub enum Values<'a> {
 }
 
 impl<'a> RawScan<'a> {
-    /// Creates the scan of `revolution`, which has the given points, on a grid of `beams` beams. `first` and `last` are
-    /// the stamps of beam 0 and of the last point. `per_second` is the number of points per second; 0 if it is unknown.
+    /// Creates the scan of `revolution`, whose points are `points`, on a grid of `beams` beams. `first` and `last` are
+    /// the stamps of beam 0 and of the last point. `per_second` is the number of points per second. It is 0 if the
+    /// number is unknown.
     pub fn revolution(
         family: Family,
         revolution: &ClosedRevolution,
@@ -85,7 +87,8 @@ impl<'a> RawScan<'a> {
         Scan::len(self.beams(), self.head.contents)
     }
 
-    /// Writes every used byte of `scan`. Beams whose values have not arrived become [`NOT_MEASURED`].
+    /// Writes all bytes of `scan` up to [`payload_len`](Self::payload_len). Beams whose values have not arrived become
+    /// [`NOT_MEASURED`].
     ///
     /// # Panics
     ///
@@ -112,7 +115,7 @@ impl<'a> RawScan<'a> {
     }
 }
 
-/// Returns the head of the scan of a revolution that takes `period` nanoseconds, on a grid of `beams` beams.
+/// Returns the head of a revolution's scan on a grid of `beams` beams. The revolution takes `period` nanoseconds.
 /// `points_per_second` is 0 if it is unknown.
 pub fn revolution_head(
     family: Family,
@@ -152,9 +155,9 @@ pub const NOT_MEASURED: u16 = Scan::NOT_MEASURED;
 /// Number of beams that a grid may have.
 pub const BEAM_RANGE: core::ops::RangeInclusive<usize> = 2..=scanhub_schema::MAX_BEAMS;
 
-/// Grid of equal bins over 360 degrees, for a head that rotates clockwise. Beam 0 points ahead, and the angle of beam
-/// `i` is `i` times the [`step`](Grid::step), which is negative. Beams are therefore in the order of measurement. The
-/// bin of beam 0 begins half a step before the scanner's zero, so 0 and 360 degrees belong to the same beam.
+/// Grid of equal bins over 360 degrees, for a head that rotates clockwise. Beam 0 points ahead. The angle of beam `i`
+/// is `i` times the [`step`](Grid::step), which is negative, so beams are in the order of measurement. The bin of beam
+/// 0 begins half a step before the scanner's zero, so 0 and 360 degrees belong to the same beam.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grid {
     beams: usize,
@@ -178,10 +181,10 @@ impl Grid {
         -core::f64::consts::TAU / self.beams as f64
     }
 
-    /// Assigns `points`, in any order, to beams by their angles, and returns the number of points whose bin already had
-    /// a point. Each slice has at least one element per beam, and the method writes all of them. A bin keeps the
-    /// nearest of its points, with its exact angle. A point without an echo is the farthest. The angle of a bin
-    /// without a point is NaN.
+    /// Assigns `points`, in any order, to beams by their angles. Returns the number of points whose bin already had a
+    /// point. Each slice has at least one element per beam, and the method writes all these elements. A bin keeps the
+    /// nearest of its points, with the exact angle of this point. A point without an echo counts as the farthest. The
+    /// angle of a bin without a point is NaN.
     pub fn fill(
         &self,
         points: &[Point],
@@ -200,7 +203,8 @@ impl Grid {
         for point in points {
             // Accept angles of up to one more revolution on either side. The sum is rounded to the nearest beam.
             let bin_position = point.angle * bins_per_radian + (beams as f32 + 0.5);
-            // NaN has no beam. The conversion is to 32 bits, because a conversion to 64 bits takes three times as long.
+            // NaN has no beam. The value is converted to 32 bits because a conversion to 64 bits takes three times as
+            // long.
             let measured = if bin_position >= 0.0 { bin_position as u32 as usize } else { usize::MAX };
             let mut bin = measured;
             let mut angle = point.angle - TAU;
@@ -216,7 +220,7 @@ impl Grid {
             if point.range < *range {
                 *range = point.range;
                 intensities[bin] = point.intensity;
-                // Keep the angle in the same revolution as its beam.
+                // Keep the angle in the same revolution as the angle of its beam.
                 angles[bin] = if (beams..2 * beams).contains(&measured) { point.angle } else { angle };
             }
         }
@@ -286,7 +290,8 @@ mod tests {
         Point { angle: -degrees.to_radians(), range, intensity: (range % 251) as u8 }
     }
 
-    /// Ranges and the exact angles in degrees, clockwise, of `points` on 8 beams.
+    /// Assigns `points` to 8 beams. Returns the ranges, the exact angles in degrees clockwise, and the number of points
+    /// whose bin already had a point.
     fn eight(points: &[Point]) -> ([u16; 8], [f32; 8], u32) {
         let (mut ranges, mut intensities, mut angles) = ([7; 8], [7; 8], [7.0; 8]);
         let collisions = Grid::new(8).fill(points, &mut ranges, &mut intensities, &mut angles);

@@ -7,19 +7,19 @@ use scanhub_schema::{MILLIS, Nanos};
 /// Clock of a scanner, with the minimum delays of the last seconds.
 #[derive(Clone, Debug)]
 pub struct SensorClock {
-    /// Minimum delay of each span. The oldest span follows index `next`, which is the newest.
+    /// Minimum delay of each span. The newest span is at index `next`, and the oldest span follows it.
     min_delays: [Option<Delay>; SensorClock::SPAN_COUNT],
     next: usize,
-    /// Start of the newest span in the scanner's clock, and duration of a span. Spans start short, so that the drift is
-    /// known soon. They then become longer, so that it is known exactly.
+    /// Start of the newest span in the scanner's clock, and duration of a span. The first spans are short, so that the
+    /// drift is known soon. Later spans are longer, so that the drift is known exactly.
     span_began: Nanos,
     span: Nanos,
     /// Minimum delay of all spans.
     min_delay: Option<Delay>,
-    /// Time in nanoseconds by which the hub's clock gets ahead of the scanner's clock in every nanosecond.
+    /// Time in nanoseconds that the hub's clock gains on the scanner's clock per nanosecond.
     drift: f64,
-    /// Time from which stamps may be wrong against earlier ones, and the maximum error. `None` once the spans have
-    /// settled it.
+    /// Time from which stamps may be wrong relative to earlier stamps, and the maximum error. `None` if no error is
+    /// possible, or once later spans have resolved it.
     uncertainty: Option<(Nanos, Nanos)>,
 }
 
@@ -54,8 +54,8 @@ impl SensorClock {
         }
     }
 
-    /// Records that times from `at` of the scanner's clock on may be wrong by up to `max_error` against earlier ones,
-    /// because the time between them was counted and not measured. Earlier delays stay valid until a later span has
+    /// Records that times of the scanner's clock from `at` on may be wrong by up to `max_error` relative to earlier
+    /// times. The time between them was counted and not measured. Earlier delays stay valid until a later span has
     /// confirmed them.
     pub fn add_uncertainty(&mut self, at: Nanos, max_error: Nanos) {
         if self.min_delay.is_some() {
@@ -64,8 +64,8 @@ impl SensorClock {
         }
     }
 
-    /// Records an event that happened at `at` of the scanner's clock, and that had arrived at `latest` of the hub's
-    /// clock.
+    /// Records an event that happened at `at` in the scanner's clock, and that arrived no later than `latest` in the
+    /// hub's clock.
     pub fn note_arrival(&mut self, at: Nanos, latest: Nanos) {
         let delay = Delay { sensor_time: at, offset: latest as i64 - at as i64 };
         if self.min_delay.is_none() || at.saturating_sub(self.span_began) >= self.span {
@@ -101,8 +101,8 @@ impl SensorClock {
         self.span_began = at;
     }
 
-    /// Ends a span at `at`. Drops the spans before an [uncertain](Self::add_uncertainty) time once the spans after it
-    /// agree with them within the maximum error, or if there are none.
+    /// Ends a span at `at`. Drops the spans before an [uncertain](Self::add_uncertainty) time if there are no earlier
+    /// spans, or once the later spans agree with the earlier ones within the maximum error.
     fn resolve_uncertainty(&mut self, at: Nanos) {
         let Some((from, max_error)) = self.uncertainty else { return };
         let offset_of = |known: Delay| known.offset_at(at, self.drift);
@@ -169,12 +169,12 @@ impl SensorClock {
     }
 }
 
-/// Maximum duration of a span; below it, the duration of the first spans.
+/// Maximum duration of a span. The first spans are shorter.
 const MAX_SPAN: Nanos = 500 * MILLIS;
 const FIRST_SPAN: Nanos = MAX_SPAN / 8;
 /// Minimum number of spans for an estimate of the drift.
 const MIN_SPANS: usize = 6;
-/// Maximum drift, as a ratio. Every oscillator is more precise than this, including those without a crystal.
+/// Maximum drift, as a ratio. Every oscillator is more precise than this limit, even without a crystal.
 const MAX_DRIFT: f64 = 0.02;
 /// Maximum delay of a packet while the host runs, in nanoseconds.
 const MAX_JITTER_NS: f64 = 4e6;
@@ -183,8 +183,8 @@ const MAX_JITTER_NS: f64 = 4e6;
 mod tests {
     use super::*;
 
-    /// Returns the maximum error in microseconds after the first `from` seconds. The scanner's clock is slow by
-    /// `drift`, and the scanner sends a packet every 2 ms with a delay of at least 100 us. The host stops for `stall`
+    /// Returns the maximum error in microseconds after the first `from` seconds. The scanner's clock is slow by the
+    /// ratio `drift`. The scanner sends a packet every 2 ms with a delay of at least 100 us. The host stops for `stall`
     /// seconds in every `every` seconds.
     fn worst_us(drift: f64, stall: f64, every: f64, from: f64) -> f64 {
         let mut clock = SensorClock::new();
@@ -219,8 +219,8 @@ mod tests {
         let (mut counted, mut wrong) = (0, 0);
         for n in 0..40_000u64 {
             let hub = 1_000_000_000_000 + n * MILLIS;
-            // In one half second of every two seconds, all packets arrive late. After it, packets are missing, and
-            // their count is one too low.
+            // In one half second of every two seconds, all packets arrive late. After this half second, packets are
+            // missing, and the caller counts one too few of them.
             let phase = n % 2_000;
             if n > 4_000 && phase == 1_250 {
                 counted += MILLIS;

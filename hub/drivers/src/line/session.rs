@@ -7,10 +7,10 @@ use crate::line::RawScan;
 use crate::line::family::Model;
 use scanhub_schema::{Counter, Counters, Nanos, Status};
 
-/// Protocol state machine on an open port. After every call that changes its state, the driver calls
+/// Protocol state machine on an open port. After every call that changes the state, the driver calls
 /// [`Protocol::poll_action`] until it returns [`Action::Wait`] or [`Action::SleepUntil`].
 pub trait Protocol {
-    /// Returns the buffer for the next read. It is never empty after the driver has drained the actions.
+    /// Returns the buffer for the next read. The buffer is never empty after the driver has drained the actions.
     fn read_buffer(&mut self) -> &mut [u8];
 
     /// Handles a read that returned at `now` and wrote `len` bytes into [`Protocol::read_buffer`].
@@ -25,17 +25,17 @@ pub trait Protocol {
     /// Returns the next action that the driver must carry out.
     fn poll_action(&mut self) -> Action<'_>;
 
-    /// Checks at `now`, immediately before the driver writes the bytes of [`Action::Transmit`], whether it is too late
-    /// for them, for example because the program did not run for a few milliseconds. If the result is `true`, the
-    /// request starts over, and the driver continues draining without writing the bytes.
+    /// Checks whether `now` is too late for the bytes of [`Action::Transmit`], for example because the program did not
+    /// run for a few milliseconds. The driver calls it immediately before it writes these bytes. If the result is
+    /// `true`, the request starts over, and the driver continues to drain actions without writing the bytes.
     fn restart_if_late(&mut self, now: Nanos) -> bool {
         let _ = now;
         false
     }
 
-    /// Handles that the port rejected the baud rate of the last [`Action::SetRate`]. A call before the
-    /// first action means that the port rejected its first baud rate. A protocol that can use other rates then tries
-    /// those.
+    /// Handles the port's rejection of the baud rate in the last [`Action::SetRate`]. Before the first action, the call
+    /// means that the port rejected the rate at which it should open. The protocol then tries other rates, if it has
+    /// any.
     fn reject_rate(&mut self, now: Nanos) {
         let _ = now;
     }
@@ -79,8 +79,8 @@ pub trait ScannerSession: Protocol {
         false
     }
 
-    /// Handles that the line has `waiting` unread bytes at `now`. Returns whether the driver should leave them unread
-    /// for a while. Unread bytes are not lost if the hub is killed.
+    /// Handles a line that has `waiting` unread bytes at `now`. Returns whether the driver should leave these bytes
+    /// unread for a while. Unread bytes are not lost if the hub is killed.
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
         let _ = (now, waiting);
         false
@@ -92,32 +92,32 @@ pub trait ScannerSession: Protocol {
     }
 
     /// Prepares for the end of the session, before the driver closes the line. Returns whether the session still has
-    /// bytes to send. If so, the driver drains it once more.
+    /// bytes to send. If so, the driver drains the actions once more.
     fn end(&mut self, now: Nanos) -> bool {
         let _ = now;
         false
     }
 
-    /// Restores the identity that the previous session saved a moment ago. If the scanner still streams, scans are
-    /// available at once. Call it before the first read.
+    /// Restores the identity that the previous session saved a moment ago. If the scanner still streams, the session
+    /// can return scans at once. Call it before the first read.
     fn restore_identity(&mut self, identity: Identity) {
         let _ = identity;
     }
 
-    /// Returns the identity for the next session. Returns `None` if the scanner does not stream, has not reported its
-    /// whole identity, or reports it in every packet.
+    /// Returns the identity for the next session. Returns `None` if the scanner does not stream, if it has not reported
+    /// its complete identity, or if every packet contains the identity.
     fn identity(&self) -> Option<Identity> {
         None
     }
 
-    /// Sets the baud rate that the search tries first, which is the rate that the last search
-    /// [found](Self::known_rate). Call it before the first read.
+    /// Sets the baud rate that the search tries first. It is the [rate](Self::known_rate) at which the last search
+    /// found the scanner. Call it before the first read.
     fn hint_rate(&mut self, known: KnownRate) {
         let _ = known;
     }
 
-    /// Handles that a search has found the scanner at `rate`, in bits per second. The port is open at this rate. Call
-    /// it before the first read, and after [`hint_rate`](Self::hint_rate).
+    /// Starts a session after a search has found the scanner at `rate`, in bits per second. The port is open at this
+    /// rate. Call it before the first read, and after [`hint_rate`](Self::hint_rate).
     fn begin_at(&mut self, rate: u32, now: Nanos) {
         let _ = (rate, now);
     }
@@ -136,14 +136,14 @@ pub trait ScannerSession: Protocol {
     }
 
     /// Sets the number of reads per telegram. With more reads, [`partial_scan`](Self::partial_scan) returns values
-    /// earlier. With 0 and 1, the session reads a telegram when it is complete.
+    /// earlier. If `count` is 0 or 1, the session reads a telegram when it is complete.
     fn set_partial_reads(&mut self, count: u8) {
         let _ = count;
     }
 
     /// Returns the scan that is arriving, with the values received so far. Call it after
-    /// [`poll_action`](Protocol::poll_action) has returned a wait. Returns `None` between scans, and while the meaning
-    /// of values is unknown.
+    /// [`poll_action`](Protocol::poll_action) has returned a wait. Returns `None` between scans, and while the session
+    /// does not know the meaning of the values.
     fn partial_scan(&self) -> Option<RawScan<'_>>;
 
     /// Returns the model. If several models cannot be distinguished, returns one of them. Returns `None` while the
@@ -153,13 +153,13 @@ pub trait ScannerSession: Protocol {
     }
 
     /// Returns the number of beams of a scan. Returns `None` while the model is unknown, and for a family whose
-    /// telegrams contain the number.
+    /// telegrams contain the number of beams.
     fn beams(&self) -> Option<usize> {
         None
     }
 
-    /// Returns the model if it differs from the model of the settings. If several models cannot be distinguished,
-    /// returns one of them.
+    /// Returns the scanner's model if it differs from the model in the settings. If several models cannot be
+    /// distinguished, returns one of them.
     fn unexpected_model(&self) -> Option<Model> {
         None
     }
@@ -175,23 +175,23 @@ pub trait ScannerSession: Protocol {
         None
     }
 
-    /// Returns the name of the setting that is required to read this recording and is missing.
+    /// Returns the name of a missing setting without which the session cannot read this recording.
     fn missing_setting(&self) -> Option<&'static str> {
         None
     }
 
-    /// Returns the model's name for a status, or the model's number if scanhub does not support the model. Returns
+    /// Returns the model as text for a status: its name, or its number if scanhub does not support the model. Returns
     /// `None` if the scanner has reported neither.
     fn model_text(&self) -> Option<String> {
         self.model().map(|model| model.name.to_uppercase())
     }
 
-    /// Returns the responses that a stream file needs before the packets of this session, because the packets do not
-    /// contain the model, the kind of packets, or the time per point. Returns an empty vector if the session received
-    /// these responses with the packets, or if the family does not need them.
+    /// Returns the responses that a stream file needs before the packets of this session. The packets do not contain
+    /// the model, the kind of packets, or the time per point. Returns an empty vector if the family does not need these
+    /// responses, or if the session received them together with the packets.
     ///
-    /// Used for a recording. `reported` is the type of the scanner in a status of the recording. `beams` is the number
-    /// of beams of its scans, if the recording has scans.
+    /// Used for a recording. `reported` is the scanner's type in a status of the recording. `beams` is the number of
+    /// beams of a scan, if the recording has scans.
     fn stream_responses(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
         let _ = (reported, beams);
         Vec::new()
@@ -202,28 +202,28 @@ pub trait ScannerSession: Protocol {
         let _ = text;
     }
 
-    /// Returns the identity and the health that the scanner reported. Returns `None` until it has reported both, and
-    /// for a family without these requests.
+    /// Returns the identity and the health that the scanner reported. Returns `None` until the scanner has reported
+    /// both, and for a family whose scanners do not report them.
     fn device_info(&self) -> Option<DeviceInfo> {
         None
     }
 
-    /// Returns the time of the scanner's clock at which the last returned packet was measured. Its zero is arbitrary,
-    /// and the clock restarts with the scanner. Returns `None` for a scanner without a clock.
+    /// Returns the time of the scanner's clock at which the last returned packet was measured. The zero of this clock
+    /// is arbitrary, and the clock restarts with the scanner. Returns `None` for a scanner without a clock.
     fn scanner_time(&self) -> Option<Nanos> {
         None
     }
 
     /// Marks the next returned packets as suspect for `reasons`, bits of [`crate::line::suspect`]. Used for a
-    /// recording, which does not contain the damaged bytes between packets.
+    /// recording: it contains the packets but not the damaged bytes between them.
     fn mark_suspect(&mut self, reasons: u8) {
         let _ = reasons;
     }
 
-    /// Reads a whole telegram of a recording, for a family whose telegrams can be read without the bytes around them.
-    /// The stamps of the result are 0. Writes the data that the telegram reports about the scanner into `status`.
+    /// Reads a complete telegram of a recording, for a family whose telegrams can be read without the bytes around
+    /// them. The stamps of the result are 0. Writes what the telegram reports about the scanner into `status`.
     ///
-    /// `is_readable` is whether the recording hub had all settings that it needs to interpret the values.
+    /// `is_readable` states whether the recording hub had all settings that are necessary to interpret the values.
     ///
     /// Returns `None` for other families, and if the bytes are not a telegram.
     fn read_recorded<'a>(
@@ -255,25 +255,27 @@ pub trait ScannerSession: Protocol {
     }
 }
 
-/// Action that a protocol requests. The driver carries out actions in the order in which they are returned.
+/// Action that a protocol requests. The driver carries out the actions in the order of their return.
 #[derive(Debug)]
 pub enum Action<'a> {
     /// Set the baud rate of the port, in bits per second, and discard received bytes. If the port does not support the
     /// rate, call [`Protocol::reject_rate`]. Then continue draining.
     SetRate(u32),
-    /// Assert the line DTR of a serial port, or clear it. Other ports do not have this line. Then continue draining.
+    /// Set the line DTR of a serial port to asserted or not asserted. Other ports do not have this line. Then continue
+    /// draining.
     SetDtr(bool),
-    /// Write these bytes, then call [`Protocol::handle_transmitted`]. Do nothing else in between, because a request may
-    /// have to arrive without pauses. The action contains a single byte if the scanner requires gaps between bytes.
+    /// Write these bytes, then call [`Protocol::handle_transmitted`]. Do nothing else between the two, because the
+    /// bytes of a request may have to arrive without pauses. The action contains a single byte if the scanner requires
+    /// gaps between bytes.
     Transmit {
         /// The bytes.
         bytes: &'a [u8],
-        /// Earliest time at which to write them.
+        /// Earliest time for the write.
         not_before: Nanos,
     },
     /// Publish this event.
     Event(Event<'a>),
-    /// Do not read before this time. Nothing can be complete earlier, or it can wait.
+    /// Do not read before this time. No transmission can be complete earlier, or the read can wait.
     SleepUntil(Nanos),
     /// Read when the port has bytes. If a read at the deadline returns no bytes, call [`Protocol::handle_timeout`].
     Wait {
@@ -285,10 +287,10 @@ pub enum Action<'a> {
 /// Event of a session: received bytes, or a scan assembled from them.
 #[derive(Clone, Copy, Debug)]
 pub enum Event<'a> {
-    /// A telegram, or packets that arrived together without other bytes between them and cover at most 10 ms. Every
-    /// packet is part of exactly one of these events, in the order of arrival.
+    /// A telegram, or packets that arrived together. The packets have no other bytes between them and cover at most 10
+    /// ms. Every packet is part of exactly one event, and events are in the order of arrival.
     Telegram(ReceivedTelegram<'a>),
-    /// A complete revolution of a rotating scanner, after the events with its packets.
+    /// A complete revolution of a rotating scanner. It follows the events with its packets.
     Scan(RawScan<'a>),
 }
 
@@ -301,17 +303,17 @@ pub struct ReceivedTelegram<'a> {
     pub first: Nanos,
     /// Time at which the last byte arrived.
     pub last: Nanos,
-    /// Whether `first` is an estimate, because the bytes arrived in one read.
+    /// Whether `first` is an estimate, because all bytes arrived in one read.
     pub estimated: bool,
     /// Reasons why the bytes are suspect: bits of [`crate::line::suspect`]; 0 means clean.
     pub reasons: u8,
     /// Number of packets; 1 for a telegram.
     pub count: usize,
-    /// Whether every packet has a checksum that was right.
+    /// Whether every packet has a checksum and the checksum was right.
     pub is_checked: bool,
-    /// Whether the bytes are the response to a request and contain no measured data.
+    /// Whether the bytes are the reply to a request and contain no measured data.
     pub is_reply: bool,
-    /// Contents of a telegram that is a complete scan or reply. `None` for packets, because several packets form a
+    /// Contents of a telegram that is a complete scan or reply. `None` for packets, because only several packets form a
     /// scan.
     pub contents: Option<TelegramContents<'a>>,
 }
@@ -319,14 +321,14 @@ pub struct ReceivedTelegram<'a> {
 /// Contents of a telegram that is a complete scan or reply.
 #[derive(Clone, Copy, Debug)]
 pub struct TelegramContents<'a> {
-    /// Serial [number](RawScan::number) that the telegram had as a partial scan. A partial scan with another number
-    /// will not be completed.
+    /// Serial [number](RawScan::number) of the telegram, which it also had as a partial scan. The session never
+    /// completes a partial scan with another number.
     pub number: u64,
     /// Number of beams with measured data; 0 for a reply.
     pub beams: usize,
-    /// Nominal time to the next telegram of a stream, in nanoseconds; 0 if it is unknown, and for a reply.
+    /// Nominal time to the next telegram of a stream, in nanoseconds. 0 if the time is unknown, and for a reply.
     pub period: Nanos,
-    /// The scan. `None` for a reply, and while the meaning of values is unknown.
+    /// The scan. `None` for a reply, and while the session does not know the meaning of the values.
     pub scan: Option<RawScan<'a>>,
 }
 
@@ -335,12 +337,12 @@ pub struct TelegramContents<'a> {
 pub struct KnownRate {
     /// Baud rate in bits per second.
     pub baud: u32,
-    /// Number of the last switches to 500,000 baud that were followed by silence. After two of them, the session
-    /// assumes that the line cannot carry this rate.
+    /// Number of most recent consecutive switches to 500,000 baud after which the line was silent. After two such
+    /// switches, the session assumes that the line cannot carry this rate.
     pub silent_switches: u8,
 }
 
-/// Identity of a streaming scanner, in a format that only its family can read.
+/// Identity of a streaming scanner, in a format that only the scanner's family can read.
 pub type Identity = [u8; 32];
 
 /// Identity and health that a scanner reported on request, as text.
@@ -372,7 +374,7 @@ pub enum HealthStatus {
 pub struct Notice {
     /// Text of the message.
     pub text: &'static str,
-    /// Whether it can make scans wrong.
+    /// Whether the reported fact can make scans wrong.
     pub is_fault: bool,
 }
 
@@ -383,7 +385,7 @@ pub enum State {
     Probing,
     /// The session changes the baud rate.
     Switching,
-    /// The session changes settings and starts the stream, or identifies it.
+    /// The session changes settings and starts the stream, or examines a stream that is already running.
     Starting,
     /// Measured data arrives.
     Streaming,
@@ -396,9 +398,9 @@ pub enum State {
 /// Request of a user to a running session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Control {
-    /// Stop the stream. Then send nothing and expect nothing.
+    /// Stop the stream. Then send nothing and expect no bytes.
     Pause,
-    /// End the pause, and start as a new session does.
+    /// End the pause and start like a new session.
     Resume,
     /// Restart the session in any state. This also ends a pause.
     Resync,
@@ -420,9 +422,9 @@ pub struct SessionStats {
     pub buffered: u64,
     /// Intact telegrams or packets.
     pub telegrams: u64,
-    /// Transmissions that the scanner must have sent since the first transmission of each stream.
+    /// Transmissions that were due after the first transmission of each stream.
     pub due: u64,
-    /// Transmissions that were due and did not arrive.
+    /// Transmissions that were due but did not arrive.
     pub lost: u64,
     /// Bytes of a stream that are not part of a telegram or packet.
     pub damaged: u64,
@@ -432,7 +434,8 @@ pub struct SessionStats {
     pub resyncs: u64,
     /// Restarts of the scanner that the session did not request. The first boot message does not count.
     pub restarts: u64,
-    /// Whether the first transmission followed the rest of another one, which was on the line when the port was opened.
+    /// Whether the first transmission followed the rest of another transmission, which was on the line when the port
+    /// was opened.
     pub first_frame_truncated: bool,
 }
 

@@ -8,19 +8,20 @@ use crate::line::framing::ByteCounters;
 use crate::line::session::{SessionStats, State};
 use crate::line::{Action, ReadLog};
 
-/// Schedule of a session's reads, with the stamps and suspicions of its packets.
+/// Schedule of a session's reads. It also creates the stamps of packets and stores the reasons why the next packet is
+/// suspect.
 #[derive(Clone, Debug)]
 pub struct ReadScheduler {
     read_log: ReadLog,
     last_byte: Nanos,
     /// Size of the buffer of the next read, in bytes.
     buffer_len: usize,
-    /// Time of the next read. If it has passed, the session reads as soon as the port has bytes.
+    /// Time of the next read. If this time has passed, the session reads as soon as the port has bytes.
     next_read_at: Nanos,
     last_packet: Nanos,
     last_revolution: Nanos,
-    /// Offset of the byte after which the next packet to end is suspect, and the reasons: bits of
-    /// [`crate::line::suspect`].
+    /// End offset and reasons of a mark: the next packet that ends after this offset is suspect for these reasons, bits
+    /// of [`crate::line::suspect`].
     suspect: (u64, u8),
 }
 
@@ -44,7 +45,7 @@ impl ReadScheduler {
     }
 
     /// Handles a read of `len` bytes at `now`. While a scanner streams, the next read waits, so that it returns several
-    /// packets. A backlog is read without a wait, because a full tty drops bytes that arrive.
+    /// packets. A backlog is read without a wait, because a full tty drops the bytes that arrive.
     pub fn note_read(&mut self, now: Nanos, len: usize, is_streaming: bool) {
         self.read_log.note_read(now, len);
         let is_drained = (1..self.buffer_len.min(MAX_TTY_READ)).contains(&len);
@@ -62,7 +63,7 @@ impl ReadScheduler {
         &self.read_log
     }
 
-    /// Returns the time at which the last byte arrived, or the start of the session.
+    /// Returns the time at which the last byte arrived. Before the first byte, returns the start of the session.
     pub fn last_byte(&self) -> Nanos {
         self.last_byte
     }
@@ -81,9 +82,9 @@ impl ReadScheduler {
         if end > self.suspect.0 { core::mem::take(&mut self.suspect.1) } else { 0 }
     }
 
-    /// Returns the wait at `now`. Until the time of the next read, the session sleeps. After it, the session waits for
-    /// bytes until the deadline `until`. If the framer holds a packet back until the line was idle for `hold`, the
-    /// deadline is the end of that time at the latest.
+    /// Returns the next wait at `now`. The session sleeps until the time of the next read. After this time, it waits
+    /// for bytes until the deadline `until`. If the framer holds a packet back, the deadline is at the latest the time
+    /// at which the line has been idle for `hold`.
     pub fn wait_action<'a>(&self, now: Nanos, until: Nanos, hold: Option<Nanos>) -> Action<'a> {
         if self.next_read_at > now {
             return Action::SleepUntil(self.next_read_at);
@@ -92,14 +93,14 @@ impl ReadScheduler {
         Action::Wait { until: until.min(held_until) }
     }
 
-    /// Returns the stamp of a packet that ends at `last`. A stamp is never earlier than that of the previous packet.
+    /// Returns the stamp of a packet that ends at `last`. The stamp is never earlier than the previous packet's stamp.
     pub fn stamp_packet(&mut self, last: Nanos) -> Nanos {
         self.last_packet = last.max(self.last_packet);
         self.last_packet
     }
 
-    /// Returns the stamps of a revolution. `first` is at least the start of the previous revolution, and `last` is at
-    /// least `first`.
+    /// Returns the stamps of a revolution. The first stamp is not earlier than the start of the previous revolution,
+    /// and the second stamp is not earlier than the first one.
     pub fn revolution_stamps(&self, first: Nanos, last: Nanos) -> (Nanos, Nanos) {
         let first = first.max(self.last_revolution);
         (first, last.max(first))
@@ -111,7 +112,7 @@ impl ReadScheduler {
     }
 }
 
-/// Interval between the reads of a stream. One read returns several packets, and at most a tenth of the bytes that a
+/// Interval between the reads of a stream. One read returns several packets, but at most a tenth of the bytes that a
 /// tty can buffer.
 const READ_INTERVAL: Nanos = 5 * MILLIS;
 
@@ -119,8 +120,7 @@ const READ_INTERVAL: Nanos = 5 * MILLIS;
 #[derive(Clone, Copy, Debug)]
 pub struct Watchdog {
     silent_at: Nanos,
-    /// Time from which the deadline of the next revolution counts: the end of the last revolution, or the start of the
-    /// stream.
+    /// Start of the deadline for the next revolution: the end of the last revolution, or the start of the stream.
     revolution_at: Nanos,
     has_revolution: bool,
 }
@@ -141,17 +141,18 @@ impl Watchdog {
         self.silent_at = now + Watchdog::SILENCE_TIMEOUT;
     }
 
-    /// Restarts the deadline for a revolution after one that was complete at `now`.
+    /// Restarts the deadline for the next revolution after a revolution that was complete at `now`.
     pub fn note_revolution(&mut self, now: Nanos) {
         (self.revolution_at, self.has_revolution) = (now, true);
     }
 
-    /// Restarts the deadline for a revolution at `now`, although there was no revolution.
+    /// Restarts the deadline for the next revolution at `now`, although no revolution was complete.
     pub fn await_revolution(&mut self, now: Nanos) {
         self.revolution_at = now;
     }
 
-    /// Extends both deadlines for a head that may not reach its speed, and measure, before `until`.
+    /// Extends both deadlines, because the head may not reach its speed before `until`, and measures nothing until
+    /// then.
     pub fn await_spin_up(&mut self, until: Nanos) {
         (self.revolution_at, self.silent_at) = (until, until);
     }
@@ -177,14 +178,14 @@ impl Watchdog {
     }
 }
 
-/// Counters of a session that its framer does not have.
+/// Counters of a session that its framer does not count.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct StreamCounters {
     /// Discarded bytes of streams.
     damaged: u64,
     /// Number of all discarded bytes at the last update of `damaged`.
     discarded: u64,
-    /// Number of damaged bytes and of bytes in packets, at the end of the last revolution.
+    /// Number of damaged bytes and number of bytes in packets, at the end of the last revolution.
     revolution_start: (u64, u64),
     resyncs: u64,
     restarts: u64,
@@ -205,8 +206,8 @@ impl StreamCounters {
         self.discarded = tally.discarded;
     }
 
-    /// Handles `packets` packets of a stream. If they are the first ones and bytes were discarded before them, the
-    /// first packet was truncated.
+    /// Handles `packets` packets of a stream. If they are the first packets and bytes were discarded before them, the
+    /// first packet counts as truncated.
     pub fn note_packets(&mut self, tally: &ByteCounters, packets: usize) {
         self.first_frame_truncated |= tally.packets == packets as u64 && tally.discarded > 0;
     }
