@@ -105,7 +105,7 @@ pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Setting
 }
 
 /// Creates the inquiry of a scanner of `family`. The port is open at `rate`, in bits per second. `rate` is `None` for a
-/// serial server, because the user sets its baud rate there. Returns `None` for a family [without an
+/// serial server, on which the user sets the baud rate. Returns `None` for a family [without an
 /// inquiry](Features::has_inquiry).
 pub fn inquiry(family: Family, rate: Option<u32>, now: Nanos) -> Option<Inquiry> {
     match family {

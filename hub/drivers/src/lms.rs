@@ -1,7 +1,7 @@
 //! SICK LMS 2xx: the framer, telegrams in both directions, and the session with a scanner. The simulator also uses the
 //! protocol, so requests are decoded and replies are encoded here, too.
 //!
-//! Here is what the family declares: its settings, and its recognizer.
+//! This file has the settings and the recognizer of the family.
 
 mod arrival_time;
 pub mod command;
@@ -47,7 +47,7 @@ pub use session::{LmsSession, Settings};
 pub struct Probe {
     framer: Framer,
     is_found: bool,
-    /// Whether the scanner has acknowledged the request, and nothing has arrived since.
+    /// Whether the scanner has acknowledged the request, and no byte has arrived since then.
     is_acknowledged: bool,
 }
 
@@ -114,10 +114,10 @@ impl crate::line::family::Probe for Probe {
 
 const APPROACH: Approach = Approach {
     family: Family::Lms,
-    // Only at this rate does a listening step contain several telegrams of a stream.
+    // Only at this rate can several telegrams of a stream arrive in one listening step.
     listen_steps: &[ListenStep { rate: 500_000, duration: 120 * MILLIS, needs_bytes: true }],
     request_steps: Some(RequestSteps {
-        // At power-on, after a hub, and the rest.
+        // The rate at power-on, the rate that a hub leaves behind, and the other rates.
         rates: &[9_600, 500_000, 38_400, 19_200],
         settle_time: 20 * MILLIS,
         stop: None,
@@ -125,16 +125,16 @@ const APPROACH: Approach = Approach {
             &[0x02, 0x00, 0x01, 0x00, command::TYPE, 0x1E, 0x12],
             &[0x02, 0x00, 0x01, 0x00, command::STATUS, 0x15, 0x12],
         ],
-        // At least 55 us and at most 6 ms (Telegram listing 4.3), less the time of the write.
+        // At least 55 us and at most 6 ms (Telegram listing 4.3), minus the duration of the write.
         gap: Some((120 * MICROS, 5 * MILLIS)),
         // The acknowledgement arrives within 60 ms (Telegram listing 4.3), and captured replies began within 150 ms.
         reply_timeout: 150 * MILLIS,
         extra_reply_time: 250 * MILLIS,
-        // The rest of the captured times, and a status at 9,600 baud.
+        // Sufficient for the rest of every captured reply, and for the rest of a status at 9,600 baud.
         extra_partial_time: 300 * MILLIS,
         repeats: 1,
     }),
-    // Without another setting in its EEPROM, the scanner starts at this rate (Telegram listing 7.1).
+    // The scanner starts at this rate, unless its EEPROM contains another rate (Telegram listing 7.1).
     boot_rate: Some(9_600),
     max_transmission: MAX_TELEGRAM,
     advice: "RS-422 needs jumper 7-8, and after power-on it takes up to a minute",
@@ -213,7 +213,7 @@ pub(crate) fn check(request: &SettingsRequest) -> Result<settings::Settings, Ref
     let angle_deg = request.angle_deg.unwrap_or(factory.angle_deg);
     let resolution_cdeg = request.resolution_cdeg.unwrap_or(factory.resolution_cdeg);
     if family == Some(Type::Fast) {
-        // A scan with 181 values looks like one of 180 degrees with a resolution of 1 degree.
+        // A scan with 181 values looks like a scan of 180 degrees with a resolution of 1 degree.
         let what = "the beams of version S14 have other angles: 90 degrees at 0.5, which no telegram reports";
         let remedy = "a hub can stream lms200, lms211, lms221 and lms291";
         return Err(Refusal::new(&[Key::Type], what.to_owned(), remedy));
@@ -234,8 +234,8 @@ pub(crate) fn check(request: &SettingsRequest) -> Result<settings::Settings, Ref
 /// Modes whose values are ranges (Telegram listing, 77h block D).
 const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";
 
-/// Returns the heads of scans with the view of `settings`. The measuring mode is unknown, and so is the unit if none is
-/// set.
+/// Returns the heads of scans whose angles and resolution are in `settings`. The measuring mode is unknown. The unit is
+/// also unknown, unless `settings` contains it.
 pub(crate) fn scan_heads(settings: &settings::Settings) -> Vec<ScanHead> {
     let variant = Settings::from(*settings).variant;
     let units = settings.unit_mm.map_or(vec![Unit::Mm.mm(), Unit::Cm.mm()], |mm| vec![mm]);
@@ -245,7 +245,7 @@ pub(crate) fn scan_heads(settings: &settings::Settings) -> Vec<ScanHead> {
     units.into_iter().map(head).collect()
 }
 
-/// Range bits of the mode with the most of them (Telegram listing, 77h block D).
+/// Number of range bits in the measuring mode with the most range bits (Telegram listing, 77h block D).
 const MAX_RANGE_BITS: u8 = 15;
 
 #[cfg(test)]

@@ -231,8 +231,8 @@ impl LastPacket {
     }
 }
 
-/// Number of packets after which the number of points per second is known. Before that, the moving average covers all
-/// packets so far.
+/// Number of packets after which the number of points per second is known. The moving average covers
+/// `WINDOW_PACKETS` packets.
 const LEARNING_PACKETS: u32 = 16;
 const WINDOW_PACKETS: u32 = 256;
 /// Minimum duration of a gap whose missing packets are counted with the clock, in milliseconds. A tenth of a revolution

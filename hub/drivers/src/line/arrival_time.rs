@@ -75,8 +75,8 @@ impl ReadLog {
         self.earliest_in_read(n, offset, timing)
     }
 
-    /// Returns the [`earliest`](Self::earliest) arrival time of the byte at `offset`, if bytes are missing before it.
-    /// This byte does not belong to the end of a backlog. If a full tty had a backlog, and almost no bytes follow this
+    /// Returns the [`earliest`](Self::earliest) arrival time of the byte at `offset`. Bytes are missing before this byte,
+    /// and it does not belong to the end of a backlog. If a full tty had a backlog, and almost no bytes follow this
     /// byte, its time is known: it arrived when the tty had space again, or shortly before.
     pub fn earliest_after_gap(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         let n = self.read_containing(offset)?;

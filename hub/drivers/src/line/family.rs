@@ -112,7 +112,7 @@ pub trait Probe: fmt::Debug + Send {
     fn evidence(&self) -> Evidence;
 }
 
-/// What the received bytes prove about the scanner.
+/// Evidence about the scanner in the received bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Evidence {
     /// The bytes prove nothing.

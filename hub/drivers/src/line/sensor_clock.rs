@@ -169,7 +169,7 @@ impl SensorClock {
     }
 }
 
-/// Maximum duration of a span. The first spans are shorter.
+/// Maximum duration of a span. The first spans take `FIRST_SPAN`.
 const MAX_SPAN: Nanos = 500 * MILLIS;
 const FIRST_SPAN: Nanos = MAX_SPAN / 8;
 /// Minimum number of spans for an estimate of the drift.

@@ -63,8 +63,8 @@ pub trait ScannerSession: Protocol {
     /// Returns the reason why the session does not stream as it should.
     fn problem(&self) -> Option<Self::Problem>;
 
-    /// Returns the name of the transmissions that the session is waiting for, such as `LMS replies`, if its
-    /// [`problem`](Self::problem) is that none of them arrive. Other bytes may be arriving.
+    /// Returns the name of the transmissions that the session is waiting for, such as `LMS replies`, if the
+    /// [`problem`](Self::problem) is that no such transmission arrives. Other bytes may be arriving.
     fn missing_transmission(&self) -> Option<&'static str>;
 
     /// Returns the baud rate at which the session sends and receives, in bits per second.

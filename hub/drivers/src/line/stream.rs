@@ -76,8 +76,9 @@ impl ReadScheduler {
         }
     }
 
-    /// Returns and clears the marked reasons for packets that end before the byte at `end`. If these packets were read
-    /// before the mark was set, the reasons stay for later packets, because the framer may have held packets back.
+    /// Returns the reasons for packets that end before the byte at `end`, and clears them. If these packets were read
+    /// before the caller marked the reasons, the reasons stay for later packets, because the framer may have held these
+    /// packets back.
     pub fn take_suspect(&mut self, end: u64) -> u8 {
         if end > self.suspect.0 { core::mem::take(&mut self.suspect.1) } else { 0 }
     }
@@ -199,7 +200,7 @@ impl StreamCounters {
         self.await_revolution(tally);
     }
 
-    /// Handles packets of a stream that has started before. Counts the bytes that were discarded since the last call as
+    /// Handles packets of a stream that has already started. Counts the bytes that were discarded since the last call as
     /// damaged.
     pub fn continue_stream(&mut self, tally: &ByteCounters) {
         self.damaged += tally.discarded - self.discarded;

@@ -1,13 +1,14 @@
 //! Arrival times of bytes and of telegrams.
 //!
-//! A port reports only when a read returned and how many bytes it had. From these reads, [`ArrivalEstimator`] computes
-//! a stamp for any byte, and [`TelegramTiming`] measures how long a telegram takes, so that the host can sleep until
-//! the next one is nearly complete.
+//! A port reports only the time at which a read returned, and the number of bytes in the read. From these reads,
+//! [`ArrivalEstimator`] computes a stamp for any byte. [`TelegramTiming`] measures the duration of a telegram, so that
+//! the host can sleep until the next telegram is nearly complete.
 
 use crate::lms::variant::BYTES_PER_REVOLUTION;
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
-/// The last reads in a ring buffer. The stamp of a byte follows from the reads that returned it and the bytes after it.
+/// The last reads, in a ring buffer. The stamp of a byte follows from the read that returned the byte, and from the
+/// reads after it.
 #[derive(Clone, Debug)]
 pub(crate) struct ArrivalEstimator {
     reads: [ReadRecord; ArrivalEstimator::CAPACITY],
@@ -15,7 +16,7 @@ pub(crate) struct ArrivalEstimator {
     total: u64,
     /// Time of the last read with bytes, or of the last call of `note_unread`.
     last_checked: Nanos,
-    /// Present while the bytes that are read were buffered when the host did not read.
+    /// Present while the session reads bytes that were buffered while the host did not read.
     backlog: Option<Backlog>,
 }
 
@@ -26,41 +27,41 @@ struct ReadRecord {
     backlog: Option<Backlog>,
 }
 
-/// Bytes that were buffered while the host or the line was stopped. Their exact age is unknown. The line's buffer keeps
-/// the oldest bytes, so the backlog arrived at the speed of the line, starting at the last read before the stop.
+/// Bytes that were buffered while the host or the line was stopped. Their exact age is unknown. A full buffer keeps its
+/// oldest bytes. The backlog therefore arrived at the speed of the line, starting at the last read before the stop.
 #[derive(Clone, Copy, Debug)]
 struct Backlog {
     /// Offset of the first byte of the backlog.
     begin_offset: u64,
     /// Time of the last read with bytes before the backlog.
     since: Nanos,
-    /// Time of the last read that returned more bytes than can have arrived since the read before.
+    /// Time of the last read that returned more bytes than can have arrived since the previous read.
     last_surplus: Nanos,
     read_since: usize,
 }
 
-/// A stamp, and whether it is an estimate because its error may exceed 64 bytes' time on the line.
+/// A stamp. It is an estimate if its error may exceed the duration of 64 bytes on the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Timestamp {
     pub(crate) at: Nanos,
     pub(crate) estimated: bool,
-    /// Latest possible arrival of a byte in a backlog; `at` is then the earliest possible arrival. `None` for other
-    /// bytes.
+    /// Latest possible arrival time of a byte in a backlog; `at` is then the earliest possible arrival time. `None` for
+    /// other bytes.
     pub(crate) latest: Option<Nanos>,
 }
 
 impl ArrivalEstimator {
-    /// Number of stored reads: enough for two telegrams in chunks of 16 bytes.
+    /// Number of stored reads. It is sufficient for two telegrams in chunks of 16 bytes.
     const CAPACITY: usize = 128;
 
-    /// Creates an estimator at `now`. No byte gets an earlier stamp.
+    /// Creates an estimator at `now`. No byte gets a stamp before `now`.
     pub(crate) fn new(now: Nanos) -> Self {
         let reads = [ReadRecord::default(); ArrivalEstimator::CAPACITY];
         ArrivalEstimator { reads, next: 0, total: 0, last_checked: now, backlog: None }
     }
 
-    /// Records a read of `len` bytes at `now`. `line_rate` is the rate of the line in bits per second; `None` if bytes
-    /// do not arrive at such a rate, as from a recording or a network.
+    /// Records a read of `len` bytes at `now`. `line_rate` is the rate of the line in bits per second. It is `None` if
+    /// bytes arrive without a fixed rate, for example from a recording or a network.
     pub(crate) fn note_read(&mut self, now: Nanos, len: usize, line_rate: Option<u32>) {
         let since = self.last_checked;
         if len > 0 {
@@ -90,7 +91,7 @@ impl ArrivalEstimator {
         }
     }
 
-    /// Records that `len` bytes were waiting in the line's buffer at `now`, which the next read will return.
+    /// Records that `len` unread bytes were in the line's buffer at `now`. The next read will return them.
     pub(crate) fn note_unread(&mut self, now: Nanos, len: usize) {
         self.last_checked = now;
         let read = ReadRecord { end_offset: self.total + len as u64, now, backlog: self.backlog };
@@ -98,7 +99,7 @@ impl ArrivalEstimator {
         self.next += 1;
     }
 
-    /// Ends the backlog. Reads after its last surplus do not belong to it.
+    /// Ends the backlog. Reads after the last surplus do not belong to the backlog.
     fn end_backlog(&mut self) {
         if let Some(backlog) = self.backlog.take() {
             for read in self.reads.iter_mut().filter(|read| read.now > backlog.last_surplus) {
@@ -107,10 +108,10 @@ impl ArrivalEstimator {
         }
     }
 
-    /// Returns the stamp of the byte with this offset, on a line of `baud` bits per second. It is the latest time at
-    /// which the byte can have arrived, because the bytes after it in the same read, or in the next ones, took their
-    /// time on the line. For a byte in a backlog, it is the earliest possible time, so that old values do not appear
-    /// new. If the period of the stream is known, [`crate::lms::scan_schedule`] computes a more exact stamp.
+    /// Returns the stamp of the byte at `offset`, on a line of `baud` bits per second. The stamp is the latest time at
+    /// which the byte can have arrived, because all bytes after it needed time on the line. For a byte in a backlog,
+    /// the stamp is the earliest possible time, so that old values do not appear new. If the period of the stream is
+    /// known, [`crate::lms::scan_schedule`] computes a more exact stamp.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Timestamp {
         let oldest = self.next.saturating_sub(ArrivalEstimator::CAPACITY);
         let (mut at, mut arrival, mut later_bytes) = (Nanos::MAX, Nanos::MAX, MAX_EXACT_BYTES + 1);
@@ -139,20 +140,21 @@ impl ArrivalEstimator {
     }
 }
 
-/// Measured duration of a telegram of the stream. A busy host measures too long a time but never too short, so the
-/// minimum of several telegrams is used.
+/// Measured duration of a telegram of the stream. A busy host may measure too long a duration, but never too short a
+/// duration. The minimum over several telegrams is therefore used.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct TelegramTiming {
     pub(crate) duration: Option<Nanos>,
     /// Minimum duration of the last `measured_telegrams` telegrams.
     min_duration: Nanos,
     measured_telegrams: u32,
-    /// Arrival of the first byte of the current telegram; `None` after the last sleep for it.
+    /// Arrival of the first byte of the current telegram. `None` after the last sleep within this telegram.
     first: Option<Nanos>,
     /// Minimum number of reads per telegram.
     partial_reads: u8,
     lead: WakeLead,
-    /// Number of reads with bytes since the sleep for the end of the telegram. `None` before that sleep.
+    /// Number of reads with bytes since the sleep until shortly before the end of the telegram. `None` before that
+    /// sleep.
     reads_near_end: Option<u32>,
 }
 
@@ -186,9 +188,9 @@ impl TelegramTiming {
         }
     }
 
-    /// Returns the time until which the host can sleep: up to the next partial read, or up to shortly before the end of
-    /// the telegram. Returns `None` if the duration is unknown, if the sleep would be too short, or if the sleep for
-    /// the end was already returned.
+    /// Returns the time until which the host can sleep: the next partial read, or a time shortly before the end of the
+    /// telegram. Returns `None` if the duration of a telegram is unknown, if the sleep would be too short, or if the
+    /// method has already returned the last sleep within this telegram.
     pub(crate) fn sleep_until(&mut self, now: Nanos) -> Option<Nanos> {
         let (first, duration) = (self.first?, self.duration?);
         let end = first + duration.checked_sub(self.lead.nanos())?;
@@ -235,19 +237,19 @@ impl TelegramTiming {
 }
 
 /// Time between the end of the host's sleep and the expected end of a telegram. The sleep should end between the last
-/// two chunks of a telegram, so that the host has to wait only once more. The lead therefore adapts to the lateness of
-/// the host's sleeps and to the chunks of the line.
+/// two chunks of a telegram, so that the host waits only once more. The lead therefore adapts to the chunks of the
+/// line, and to the delay with which the host's sleeps end.
 #[derive(Clone, Copy, Debug)]
 pub struct WakeLead(Nanos);
 
 impl WakeLead {
-    /// Maximum lead, and the first value: one or two chunks of 16 bytes at 500,000 baud.
+    /// Maximum lead, and initial lead. One or two chunks of 16 bytes arrive in this time at 500,000 baud.
     const MAX: Nanos = 600 * MICROS;
-    /// Minimum lead. The sleeps of an idle host end 50 to 100 us late.
+    /// Minimum lead. On an idle host, sleeps end 50 to 100 us late.
     const MIN: Nanos = 100 * MICROS;
     /// Increase after a sleep that ended too late.
     const INCREASE: Nanos = 80 * MICROS;
-    /// Decrease after a telegram for which the host had to wait at least twice after the sleep. It is a fraction of
+    /// Decrease after a telegram for which the host waited at least twice after the sleep. It is a fraction of
     /// [`INCREASE`](Self::INCREASE), so that few sleeps end too late.
     const DECREASE: Nanos = 5 * MICROS;
 
@@ -256,8 +258,8 @@ impl WakeLead {
         self.0
     }
 
-    /// Adapts the lead after a complete telegram. `reads` is the number of reads with bytes after the sleep. If it is
-    /// 1, the telegram was already complete when the sleep ended.
+    /// Adapts the lead after a complete telegram. `reads` is the number of reads with bytes after the sleep. If `reads`
+    /// is 1, the telegram was already complete when the sleep ended.
     pub fn adapt(&mut self, reads: u32) {
         match reads {
             1 => self.0 = (self.0 + WakeLead::INCREASE).min(WakeLead::MAX),
@@ -273,29 +275,31 @@ impl Default for WakeLead {
     }
 }
 
-/// Maximum number of later bytes in the same read for which a stamp is exact. A chunk of a USB adapter has 62 bytes.
+/// Maximum number of later bytes in the same read with which a stamp is still exact. A chunk of a USB adapter has 62
+/// bytes.
 const MAX_EXACT_BYTES: usize = 64;
-/// Minimum time without bytes, after which a large read is a backlog. It is longer than any sleep at the highest rate,
-/// so the host or the line was stopped.
+/// Minimum time without bytes before a read that may be a backlog. Sleeps at the highest rate are shorter, so the host
+/// or the line must have been stopped.
 const STALL_THRESHOLD: Nanos = 50 * MILLIS;
-/// Time without a surplus of bytes that ends a backlog. It is shorter than a telegram, and longer than the kernel needs
-/// to move bytes from one buffer to the next.
+/// Time without a surplus of bytes after which a backlog has ended. It is shorter than a telegram. It is longer than
+/// the kernel needs to move bytes from one buffer to the next.
 const BACKLOG_END_TIME: Nanos = 12 * MILLIS;
-/// Minimum sleep. A shorter one is not worth the system call.
+/// Minimum sleep. The system call costs too much for a shorter sleep.
 const MIN_SLEEP: Nanos = 500 * MICROS;
 /// Number of telegrams that are measured before the first sleep.
 const LEARNING_TELEGRAMS: u32 = 3;
-/// Number of telegrams per minimum after that. A telegram during which the host sleeps too long measures at most the
-/// sleep, so the sleeps become shorter again.
+/// Number of telegrams per minimum after the first sleep. If the host sleeps too long, the measured duration of the
+/// telegram is at most the sleep. The sleeps therefore become shorter again.
 const WINDOW_TELEGRAMS: u32 = 16;
-/// A telegram that takes longer than usual by more than this time is suspect (framing: quality, reason 4).
+/// A telegram is suspect if its duration exceeds the usual duration by more than this time (framing: quality, reason
+/// 4).
 const SLOW_TOLERANCE: Nanos = 8 * MILLIS;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Returns the stamp of a byte, and whether it is an estimate.
+    /// Returns the stamp of a byte, and whether the stamp is an estimate.
     fn seen(arrivals: &ArrivalEstimator, offset: u64) -> (Nanos, bool) {
         let Timestamp { at, estimated, .. } = arrivals.stamp(offset, 500_000);
         (at, estimated)
@@ -327,7 +331,7 @@ mod tests {
     fn backlogged_bytes_are_not_stamped_as_new() {
         let mut arrivals = ArrivalEstimator::new(0);
         arrivals.note_read(1_000 * MILLIS, 16, Some(500_000));
-        // After two seconds, the backlog is read as fast as possible. New bytes follow.
+        // After two seconds, the host reads the backlog as fast as possible. New bytes follow.
         for read in 0..4 {
             arrivals.note_read(3_000 * MILLIS + read * 100_000, 1_600, Some(500_000));
         }
@@ -399,9 +403,9 @@ mod tests {
         assert_eq!(rhythm.sleep_until(200_000_000), Some(216_900_000));
     }
 
-    /// Simulates 400 telegrams of 18 ms that arrive in chunks of `chunk` ns, on a host whose sleeps are late by up to
-    /// `lateness` ns. For the last 200 telegrams, returns the average number of reads after the sleep, and the number
-    /// of telegrams that were complete before the sleep ended.
+    /// Simulates 400 telegrams of 18 ms. They arrive in chunks of `chunk` ns, on a host whose sleeps end up to
+    /// `lateness` ns late. For the last 200 telegrams, returns the average number of reads after the sleep, and the
+    /// number of telegrams that were complete before the sleep ended.
     fn play(chunk: Nanos, lateness: Nanos) -> (f64, u32) {
         const DURATION: Nanos = 18 * MILLIS;
         let mut rhythm = TelegramTiming::new();
@@ -437,7 +441,7 @@ mod tests {
             );
             assert!(late <= 20, "{chunk} us, {lateness} us: {late} of 200 late");
         }
-        // Sleeps that are late by more than a chunk either leave two chunks or end too late.
+        // With sleeps that end more than a chunk late, the host either has to wait for two chunks or wakes up too late.
         let (reads, late) = play(320 * MICROS, 500 * MICROS);
         assert!(reads < 2.5 && late <= 40, "{reads} reads, {late} late");
     }

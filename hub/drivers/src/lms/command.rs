@@ -9,15 +9,15 @@ use crate::lms::variant::{Baud, Variant};
 
 /// A parameter of a request.
 pub(crate) trait Parameter: Sized {
-    /// Decodes the parameter at the beginning of `data`, and returns it with the rest.
+    /// Decodes the parameter at the beginning of `data`. Returns the parameter and the rest of `data`.
     fn read(data: &[u8]) -> Option<(Self, &[u8])>;
 
     /// Appends the parameter to a telegram.
     fn write(self, writer: Writer) -> Writer;
 }
 
-/// Declares an enum of requests. Each has parameters, a command code, and a mode byte after the code if the request
-/// always has the same one.
+/// Declares an enum of requests. Each request has parameters and a command code. If the request always has the same
+/// mode byte, this byte follows the code.
 macro_rules! requests {
     ($(#[$doc:meta])* $Enum:ident by $code_of:ident {
         $($(#[doc = $text:literal])+ $Name:ident $(($($field:ident: $Type:ty),+))? = $code:tt $(+ $after:path)?,)+
@@ -77,8 +77,8 @@ requests! {
         Baud(baud: Baud) = MODE,
         /// 20h with any other operating mode.
         Operate(operating: Operating) = MODE,
-        /// 30h: one telegram of values, selected by the byte (Telegram listing 7-14): 1 all, 2 vertical minimum, 3
-        /// taught, 6 every second, 7 every twentieth, 8 the current partial scan.
+        /// 30h: one telegram of values. The byte selects the values (Telegram listing 7-14): 1 all, 2 vertical minimum,
+        /// 3 taught, 6 every second, 7 every twentieth, 8 the current partial scan.
         Values(number: u8) = VALUES,
         /// 31h: status of the scanner. The reply is [`crate::lms::reply::Reply::Status`].
         Status = STATUS,
@@ -86,7 +86,7 @@ requests! {
         Errors = ERRORS,
         /// 35h: hours of operation and power-ons; LMS 211, 221 and 291 only.
         Counters = COUNTERS,
-        /// 36h: mean values of this number of scans, 2 to 250.
+        /// 36h: mean values over this number of scans, 2 to 250.
         Means(number: u8) = MEANS,
         /// 37h: values of a sub-range. Bit 15 of the first index requests direct output of a partial scan.
         Range(span: SubRange) = RANGE,
@@ -96,7 +96,7 @@ requests! {
         Variant(variant: Variant) = VARIANT,
         /// 3Eh: values of a sub-range, with the borders of the fields A, B and C; at most 100 beams.
         RangeFields(span: SubRange) = RANGE_FIELDS,
-        /// 3Fh: mean values of this number of scans in a sub-range.
+        /// 3Fh: mean values of a sub-range over this number of scans.
         RangeMeans(number: u8, span: SubRange) = RANGE_MEANS,
         /// 41h: select the set of fields. The parameters are not decoded.
         FieldSet(raw: RawParameters) = FIELD_SET,
@@ -134,7 +134,7 @@ impl Request {
         Request::read_parameters(telegram.command(), telegram.data())
     }
 
-    /// Returns the request that enters installation mode with `password`. [`Request::Stop`] ends that mode.
+    /// Returns the request that enters installation mode with `password`. [`Request::Stop`] ends installation mode.
     pub fn install(password: Password) -> Request {
         Request::Operate(Operating::Installation(password))
     }
@@ -183,9 +183,9 @@ pub const CARTESIAN: u8 = 0x76;
 /// Command byte: read the second part of the configuration.
 pub const CONFIGURATION_2: u8 = 0x7B;
 
-/// Commands that write the scanner's EEPROM: fields, password, taught fields, permanent baud rate, configuration parts
-/// 1 and 2 (Telegram listing 7-1: those that need the installation mode). Only `lms_configure` encodes them; none is a
-/// [`Request`].
+/// Commands that write the scanner's EEPROM: fields, password, taught fields, permanent baud rate, and parts 1 and 2 of
+/// the configuration (Telegram listing 7-1: commands that need the installation mode). Only `lms_configure` encodes
+/// these commands. No [`Request`] contains them.
 pub const EEPROM_WRITES: [u8; 6] = [0x40, 0x42, 0x46, 0x66, 0x77, 0x7C];
 
 /// A sub-range of the values. Indices are counted from 1, and both ends are included.
@@ -314,7 +314,7 @@ impl RawParameters {
     /// Maximum length in bytes.
     pub const MAX: usize = 16;
 
-    /// Copies `bytes`. Returns `None` if there are more than [`RawParameters::MAX`].
+    /// Copies `bytes`. Returns `None` if `bytes` is longer than [`RawParameters::MAX`].
     pub fn new(bytes: &[u8]) -> Option<RawParameters> {
         let mut kept = [0; RawParameters::MAX];
         kept.get_mut(..bytes.len())?.copy_from_slice(bytes);

@@ -8,7 +8,7 @@ use crate::lms::variant::{Mode, Unit};
 pub struct Configuration<'a>(&'a [u8]);
 
 impl<'a> Configuration<'a> {
-    /// Returns the configuration in `bytes`, or `None` if there are fewer than 32.
+    /// Returns the configuration in `bytes`. Returns `None` if `bytes` is shorter than 32 bytes.
     pub fn new(bytes: &'a [u8]) -> Option<Configuration<'a>> {
         (bytes.len() >= OLD_CONFIGURATION_LEN).then_some(Configuration(bytes))
     }
@@ -29,7 +29,7 @@ impl<'a> Configuration<'a> {
         self.availability() & REAL_TIME_INDICES != 0
     }
 
-    /// Returns the measuring mode, which defines how a value is split into range and upper bits.
+    /// Returns the measuring mode, which determines the range bits and the upper bits of a value.
     pub fn mode(&self) -> Mode {
         Mode(self.0[5])
     }
@@ -40,7 +40,7 @@ impl<'a> Configuration<'a> {
     }
 }
 
-/// Returns the configuration of a factory-new scanner, with this measuring mode and unit.
+/// Returns the configuration of a factory-new scanner whose measuring mode is `mode` and whose unit is `unit`.
 pub fn factory_configuration(mode: Mode, unit: Unit) -> [u8; CONFIGURATION_LEN] {
     let mut bytes = [0; CONFIGURATION_LEN];
     bytes[2] = 0x70;
@@ -55,15 +55,15 @@ pub fn factory_configuration(mode: Mode, unit: Unit) -> [u8; CONFIGURATION_LEN] 
 /// Location and name of one value of the configuration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Item {
-    /// Index of its first byte.
+    /// Index of the first byte.
     pub at: usize,
-    /// Number of its bytes: 1, or 2 for a word.
+    /// Number of bytes: 1, or 2 for a word.
     pub len: usize,
     /// Name for users.
     pub name: &'static str,
 }
 
-/// All values of a configuration, in their order and without gaps.
+/// All values of a configuration. Their order is the order of the bytes, without gaps.
 pub const ITEMS: [Item; 31] = {
     const fn byte(at: usize, name: &'static str) -> Item {
         Item { at, len: 1, name }

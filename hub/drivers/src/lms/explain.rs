@@ -1,8 +1,8 @@
 //! Explanation of a telegram as a list of fields that covers every byte. A field has a name, a value and, if needed,
 //! its meaning as text.
-//!
-//! [`explain`] passes one field after the other to a callback and allocates nothing. [`Headline`] is the telegram in
-//! one line. The layouts are from the Telegram listing, chapter 7. Requests that write the EEPROM are explained here
+//! [`explain`] passes each field to a callback and allocates nothing. [`Headline`] displays a telegram in one line. The
+//! layouts are from the Telegram listing, chapter 7. Requests that write the EEPROM are explained here but encoded in
+//! `lms_configure`.
 //! but encoded in `lms_configure`.
 
 use core::fmt::{self, Display};
@@ -21,7 +21,7 @@ use crate::lms::variant::{Baud, Mode, Unit, Variant};
 
 /// A field of a telegram.
 pub struct Field<'a> {
-    /// Index of its first byte, counted from STX.
+    /// Index of the field's first byte, counted from STX.
     pub offset: usize,
     /// Bytes of the field.
     pub bytes: &'a [u8],
@@ -29,7 +29,7 @@ pub struct Field<'a> {
     pub name: &'static str,
     /// Decoded value.
     pub value: Value<'a>,
-    /// The meaning of the value as text; `None` if it needs none.
+    /// Meaning of the value as text. `None` if the value needs no explanation.
     pub meaning: Option<&'a dyn Display>,
 }
 
@@ -57,9 +57,9 @@ pub enum Value<'a> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Ranges<'a> {
     bytes: &'a [u8],
-    /// Measuring mode, which defines how a value is split into range and upper bits.
+    /// Measuring mode, which determines the range bits and the upper bits of a value.
     pub mode: Mode,
-    /// Whether the mode is known. If not, the lower 13 bits are assumed to be the range.
+    /// Whether the measuring mode is known. If not, the lower 13 bits of a value are assumed to be the range.
     pub mode_known: bool,
     /// Unit of the ranges.
     pub unit: Unit,
@@ -71,13 +71,13 @@ impl<'a> Ranges<'a> {
         self.bytes.chunks_exact(2).map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
     }
 
-    /// Returns the range of each value in millimeters, or the code that says why there is none.
+    /// Returns the range of each value in millimeters. If a value has no range, returns the code with the reason.
     pub fn millimeters(&self) -> impl ExactSizeIterator<Item = Result<u32, crate::lms::variant::Code>> + 'a {
         let (mode, mm) = (self.mode, u32::from(self.unit.mm()));
         self.raw().map(move |word| mode.split(word).range.map(|range| u32::from(range) * mm))
     }
 
-    /// Returns the bits above the range of each value.
+    /// Returns the bits above the range bits of each value.
     pub fn upper(&self) -> impl ExactSizeIterator<Item = u8> + 'a {
         let mode = self.mode;
         self.raw().map(move |word| mode.split(word).upper)
@@ -201,11 +201,12 @@ fn write_measured(f: &mut fmt::Formatter<'_>, values: MeasuredValues<'_>) -> fmt
 
 /// Passes each field of `telegram` to `visit`, from STX to the checksum, without gaps.
 ///
-/// `mode` defines how a value is split into range and upper bits. A telegram of values does not contain the mode.
-/// Without it, the lower 13 bits are assumed to be the range.
+/// `mode` determines the range bits and the upper bits of a value. A telegram of values does not contain the mode. If
+/// `mode` is `None`, the lower 13 bits are assumed to be the range.
 pub fn explain(telegram: Telegram<'_>, mode: Option<Mode>, visit: &mut dyn FnMut(&Field<'_>)) {
     let mut reader = FieldReader::new(telegram.bytes(), visit);
-    // A telegram that is shorter than its layout ends early. The rest is shown as bytes.
+    // A telegram that is shorter than its layout has fewer fields. Bytes that do not fill a field are shown as they
+    // are.
     let _ = fields(&mut reader, telegram, mode);
     reader.show_to_tail(2 + usize::from(telegram.status().is_some()));
     if telegram.status().is_some() {
@@ -232,8 +233,8 @@ fn fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: Option
     if telegram.is_reply() { reply_fields(reader, telegram, mode) } else { request_fields(reader, telegram) }
 }
 
-/// Returns the name of `command` (Telegram listing, table 7-1), or `None` if it is unknown. The name of most replies is
-/// that of the request.
+/// Returns the name of `command` (Telegram listing, table 7-1). Returns `None` if the command is unknown. Most replies
+/// have the same name as their requests.
 pub fn name(command: u8, is_reply: bool) -> Option<&'static str> {
     if !is_reply {
         return request_name(command);
@@ -295,7 +296,7 @@ fn request_name(command: u8) -> Option<&'static str> {
     })
 }
 
-/// Reads the parameters of a request. Parameters without a known layout are left to the caller.
+/// Reports the parameters of a request. Parameters without a known layout become one field.
 fn request_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>) -> Option<()> {
     match telegram.command() {
         MODE => mode_fields(reader),
@@ -376,7 +377,7 @@ fn selection(byte: u8) -> &'static str {
 
 /// Request that writes the EEPROM. It is explained here, and encoded only in `lms_configure`.
 const POWER_ON_RATE: u8 = 0x66;
-/// See [`POWER_ON_RATE`].
+/// Request that writes the EEPROM. It is explained here, and encoded only in `lms_configure`.
 const WRITE_CONFIGURATION: u8 = 0x77;
 /// Bit of the first value of a sub-range: direct output of a partial scan.
 const DIRECT: u16 = 1 << 15;
@@ -440,7 +441,7 @@ fn reply_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: 
     }
 }
 
-/// Reads the count word, the values, and the two indices if they are present.
+/// Reads the count word, the values, and the two real-time indices if they are present.
 fn values(reader: &mut FieldReader<'_, '_>, mode: Option<Mode>) -> Option<()> {
     let (count, unit) = counted(reader)?;
     ranges(reader, count, unit, mode)?;
@@ -483,7 +484,7 @@ fn indices(reader: &mut FieldReader<'_, '_>) -> Option<()> {
 
 fn error_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     while reader.remaining() >= 2 {
-        // Both bytes are one error.
+        // The two bytes form one error.
         reader.word_as("error", |word| {
             let [kind, number] = word.to_le_bytes();
             Fault { kind, number }
@@ -527,7 +528,7 @@ fn status_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     Some(())
 }
 
-/// Reads the configuration, up to its end or the end of the data.
+/// Reads the fields of the configuration, up to the end of the data if the data are shorter.
 fn configuration_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     for item in configuration::ITEMS {
         if reader.remaining() < item.len {
@@ -582,8 +583,8 @@ fn unit_text(code: u8) -> &'static str {
     Unit::of_code(code).map_or("unknown", unit_name)
 }
 
-/// Reader that turns the bytes of a telegram into fields. It never reads past the end of the layout and never skips a
-/// byte.
+/// Reader that divides the bytes of a telegram into fields. It never reads past the end of the layout, and never skips
+/// a byte.
 struct FieldReader<'t, 'v> {
     bytes: &'t [u8],
     at: usize,
@@ -596,12 +597,13 @@ impl<'t, 'v> FieldReader<'t, 'v> {
         FieldReader { bytes, at: 0, end: 0, visit }
     }
 
-    /// Sets the end of the fields that follow.
+    /// Sets the index at which the following fields end.
     fn set_end(&mut self, end: usize) {
         self.end = end;
     }
 
-    /// Reports all bytes up to the last `len` bytes of the telegram as one field. The last bytes have their own fields.
+    /// Reports all bytes before the last `len` bytes of the telegram as one field. The last `len` bytes have their own
+    /// fields.
     fn show_to_tail(&mut self, len: usize) {
         self.end = self.bytes.len() - len;
         self.show_rest("data");
@@ -695,7 +697,7 @@ impl<'t, 'v> FieldReader<'t, 'v> {
     }
 }
 
-/// Text that is written when it is displayed.
+/// Text that is created only when it is displayed.
 struct LazyText<F>(F);
 
 /// Returns text that calls `write` when it is displayed.

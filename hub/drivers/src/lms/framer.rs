@@ -1,14 +1,14 @@
-//! Framer that finds telegrams in a stream with missing bytes. It never discards an intact telegram.
+//! Framer that finds telegrams in a stream that may lack bytes. It never discards an intact telegram.
 //!
-//! A parser that collects a damaged telegram up to its announced length also consumes the beginning of the next one.
-//! The framer therefore examines every byte before it discards it. Each position with an acceptable header is a
-//! *candidate*, and the first candidate that is complete with a right checksum is the telegram. Because the checksum is
-//! weak, the framer *holds* such a frame while another header begins inside it, or might begin with its last bytes. If
-//! the inner telegram turns out to be valid, the outer frame was wrong. A pause on the line may release a held frame,
-//! but never discards a byte.
+//! A parser that collects a damaged telegram up to its announced length also consumes the beginning of the next
+//! telegram. The framer therefore examines every byte before it discards it. Each position with an acceptable header is
+//! a *candidate*. The first candidate that is complete and has a right checksum is the telegram. The checksum is weak,
+//! so the framer *holds* a complete frame while another header begins inside it, or while its last bytes may be the
+//! beginning of a header. If the inner telegram turns out to be valid, the outer frame was wrong. A pause on the line
+//! may release a held frame, but the framer never discards a byte because of a pause.
 //!
-//! [`FramerCounters`] accounts for every byte: `read == in_telegrams + acknowledge + discarded + buffered` always
-//! holds.
+//! [`FramerCounters`] accounts for every byte. The equation `read == in_telegrams + acknowledge + discarded + buffered`
+//! always holds.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -26,19 +26,20 @@ pub struct FramerCounters {
     pub read: u64,
     /// Bytes in delivered telegrams.
     pub in_telegrams: u64,
-    /// ACK and NAK bytes outside telegrams, while a reply was expected.
+    /// ACK and NAK bytes outside telegrams that arrived while a reply was expected.
     pub acknowledge: u64,
-    /// Bytes that belong to no telegram or acknowledgement.
+    /// Bytes that are not part of a telegram or an acknowledgement.
     pub discarded: u64,
-    /// Discarded bytes of measured-value telegrams that broke off for a reply. They are included in `discarded`.
+    /// Discarded bytes of measured-value telegrams that the scanner broke off to send a reply. `discarded` includes
+    /// them.
     pub broken_off: u64,
     /// Delivered telegrams.
     pub telegrams: u64,
-    /// Measured-value telegrams that broke off for a reply.
+    /// Measured-value telegrams that the scanner broke off to send a reply.
     pub aborted: u64,
     /// Delivered telegrams that were held because another header began inside them.
     pub held: u64,
-    /// Start bytes among the discarded bytes, by the reason for their rejection.
+    /// Number of start bytes among the discarded bytes, by the reason for the rejection.
     pub rejected: [u64; Reject::COUNT],
 }
 
@@ -47,7 +48,7 @@ pub struct FramerCounters {
 pub struct FramedTelegram<'a> {
     /// The telegram, in the framer's buffer.
     pub telegram: Telegram<'a>,
-    /// Offset of its first byte among all bytes committed.
+    /// Offset of the telegram's first byte, counted from the first committed byte.
     pub offset: u64,
     /// Bits of [`suspect`]; 0 if the telegram is clean.
     pub reasons: u8,
@@ -58,9 +59,9 @@ pub struct FramedTelegram<'a> {
 pub(crate) struct PartialTelegram<'a> {
     /// Bytes from the start byte on.
     pub(crate) bytes: &'a [u8],
-    /// Offset of the first byte among all bytes committed.
+    /// Offset of the first byte, counted from the first committed byte.
     pub(crate) offset: u64,
-    /// Bits of [`suspect`] that are already known.
+    /// Bits of [`suspect`] that can already be determined.
     pub(crate) reasons: u8,
 }
 
@@ -75,7 +76,7 @@ pub enum FramerEvent<'a> {
     Nak,
 }
 
-/// [`FramerEvent`] without the bytes.
+/// [`FramerEvent`] without the telegram's bytes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum FoundItem {
     Telegram(TelegramSpan),
@@ -83,7 +84,7 @@ pub(crate) enum FoundItem {
     Nak,
 }
 
-/// Location of a telegram in the buffer, valid until the next bytes are read.
+/// Location of a telegram in the buffer. It is valid until the next bytes are committed.
 #[derive(Clone, Copy, Debug)]
 pub struct TelegramSpan {
     at: usize,
@@ -92,20 +93,20 @@ pub struct TelegramSpan {
     reasons: u8,
 }
 
-/// The framer, with a buffer for two of the longest telegrams.
+/// The framer. Its buffer has room for two telegrams of the maximum length.
 #[derive(Clone, Debug)]
 pub struct Framer {
     buffer: [u8; BUFFER_LEN],
-    /// `buffer[start..end]` are the bytes that are neither delivered nor discarded.
+    /// `buffer[start..end]` contains the bytes that are neither delivered nor discarded.
     start: usize,
     end: usize,
-    /// All positions before it have been checked for a header.
+    /// Position in the buffer. All earlier positions have been checked for a header.
     cursor: usize,
     /// Positions with an acceptable header whose checksum has not been checked yet, ascending.
     candidates: Candidates,
-    /// A frame with a right checksum that is held because another header may begin inside it.
+    /// A frame with a right checksum that the framer holds because another header may begin inside it.
     held: Option<HeldFrame>,
-    /// Checksum of the bytes of a candidate so far, and the offset of the candidate's first byte.
+    /// Offset of a candidate's first byte, and the checksum of the candidate's bytes so far.
     partial_checksum: (u64, Checksum),
     expect: ExpectedHeaders,
     expects_acknowledge: bool,
@@ -140,8 +141,8 @@ impl Default for Framer {
 }
 
 impl Framer {
-    /// Returns the space for the next bytes. It is never empty after [`Framer::poll`] returned `None`. Write to its
-    /// beginning, then call [`Framer::commit`].
+    /// Returns the space for the next bytes. The space is never empty after [`Framer::poll`] has returned `None`. The
+    /// caller writes to the beginning of the space and then calls [`Framer::commit`].
     pub fn read_buffer(&mut self) -> &mut [u8] {
         if self.start == self.end {
             self.shift(self.start);
@@ -159,17 +160,17 @@ impl Framer {
         self.counters.read += len as u64;
     }
 
-    /// Sets the acceptable headers. Positions that were already checked keep their result.
+    /// Sets the acceptable headers. Positions that have already been checked keep their results.
     pub fn expect(&mut self, expect: ExpectedHeaders) {
         self.expect = expect;
     }
 
-    /// Sets whether single ACK and NAK bytes are acknowledgements.
+    /// Sets whether the framer treats single ACK and NAK bytes as acknowledgements.
     pub fn expect_acknowledge(&mut self, is_expected: bool) {
         self.expects_acknowledge = is_expected;
     }
 
-    /// Returns the next telegram or acknowledgement in the committed bytes, or `None` until more bytes arrive.
+    /// Returns the next telegram or acknowledgement in the committed bytes. Returns `None` if more bytes are necessary.
     pub fn poll(&mut self) -> Option<FramerEvent<'_>> {
         Some(match self.advance()? {
             FoundItem::Telegram(span) => FramerEvent::Telegram(self.telegram_at(span)),
@@ -184,7 +185,7 @@ impl Framer {
         FramedTelegram { telegram: Telegram::assume_valid(&self.buffer[at..end]), offset, reasons }
     }
 
-    /// Returns the same as [`Framer::poll`], but without a borrow of the buffer.
+    /// Returns the same as [`Framer::poll`], but does not borrow the buffer.
     pub(crate) fn advance(&mut self) -> Option<FoundItem> {
         loop {
             self.check_headers();
@@ -217,16 +218,16 @@ impl Framer {
         }
     }
 
-    /// Returns the time without bytes after which [`Framer::release`] delivers the held frame, or `None` if none is
-    /// held.
+    /// Returns the time without bytes after which [`Framer::release`] delivers the held frame. Returns `None` if no
+    /// frame is held.
     pub fn hold(&self) -> Option<Nanos> {
         self.held.map(|held| {
             if self.candidates.has_candidate_before(held.end) { VETO_HOLD_TIME } else { SUFFIX_HOLD_TIME }
         })
     }
 
-    /// Handles a read without bytes, after the line has been idle for `idle` ns. After enough time, headers inside the
-    /// held frame are no longer waited for.
+    /// Handles a read without bytes, after the line has been idle for `idle` ns. If `idle` is long enough, the framer
+    /// no longer waits for telegrams inside the held frame.
     pub fn release(&mut self, idle: Nanos) {
         if self.hold().is_some_and(|hold| idle >= hold) {
             self.refute_headers_inside();
@@ -243,7 +244,8 @@ impl Framer {
         self.has_damage = false;
     }
 
-    /// Returns the next bytes that the earliest candidate needs, after [`Framer::poll`] returned `None`.
+    /// Returns the part of the telegram that the earliest candidate needs next. Call it after [`Framer::poll`] has
+    /// returned `None`.
     pub fn state(&self) -> State {
         match self.candidates.first() {
             Some(candidate) if self.end + 2 < usize::from(candidate.end) => State::Body,
@@ -255,7 +257,8 @@ impl Framer {
         }
     }
 
-    /// Returns the earliest telegram that has begun and was not delivered, after [`Framer::poll`] returned `None`.
+    /// Returns the earliest telegram that has begun but was not delivered. Call it after [`Framer::poll`] has returned
+    /// `None`.
     pub(crate) fn partial_telegram(&self) -> Option<PartialTelegram<'_>> {
         let held = self.held.map(|held| (held.at, held.end));
         let first_candidate =
@@ -275,7 +278,7 @@ impl Framer {
         self.end - self.start
     }
 
-    /// Returns the offset of the byte at `at` among all bytes committed.
+    /// Returns the offset of the byte at index `at` of the buffer, counted from the first committed byte.
     fn offset(&self, at: usize) -> u64 {
         self.counters.read - (self.end - at) as u64
     }
@@ -297,7 +300,8 @@ impl Framer {
         self.cursor = self.end.max(self.cursor);
     }
 
-    /// Adds the received bytes of the first candidate to its checksum, so that little work is left after its last byte.
+    /// Adds the received bytes of the first candidate to its checksum, so that little work is left when the last byte
+    /// arrives.
     fn add_arrived(&mut self) {
         if let Some(first) = self.candidates.first() {
             let (at, end) = (usize::from(first.at), usize::from(first.end));
@@ -313,14 +317,15 @@ impl Framer {
         if offset == self.offset(at) { checksum } else { Checksum::default() }
     }
 
-    /// Checks the checksum of the earliest complete candidate. A wrong checksum removes the candidate. A right one
-    /// removes the candidates that began before it and, if it began inside the held frame, replaces that frame.
+    /// Checks the checksum of the earliest complete candidate. If the checksum is wrong, removes the candidate. If it
+    /// is right, removes all earlier candidates. The candidate then replaces the held frame, if it began inside this
+    /// frame.
     fn complete(&mut self, candidate: Candidate) {
         let (at, end) = (usize::from(candidate.at), usize::from(candidate.end));
         let is_valid = Telegram::check_with(&self.buffer[at..end], self.checksum(at)).is_some();
         match &mut self.held {
-            // This telegram begins after the held frame. A candidate inside the held frame would overlap it, so it is
-            // not valid.
+            // This telegram begins after the held frame. A candidate inside the held frame would overlap the telegram,
+            // so the candidate is not valid.
             Some(held) if is_valid && held.end <= at => return self.refute_headers_inside(),
             Some(held) => held.header_inside |= at < held.end,
             None => {}
@@ -359,7 +364,8 @@ impl Framer {
         self.discard(held.at, Some((self.buffer[held.at + 4], held.end)));
     }
 
-    /// Discards the bytes before `to`. `successor` has the command and the end of the telegram that begins there.
+    /// Discards the bytes before index `to`. `successor` contains the command and the end of the telegram that begins
+    /// at `to`.
     fn discard(&mut self, to: usize, successor: Option<(u8, usize)>) {
         let is_reply = successor.is_some_and(|(command, _)| command != MEASURED);
         let decided = successor.map_or(self.end, |(_, end)| end);
@@ -380,8 +386,8 @@ impl Framer {
         self.start = to;
     }
 
-    /// Counts the reason why the start byte at `at` did not become a telegram, as of the moment at which the bytes
-    /// before `decided` had arrived. Returns whether a scan began there and broke off for a reply.
+    /// Counts the reason why the start byte at `at` did not become a telegram. The reason is determined from the bytes
+    /// before `decided`. Returns whether a scan began at `at` that the scanner broke off to send a reply.
     fn count_rejection(&mut self, at: usize, is_reply: bool, decided: usize) -> bool {
         let reject = match check_header(&self.buffer[at..self.end.min(at + MAX_HEADER_LEN)], &self.expect) {
             HeaderCheck::Refused(reject) => reject,
@@ -402,7 +408,7 @@ impl Framer {
         false
     }
 
-    /// Adjusts all positions after the first `by` bytes of the buffer were removed.
+    /// Adjusts all positions after the removal of the first `by` bytes from the buffer.
     fn shift(&mut self, by: usize) {
         self.start -= by;
         self.end -= by;
@@ -415,19 +421,20 @@ impl Framer {
     }
 }
 
-/// Returns the index of the first STX. One vector comparison skips a block of 16 bytes without an STX.
+/// Returns the index of the first STX. A block of 16 bytes without an STX needs only one vector comparison.
 fn find_stx(bytes: &[u8]) -> Option<usize> {
     let is_empty = |block: &&[u8; 16]| !block.iter().fold(false, |any, &byte| any | (byte == STX));
     let skipped = 16 * bytes.as_chunks().0.iter().take_while(is_empty).count();
     bytes[skipped..].iter().position(|&byte| byte == STX).map(|at| skipped + at)
 }
 
-/// Length of the buffer: enough for a held frame and a telegram that begins with its last byte.
+/// Length of the buffer, in bytes. A held frame and a telegram that begins with the last byte of this frame fit into
+/// it.
 pub(crate) const BUFFER_LEN: usize = 2 * MAX_TELEGRAM;
-/// Time without bytes after which a header inside a held frame no longer counts: the longest pause inside a telegram
-/// (Telegram listing 4.3).
+/// Time without bytes after which the framer ignores a header inside a held frame. It is the longest pause inside a
+/// telegram (Telegram listing 4.3).
 pub const VETO_HOLD_TIME: Nanos = 14 * MILLIS;
-/// Time without bytes after which a held frame is delivered whose last bytes might begin a header.
+/// Time without bytes after which the framer delivers a held frame whose last bytes may be the beginning of a header.
 pub const SUFFIX_HOLD_TIME: Nanos = 2 * MILLIS;
 
 /// A position with an acceptable header, and the end of its telegram.
@@ -437,7 +444,8 @@ pub(crate) struct Candidate {
     pub(crate) end: u16,
 }
 
-/// The candidates in the buffer, ascending by position. There is room for as many as a full buffer can contain.
+/// The candidates in the buffer, in ascending order of position. The capacity is the maximum number of candidates in a
+/// full buffer.
 #[derive(Clone, Debug)]
 pub(crate) struct Candidates {
     list: [Candidate; Candidates::MAX_CANDIDATES],
@@ -464,8 +472,8 @@ impl Candidates {
         self.as_slice().first().copied()
     }
 
-    /// Returns the candidate that is complete first, with bytes up to `end`. If two end at the same position, it is the
-    /// inner one, because that one may refute the outer one.
+    /// Returns the candidate that is complete first, if the bytes before `end` are available. If two candidates end at
+    /// the same position, returns the inner one, because it may prove that the outer one is wrong.
     pub(crate) fn first_complete(&self, end: usize) -> Option<Candidate> {
         let complete = self.as_slice().iter().filter(|candidate| usize::from(candidate.end) <= end);
         complete.copied().min_by_key(|candidate| (candidate.end, core::cmp::Reverse(candidate.at)))

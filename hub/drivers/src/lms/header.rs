@@ -1,12 +1,13 @@
-//! Check of a telegram's header. A position in the stream becomes a candidate only if its header passes this check,
-//! which uses the first 5 or 7 bytes and never the checksum.
+//! Check of a telegram's header. A position in the stream becomes a candidate only if its header passes this check. The
+//! check uses the first 5 or 7 bytes, and not the checksum.
 
 use crate::lms::command;
 use crate::lms::measured::MEASURED;
 use crate::lms::telegram::{FRAME_LEN, MAX_LENGTH, REPLY, STX};
 use crate::lms::variant::MAX_BEAMS;
 
-/// The next bytes that a position in the stream needs: the six states of Fig. 3 of the paper.
+/// Part of a telegram that is expected next at a position in the stream. The variants are the six states of Fig. 3 of
+/// the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
     /// The start byte. No header has begun.
@@ -26,42 +27,42 @@ pub enum State {
 /// Reason why a start byte did not become a delivered telegram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reject {
-    /// The address is not that of a reply, or not that of this scanner.
+    /// The address is not a reply's address, or it belongs to another scanner.
     Address,
-    /// The length exceeds [`MAX_LENGTH`], or is not the expected one.
+    /// The length exceeds [`MAX_LENGTH`], or differs from the expected length.
     Length,
-    /// The command is not that of a reply, or not that of an expected reply.
+    /// The command is not a reply's command, or the reply is not expected.
     Command,
-    /// The count word does not match the length, or is not the expected one.
+    /// The count word does not match the length, or differs from the expected count word.
     Count,
     /// The checksum is wrong.
     Crc,
-    /// The checksum was right, but another telegram with a right checksum began inside this one.
+    /// The checksum was right, but another telegram with a right checksum began inside this telegram.
     Vetoed,
     /// Another telegram was complete first.
     Superseded,
 }
 
 impl Reject {
-    /// Number of reasons, and the length of a table with one counter for each.
+    /// Number of reasons. A table with one counter for each reason has this length.
     pub const COUNT: usize = 7;
 }
 
-/// First seven bytes of every measured-value telegram of a stream in a known mode: STX, address, length, command and
-/// count word.
+/// First seven bytes of every measured-value telegram in a stream whose mode is known: STX, address, length, command
+/// and count word.
 pub type StreamHeader = [u8; 7];
 
-/// Headers that are acceptable at the moment.
+/// Headers that the framer accepts at the moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExpectedHeaders {
     /// Any reply of at most [`MAX_LENGTH`] bytes. The length of a measured-value telegram must match its count.
     Anything,
-    /// Telegrams of a stream in a known mode, the reply to the open request, and its refusal. Replies that may arrive
-    /// late, twice or after power-on are always accepted if they have their usual length.
+    /// Telegrams of a stream in a known mode, the reply to the open request, and the refusal of this request. Some
+    /// replies may arrive late, twice or after power-on. They are always accepted if they have their usual length.
     Stream {
         /// First bytes of each measured-value telegram.
         header: StreamHeader,
-        /// Command byte of the reply to the open request; `None` without such a request.
+        /// Command byte of the reply to the open request. `None` if no request is open.
         reply: Option<u8>,
     },
 }
@@ -69,15 +70,15 @@ pub enum ExpectedHeaders {
 /// Result of checking the first bytes at a position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum HeaderCheck {
-    /// The beginning of an acceptable header. The next missing byte is that of the given state.
+    /// The bytes are the beginning of an acceptable header. Contains the state for the next missing byte.
     Prefix(State),
-    /// A complete, acceptable header of a telegram of `len` bytes from STX to checksum.
+    /// The bytes begin with a complete and acceptable header. The telegram has `len` bytes from STX to checksum.
     Candidate { len: usize },
-    /// Not acceptable.
+    /// The header is not acceptable.
     Refused(Reject),
 }
 
-/// Checks the header that begins at `bytes[0]`, which must be STX. Bytes after the header are ignored.
+/// Checks the header that begins at `bytes[0]`, which must be STX. Ignores bytes after the header.
 pub(crate) fn check_header(bytes: &[u8], expect: &ExpectedHeaders) -> HeaderCheck {
     use HeaderCheck::{Candidate, Prefix, Refused};
     let Some(&stx) = bytes.first() else { return Prefix(State::Stx) };
@@ -163,7 +164,7 @@ fn count_fits(word: [u8; 2], length: usize, expect: &ExpectedHeaders) -> bool {
     match expect {
         ExpectedHeaders::Anything => {
             let count = usize::from(u16::from_le_bytes(word) & 0x03FF);
-            // Command, count word and status, and two more bytes if real-time indices are on.
+            // Command, count word and status. Two more bytes follow if the scanner sends real-time indices.
             let len_without_indices = 2 * count + 4;
             (1..=MAX_BEAMS).contains(&count)
                 && (length == len_without_indices || length == len_without_indices + 2)
@@ -176,18 +177,19 @@ fn stream_length(header: &StreamHeader) -> usize {
     usize::from(u16::from_le_bytes([header[2], header[3]]))
 }
 
-/// Returns whether a scanner sends telegrams with this command byte continuously, without a request for each, in one of
-/// its operating modes.
+/// Returns whether some operating mode makes a scanner send telegrams with this command byte continuously, without a
+/// request for each telegram.
 pub(crate) fn is_data(command: u8) -> bool {
     STREAM_COMMANDS.contains(&command)
 }
 
-/// Command bytes of telegrams that a scanner sends continuously: all values, means, a sub-range, with field values,
-/// means of a sub-range, with reflectivity, ranges and reflectivity, Cartesian (Telegram listing, 20h).
+/// Command bytes of telegrams that a scanner sends continuously: all values, means, a sub-range, a sub-range with field
+/// values, means of a sub-range, ranges with the reflectivity of a sub-range, ranges and reflectivities, Cartesian
+/// coordinates (Telegram listing, 20h).
 const STREAM_COMMANDS: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
-/// Replies to a session's requests, the refusal, and the boot message, each with its possible LENGTH: types have 20 or
-/// 21 characters, configurations 32 or 34 bytes. Without this restriction, the bytes of scans would often look like
-/// one.
+/// Replies to a session's requests, the refusal, and the boot message, each with its possible values of LENGTH. Types
+/// have 20 or 21 characters, and configurations have 32 or 34 bytes. Without this restriction, the bytes of scans would
+/// often look like one of these replies.
 const REPLIES_IN_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
     (crate::lms::reply::POWER_ON, 20..=26),
     (crate::lms::reply::REFUSED, 2..=2),
@@ -197,12 +199,12 @@ const REPLIES_IN_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
     (command::VARIANT | REPLY, 7..=7),
     (command::CONFIGURATION | REPLY, 33..=36),
 ];
-/// Minimum LENGTH: command and status.
+/// Minimum LENGTH: the command byte and the status byte.
 const MIN_LENGTH: usize = 2;
 /// Number of bytes of the longest header.
 pub(crate) const MAX_HEADER_LEN: usize = 7;
-/// Minimum distance between two acceptable headers. The high byte of a length is at most 3, so it is not a valid
-/// address, but it may be a start byte.
+/// Minimum distance between two acceptable headers, in bytes. The high byte of a length is at most 3. It is therefore
+/// not a valid address, but it may be a start byte.
 pub(crate) const MIN_HEADER_DISTANCE: usize = 3;
 
 const _: () = assert!(MAX_LENGTH < 0x0400, "HEADER_DISTANCE rests on it");

@@ -1,9 +1,9 @@
-//! Dialog that finds the baud rate of a scanner and requests its identity and state, without changing its mode, its
-//! baud rate or a setting. A scanner that streams continues; each reply costs a scan.
+//! Dialog that finds the baud rate of a scanner and requests its identity and state. It does not change the scanner's
+//! mode, baud rate or settings. A scanner that streams continues to stream, but each reply costs a scan.
 //!
 //! The inquiry listens first, because a stream at the port's rate needs no request. Then it requests the status at each
-//! rate, in two rounds, because a scanner may overlook a request. A rate at which telegrams arrived is tried more
-//! often.
+//! rate. It does this in two rounds, because a scanner may overlook a request. If telegrams arrived at a rate, the
+//! inquiry sends more requests at this rate.
 
 use scanhub_schema::{Nanos, line_time};
 
@@ -29,7 +29,7 @@ pub struct Inquiry {
     phase: Phase,
     /// Baud rates in the order of the search.
     rates: [Baud; Baud::ALL.len()],
-    /// Number of entries of `rates` that are tried.
+    /// Number of entries of `rates` that the inquiry tries.
     count: usize,
     /// Number of telegrams that arrived without a request, for each entry of `rates`.
     unrequested: [u32; Baud::ALL.len()],
@@ -49,7 +49,7 @@ enum Phase {
     Requesting {
         question: usize,
     },
-    /// Bytes arrived, but no reply. The inquiry checks at each rate whether they are a stream.
+    /// Bytes arrived, but no reply. The inquiry checks at each rate whether the bytes are a stream.
     ListeningPerRate {
         attempt: usize,
         give_up_at: Nanos,
@@ -61,17 +61,17 @@ impl Inquiry {
     /// All baud rates of a scanner.
     pub const RATES: [u32; Baud::ALL.len()] = table!(Baud::ALL, Baud::rate);
 
-    /// Creates an inquiry on a port that is open at `rate` baud. `None` stands for a serial server, which sets the rate
-    /// itself.
+    /// Creates an inquiry on a port that is open at `rate`, in bits per second. `rate` is `None` for a serial server,
+    /// on which the user sets the rate.
     pub fn begin(rate: Option<u32>, now: Nanos) -> Self {
         match rate {
             Some(rate) => Inquiry::new(Baud::of_rate(rate).unwrap_or(Baud::B500000), now),
-            // The status will report the rate. Timeouts for the slowest rate are long enough for every rate.
+            // The status will contain the rate. Timeouts for the slowest rate are long enough for every rate.
             None => Inquiry::at_fixed_rate(Baud::B9600, now),
         }
     }
 
-    /// Creates an inquiry on a port that is open at `first`. It tries all baud rates, starting with `first`.
+    /// Creates an inquiry on a port that is open at `first`. The inquiry tries all baud rates, starting with `first`.
     pub fn new(first: Baud, now: Nanos) -> Self {
         let mut rates = Baud::ALL;
         if let Some(at) = rates.iter().position(|&baud| baud == first) {
@@ -80,7 +80,7 @@ impl Inquiry {
         Inquiry::with_rates(rates, rates.len(), now)
     }
 
-    /// Creates an inquiry on the line of a serial server, whose baud rate is fixed.
+    /// Creates an inquiry on the line of a serial server, whose baud rate is fixed at `baud`.
     pub fn at_fixed_rate(baud: Baud, now: Nanos) -> Self {
         let mut inquiry = Inquiry::with_rates([baud; Baud::ALL.len()], 1, now);
         inquiry.channel.is_behind_server = true;
@@ -99,7 +99,7 @@ impl Inquiry {
         }
     }
 
-    /// Returns the report, which is complete when the inquiry [is done](Protocol::is_done).
+    /// Returns the report. It is complete when the inquiry [is done](Protocol::is_done).
     pub fn report(&self) -> &Report {
         &self.report
     }
@@ -109,7 +109,7 @@ impl Inquiry {
         self.channel.baud
     }
 
-    /// Returns the counters of bytes, and the number of buffered bytes that are not counted in a class yet.
+    /// Returns the counters of bytes, and the number of buffered bytes, which no other counter includes yet.
     pub fn byte_counters(&self) -> (&FramerCounters, usize) {
         self.channel.byte_counters()
     }
@@ -119,8 +119,8 @@ impl Inquiry {
         let (command, address, status) = (telegram.command(), telegram.address() & !REPLY, telegram.status());
         let is_status = matches!(Reply::decode(telegram), Some(Reply::Status(_)));
         let reply = EncodedTelegram::of(telegram);
-        // The checksum is weak, so bytes at a wrong rate may pass it. During the search, only a complete status proves
-        // the rate.
+        // The checksum is weak, so bytes that arrive at a wrong rate may pass it. During the search, only a complete
+        // status proves the rate.
         let may_be_reply = is_status || matches!(self.phase, Phase::Requesting { .. });
         let Some(request) = may_be_reply.then(|| self.channel.take_answered(command)).flatten() else {
             return self.on_unrequested(command);
@@ -161,8 +161,8 @@ impl Inquiry {
         }
     }
 
-    /// Returns whether the scanner may have counters. If its model is unknown, the request is sent, and the scanner can
-    /// refuse it.
+    /// Returns whether the scanner may have counters. If its model is unknown, the inquiry sends the request, and the
+    /// scanner can refuse it.
     fn has_counters(&self) -> bool {
         let family = self.report.kind().and_then(LmsModel::of_type);
         family.is_none_or(|family| family.refuses(Request::Counters).is_none())
@@ -175,13 +175,13 @@ impl Inquiry {
         }
         self.phase = Phase::Searching { attempt };
         self.channel.set_baud(self.rates[attempt % self.count]);
-        // The request is sent once in the first round, and twice in the second.
+        // The request is sent once in the first round and twice in the second round.
         let tries = 1 + (attempt / self.count) as u8;
         self.channel.send_request(Request::Status, not_before, tries);
     }
 
-    /// Waits for any telegram at one baud rate after the other, at each for the time of two of the longest telegrams.
-    /// Ends the inquiry instead if the line is silent, or if telegrams have already arrived.
+    /// Waits for a telegram at each baud rate. At each rate, it waits for the duration of two telegrams of the maximum
+    /// length. If the line is silent, or if telegrams have already arrived, ends the inquiry instead.
     fn listen_per_rate(&mut self, attempt: usize) {
         let is_silent = self.channel.byte_counters().0.read == 0;
         if is_silent || attempt >= self.count || self.unrequested.iter().any(|&count| count > 0) {
@@ -193,7 +193,7 @@ impl Inquiry {
         self.phase = Phase::ListeningPerRate { attempt, give_up_at };
     }
 
-    /// Ends the inquiry without a reply. If a stream was found, the report has its baud rate.
+    /// Ends the inquiry without a reply. If the inquiry found a stream, the report contains the stream's baud rate.
     fn end_without_reply(&mut self) {
         self.phase = Phase::Done;
         let busiest = self.unrequested.iter().zip(self.rates).max_by_key(|(count, _)| **count);
@@ -279,7 +279,7 @@ impl Protocol for Inquiry {
 /// Result of an inquiry.
 #[derive(Clone, Debug, Default)]
 pub struct Report {
-    /// Baud rate of the scanner; `None` if no telegram arrived at any rate.
+    /// Baud rate of the scanner. `None` if no telegram arrived at any rate.
     pub baud: Option<Baud>,
     /// Address of the scanner, 0 to 127.
     pub address: Option<u8>,
@@ -293,13 +293,13 @@ pub struct Report {
 }
 
 impl Report {
-    /// Returns whether the scanner has replied. A scanner that streams but does not reply does not receive the
+    /// Returns whether the scanner has replied. If a scanner streams but does not reply, it does not receive the
     /// requests.
     pub fn has_replied(&self) -> bool {
         self.replies.iter().any(Option::is_some)
     }
 
-    /// Returns the reply to `request`, which may be a refusal.
+    /// Returns the reply to `request`. The reply may be a refusal.
     pub fn reply(&self, request: Request) -> Option<Reply<'_>> {
         Reply::decode(self.replies[request_index(request)?].as_ref()?.telegram())
     }
@@ -336,7 +336,7 @@ impl Report {
         }
     }
 
-    /// Returns whether the front window is dirty, according to the status byte or to the measured transmission in the
+    /// Returns whether the front window is dirty, according to the status byte or to the window's transmission in the
     /// status. Returns `None` if the scanner reported neither.
     pub fn is_polluted(&self) -> Option<bool> {
         let reported = self.status_byte.map(|byte| StatusByte(byte).is_polluted());
@@ -360,7 +360,7 @@ fn request_index(request: Request) -> Option<usize> {
     REQUESTS.iter().position(|&question| question == request)
 }
 
-/// Requests of an inquiry in their order. The first one finds the baud rate.
+/// Requests of an inquiry, in the order in which it sends them. The reply to the first request proves the baud rate.
 const REQUESTS: [Request; 5] =
     [Request::Status, Request::Type, Request::Configuration, Request::Errors, Request::Counters];
 /// Number of rounds through all baud rates.
