@@ -1,9 +1,9 @@
 //! Explanation of a telegram as a list of fields that covers every byte. A field has a name, a value and, if needed,
 //! its meaning as text.
+//!
 //! [`explain`] passes each field to a callback and allocates nothing. [`Headline`] displays a telegram in one line. The
 //! layouts are from the Telegram listing, chapter 7. Requests that write the EEPROM are explained here but encoded in
 //! `lms_configure`.
-//! but encoded in `lms_configure`.
 
 use core::fmt::{self, Display};
 

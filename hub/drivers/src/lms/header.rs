@@ -55,7 +55,7 @@ pub type StreamHeader = [u8; 7];
 /// Headers that the framer accepts at the moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExpectedHeaders {
-    /// Any reply of at most [`MAX_LENGTH`] bytes. The length of a measured-value telegram must match its count.
+    /// Any reply of at most [`MAX_LENGTH`] bytes. The length of a measured-value telegram must match its count word.
     Anything,
     /// Telegrams of a stream in a known mode, the reply to the open request, and the refusal of this request. Some
     /// replies may arrive late, twice or after power-on. They are always accepted if they have their usual length.

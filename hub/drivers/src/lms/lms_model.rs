@@ -29,7 +29,8 @@ impl LmsModel {
         LmsModel::ALL.into_iter().find(|family| family.name().eq_ignore_ascii_case(name))
     }
 
-    /// Returns the model in a type reply such as `LMS200;S18063;V02.19`, or `None` if it is not one of these.
+    /// Returns the model in a type reply such as `LMS200;S18063;V02.19`. Returns `None` if the reply contains no known
+    /// model.
     pub fn of_type(text: &[u8]) -> Option<LmsModel> {
         let mut parts = text.split(|&byte| byte == b';');
         let (kind, version) = (parts.next()?, parts.next().unwrap_or_default());
@@ -53,7 +54,7 @@ impl LmsModel {
         }
     }
 
-    /// Returns the factory setting of the unit: mm for ranges up to 8 m, or cm for ranges up to 80 m.
+    /// Returns the factory setting of the unit. With mm, ranges reach up to 8 m. With cm, they reach up to 80 m.
     pub fn factory_unit(self) -> Unit {
         match self {
             LmsModel::Lms200 => Unit::Mm,
@@ -61,7 +62,7 @@ impl LmsModel {
         }
     }
 
-    /// Returns the reason why the model cannot scan `variant`, or `None` if it can.
+    /// Returns the reason why the model cannot scan `variant`. Returns `None` if it can.
     pub fn refuses_variant(self, variant: Variant) -> Option<&'static str> {
         match self {
             LmsModel::Lms211 if variant.angle_deg > 100 => Some("its window is 100 degrees wide"),
@@ -70,18 +71,18 @@ impl LmsModel {
         }
     }
 
-    /// Returns the reason why the model has no sensitivity setting (byte 3 of the configuration, 0 to 3), or `None` if
-    /// it has one. For the other models, this byte is a peak threshold.
+    /// Returns the reason why the model has no sensitivity setting (byte 3 of the configuration, 0 to 3). Returns
+    /// `None` if it has this setting. For the other models, byte 3 is a peak threshold.
     pub fn refuses_sensitivity(self) -> Option<&'static str> {
         (self != LmsModel::Lms291)
             .then_some("only the LMS 291 has a sensitivity; here the byte is a peak threshold")
     }
 
-    /// Returns the reason why the model cannot execute `request`, or `None` if it can.
+    /// Returns the reason why the model cannot execute `request`. Returns `None` if it can.
     pub fn refuses(self, request: Request) -> Option<&'static str> {
         match request {
             Request::Variant(variant) => self.refuses_variant(variant),
-            // An operating mode needs the command that requests the same data once.
+            // The model needs the command that requests the same data once.
             Request::Operate(Operating::Reflectivity(_)) => self.refuses_command(REFLECTIVITY),
             Request::Operate(Operating::RangeFields(_)) => self.refuses_command(RANGE_FIELDS),
             Request::Operate(Operating::Reflectivities(_)) => self.refuses_command(REFLECTIVITIES),
@@ -89,8 +90,8 @@ impl LmsModel {
         }
     }
 
-    /// Returns the reason why the model does not support `command` (Telegram listing table 7-1), or `None` if it does.
-    /// Commands that write the EEPROM are included.
+    /// Returns the reason why the model does not support `command` (Telegram listing table 7-1). Returns `None` if it
+    /// does. `command` may also be a command that writes the EEPROM.
     pub fn refuses_command(self, command: u8) -> Option<&'static str> {
         match (command, self) {
             (COUNTERS, LmsModel::Lms200) => Some("only the LMS 211, 221 and 291 count their hours"),

@@ -1,7 +1,7 @@
-//! Telegrams with measured values. B0h, B6h, B7h and BFh contain a count word, one word per beam, and two real-time
-//! indices if the scanner is set to send them. The meaning of a word depends on the measuring mode, which is not in the
-//! telegram. F5h, C4h and BEh contain more than one word per beam: ranges with reflectivities, or with the borders of
-//! the fields.
+//! Telegrams with measured values. B0h, B6h, B7h and BFh contain a count word and one word per beam. Two real-time
+//! indices follow if the scanner is set to send them. The meaning of a word depends on the measuring mode, which the
+//! telegram does not contain. F5h, C4h and BEh contain more than one word per beam: ranges with reflectivities, or
+//! ranges with the borders of the fields.
 
 use scanhub_schema::{Nanos, ScanHead};
 
@@ -21,8 +21,8 @@ pub struct MeasuredValues<'a> {
 }
 
 impl<'a> MeasuredValues<'a> {
-    /// Returns the view of `telegram`. Returns `None` unless the command is B0h, the unit is known, and the number of
-    /// words matches the count, with at most the two real-time indices after them.
+    /// Returns the view of `telegram`. Returns `None` if the command is not B0h, if the unit is unknown, or if the
+    /// number of words does not match the count. At most two real-time indices may follow the words.
     pub fn decode(telegram: Telegram<'a>) -> Option<Self> {
         if telegram.command() != MEASURED || !telegram.is_reply() {
             return None;
@@ -64,16 +64,17 @@ impl<'a> MeasuredValues<'a> {
 
     /// Returns the unit of the ranges.
     pub fn unit(&self) -> Unit {
-        // `read` has rejected the unknown code 3.
+        // `read` has rejected code 3, which has no unit.
         Unit::of_code((self.count_word >> 14) as u8).unwrap_or(Unit::Mm)
     }
 
-    /// Returns the start of a partial scan in quarters of a degree (0 to 3), or `None` for a complete scan.
+    /// Returns the start of a partial scan, in quarters of a degree (0 to 3). Returns `None` for a complete scan.
     pub fn partial(&self) -> Option<u8> {
         (self.count_word & PARTIAL_FLAG != 0).then_some((self.count_word >> 11) as u8 & 3)
     }
 
-    /// Returns the scan index and the telegram index, both modulo 256, if the scanner sends them.
+    /// Returns the scan index and the telegram index, both modulo 256. Returns `None` if the scanner does not send
+    /// them.
     pub fn indices(&self) -> Option<(u8, u8)> {
         self.indices
     }
@@ -83,12 +84,13 @@ impl<'a> MeasuredValues<'a> {
         mode.forbidden() != 0 && self.words().any(|word| word & mode.forbidden() != 0)
     }
 
-    /// Returns the scan, with its values split according to `mode`. Its stamps are 0.
+    /// Returns the scan. `mode` determines the range bits of a value. The stamps of the scan are 0.
     pub fn scan(&self, mode: Mode) -> RawScan<'a> {
         raw_scan(self.values, head(self.count(), self.unit(), self.partial(), mode), mode)
     }
 
-    /// Returns the words as sent: the range in the low bits, reflector level or field bits above (see [`Mode`]).
+    /// Returns the words as the scanner sent them. The low bits are the range, and the bits above are the reflector
+    /// level or field bits (see [`Mode`]).
     pub fn words(&self) -> impl ExactSizeIterator<Item = u16> + use<'a> {
         words(self.values)
     }
@@ -118,7 +120,7 @@ impl<'a> PartialValues<'a> {
         is_whole.then_some(PartialValues { count, unit, values })
     }
 
-    /// Returns the incomplete scan, with its values split according to `mode`. Its stamps are 0.
+    /// Returns the incomplete scan. `mode` determines the range bits of a value. The stamps of the scan are 0.
     pub(crate) fn scan(&self, mode: Mode) -> RawScan<'a> {
         raw_scan(self.values, head(self.count, self.unit, None, mode), mode)
     }
@@ -130,8 +132,7 @@ fn raw_scan(bytes: &[u8], head: ScanHead, mode: Mode) -> RawScan<'_> {
 }
 
 /// Returns the head of a scan of `count` values. Beams are in the order in which the scanner sends them:
-/// counterclockwise as seen from above, with the first one on the right. Their angles are counted from straight ahead
-/// (REP 103).
+/// counterclockwise as seen from above, and the first beam is on the right. Straight ahead is angle 0 (REP 103).
 fn head(count: usize, unit: Unit, partial: Option<u8>, mode: Mode) -> ScanHead {
     let variant = Variant::of_beams(count);
     // A partial scan has 180 or 181 beams, 1 degree apart.
@@ -146,16 +147,16 @@ fn head(count: usize, unit: Unit, partial: Option<u8>, mode: Mode) -> ScanHead {
     }
 }
 
-/// Returns the nominal time between two scans of `beams` values at `baud`, rounded down to microseconds, or 0 if no
-/// variant has this number of values.
+/// Returns the nominal time between two scans of `beams` values at `baud`, rounded down to microseconds. Returns 0 if
+/// no variant has `beams` values.
 pub fn nominal_period(beams: usize, baud: u32) -> Nanos {
     // In addition to the values, a telegram has 10 bytes: STX to count word, status and checksum.
     let period = |variant: Variant| variant.period(2 * variant.beams() + 10, baud);
     Variant::of_beams(beams).map_or(0, |variant| period(variant) / 1000 * 1000)
 }
 
-/// Encodes the measured-value telegram of a complete scan from the scanner at `address` (0 to 127), with at most 401
-/// `words` and the status byte.
+/// Encodes the measured-value telegram of a complete scan. `address` is the scanner's address (0 to 127), `words` has
+/// at most 401 elements, and `status` is the status byte.
 pub fn encode(address: u8, unit: Unit, words: &[u16], status: u8) -> EncodedTelegram {
     encode_with(address, ScanFrame { unit, partial: None, indices: None }, words, status)
 }
@@ -167,11 +168,11 @@ pub struct ScanFrame {
     pub unit: Unit,
     /// Start of a partial scan in quarters of a degree (0 to 3); `None` for a complete scan.
     pub partial: Option<u8>,
-    /// Scan index and telegram index; `None` if they are not sent.
+    /// Scan index and telegram index. `None` if the scanner does not send them.
     pub indices: Option<(u8, u8)>,
 }
 
-/// Encodes a measured-value telegram like [`encode`], but also partial scans and real-time indices.
+/// Encodes a measured-value telegram like [`encode`], but supports partial scans and real-time indices.
 pub fn encode_with(address: u8, frame: ScanFrame, words: &[u16], status: u8) -> EncodedTelegram {
     let partial = frame.partial.map_or(0, |quarter| PARTIAL_FLAG | u16::from(quarter & 3) << 11);
     let count_word = words.len() as u16 | partial | u16::from(frame.unit.code()) << 14;
@@ -190,7 +191,8 @@ pub(crate) const COUNT_MASK: u16 = 0x03FF;
 /// Bit of the count word that marks a partial scan.
 pub(crate) const PARTIAL_FLAG: u16 = 1 << 13;
 
-/// Data of a reply with more than one word per beam, whose counts match its length. Two real-time indices may follow.
+/// Data of a reply with more than one word per beam. The counts in the data match the length of the data. Two real-time
+/// indices may follow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Rows<'a>(&'a [u8]);
 

@@ -1,4 +1,5 @@
-//! Operating modes, which follow command byte 20h. Streaming, stopping and the baud rates are separate requests.
+//! Operating modes, which follow the command byte 20h. The requests to stream, to stop and to change the baud rate are
+//! not part of [`Operating`].
 
 use crate::lms::command::{Parameter, Password, RawParameters, SubRange, SubRanges, requests};
 use crate::lms::telegram::Writer;

@@ -1,7 +1,7 @@
 //! Protocol state of a session: it finds the scanner, starts its stream, monitors it, and stops it.
 //!
-//! It handles telegrams and deadlines; the session handles bytes. No request changes a setting that outlives a power
-//! cycle.
+//! It handles telegrams and deadlines. The session handles bytes. No request changes a setting that the scanner keeps
+//! after a power cycle.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -29,14 +29,14 @@ pub(crate) struct ProtocolState {
     pub(crate) sensor: Sensor,
     /// Identity that an earlier session saved. The first request discards it.
     restored_identity: Option<Identity>,
-    /// Reason why the session does not stream now. [`ProtocolState::problem`] also returns lasting problems.
+    /// Reason why the session does not stream now. [`ProtocolState::problem`] also returns problems that last longer.
     problem: Option<Problem>,
     /// Whether a user paused the session.
     is_paused: bool,
-    /// Whether the scanner keeps another variant than the requested one.
+    /// Whether the scanner keeps a variant that differs from the requested variant.
     variant_refused: bool,
-    /// Whether bytes have arrived since the last time at which the session started to listen, to stop the scanner, or
-    /// to search for another round.
+    /// Whether bytes have arrived since the session last started to listen, to stop the scanner, or to run a round of
+    /// the search.
     has_received: bool,
     /// Time of the last telegram, or of the start of the session.
     no_telegram_since: Nanos,
@@ -46,18 +46,19 @@ pub(crate) struct ProtocolState {
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// Waits for a stream without sending, while the reported state is `shown`. Then the session sends request number
-    /// `attempt` of the search: at `quiet_at` if no byte has arrived, otherwise at `deadline`.
+    /// Waits for a stream without sending. Meanwhile, the reported state is `shown`. Then the session sends request
+    /// number `attempt` of the search. It sends the request at `quiet_at` if no byte has arrived, and otherwise at
+    /// `deadline`.
     Listening { deadline: Nanos, quiet_at: Nanos, shown: State, attempt: usize },
-    /// Sends a request at one rate after the other.
+    /// Sends a request at each baud rate.
     Probing { attempt: usize },
-    /// Brings a scanner that receives requests to the stream.
+    /// Starts the stream of a scanner that receives requests.
     Starting(Start),
     /// Receives measured data.
     Streaming { header: StreamHeader, silent_at: Nanos, questions: Questions },
     /// Reads a recording.
     Replaying,
-    /// Has stopped the scanner. If a stream continues, `stops_left` further stops are sent.
+    /// Has stopped the scanner. If a stream continues, the session sends up to `stops_left` more stop requests.
     Paused { stops_left: u8 },
 }
 
@@ -101,7 +102,7 @@ impl ProtocolState {
         }
     }
 
-    /// Handles the port's refusal of a rate.
+    /// Handles the port's rejection of a rate.
     pub(crate) fn reject_rate(&mut self) {
         self.rate.reject();
     }
@@ -136,7 +137,8 @@ impl ProtocolState {
         }
     }
 
-    /// Returns the current problem, or otherwise a lasting one. During a pause, lasting problems do not matter.
+    /// Returns the current problem. Without one, returns a problem that lasts longer. During a pause, such a problem is
+    /// irrelevant.
     pub(crate) fn problem(&self) -> Option<Problem> {
         if self.is_paused {
             return self.problem;
@@ -145,7 +147,7 @@ impl ProtocolState {
         let no_ranges = self.sensor.mode.filter(|mode| !mode.has_ranges()).map(Problem::NoRanges);
         let variant_refused = self.variant_refused.then_some(Problem::VariantRefused);
         let needs_rs422 = self.rate.problem();
-        // A lost scanner is the cause of all other problems.
+        // If the scanner was lost after a switch, this is the cause of all other problems.
         let main_problem = needs_rs422.filter(|_| self.rate.has_lost_scanner()).or(self.problem);
         main_problem.or(has_other_angles).or(no_ranges).or(needs_rs422).or(variant_refused)
     }
@@ -160,7 +162,7 @@ impl ProtocolState {
         let Some(open) = &mut self.open_request else { return };
         open.on_byte_sent(now, self.rate.baud);
         if self.settings.fixed_rate {
-            // A network may deliver a complete reply in one read.
+            // A network may deliver the complete reply in one read, so its arrival does not extend the deadline.
             open.on_byte(self.rate.baud);
         }
     }
@@ -176,8 +178,8 @@ impl ProtocolState {
         }
     }
 
-    /// Returns the time at which the protocol must act without a byte: the end of its phase, the timeout of a reply, or
-    /// the earliest time of the next byte of a request.
+    /// Returns the time at which the protocol must act even if no byte arrives: the end of its phase, the timeout of a
+    /// reply, or the earliest time of a request's next byte.
     pub(crate) fn deadline(&self) -> Nanos {
         let phase_ends_at = match self.phase {
             Phase::Listening { deadline: give_up_at, .. } if self.has_received => give_up_at,
@@ -202,7 +204,8 @@ impl ProtocolState {
                 self.resyncs += 1;
                 self.problem = Some(Problem::Silence);
                 self.sensor.reset_identity();
-                // The cable may be connected again before the power, so search first at the rate of the stream.
+                // The cable may be connected again although the power was on, so search first at the rate of the
+                // stream.
                 self.rate.expect_target();
                 return self.listen(now, State::Silent);
             }
@@ -228,8 +231,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a NAK. It is ignored during a search and while a stream is being stopped, because the rest of a scan, or
-    /// a stream at another rate, contains such bytes. Only the timeout counts then.
+    /// Handles a NAK. Ignores it during a search and while a stream is being stopped. The rest of a scan, or a stream
+    /// at another rate, contains bytes that look like a NAK. Only the timeout counts then.
     pub(crate) fn on_nak(&mut self, now: Nanos) {
         let is_credible = !matches!(self.phase, Phase::Probing { .. }) && !self.sensor.streams;
         if is_credible && self.open_request.as_ref().is_some_and(PendingRequest::is_sent) {
@@ -237,8 +240,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a telegram whose first byte arrived at `first`. It counts as the reply to the open request even if it
-    /// has no decoded `reply`. `is_line_damaged`: the line has damaged telegrams recently.
+    /// Handles a telegram whose first byte arrived at `first`. The telegram counts as the reply to the open request
+    /// even if `reply` is `None`. `is_line_damaged` is whether the line has recently damaged telegrams.
     pub(crate) fn on_telegram(
         &mut self,
         telegram: Telegram<'_>,
@@ -248,7 +251,7 @@ impl ProtocolState {
         now: Nanos,
     ) {
         self.no_telegram_since = now;
-        // A lost scanner needs a power cycle. That restart is not a sign of a weak power supply.
+        // A lost scanner needs a power cycle. The restart is then not a sign of a weak power supply.
         let is_expected_restart = self.rate.has_lost_scanner();
         self.rate.note_telegram();
         self.sensor.set_line_damaged(is_line_damaged);
@@ -272,7 +275,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles data that the scanner sends without a request. `measured` is its decoded form if it is a complete scan.
+    /// Handles data that the scanner sends without a request. `measured` contains the decoded data if they are a
+    /// complete scan.
     fn on_data(
         &mut self,
         telegram: Telegram<'_>,
@@ -327,8 +331,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles the boot message. The scanner lost power or was reset, so its settings are lost. It receives requests at
-    /// the current rate.
+    /// Handles the boot message. The scanner lost power or was reset, so it has lost its settings. It receives requests
+    /// at the current rate.
     fn on_power_on(&mut self, now: Nanos) {
         match self.phase {
             Phase::Replaying => {}
@@ -347,7 +351,8 @@ impl ProtocolState {
 
     /// Handles the reply to `request`.
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
-        // A scanner that does not report its state may be streaming, so it is stopped, a limited number of times.
+        // A scanner that does not report its state may be streaming. The session therefore stops it, a limited number
+        // of times.
         self.sensor.streams |= request == Request::Status && !matches!(reply, Some(Reply::Status(_)));
         match self.phase {
             Phase::Probing { .. } if self.is_paused => self.stop(now),
@@ -357,8 +362,8 @@ impl ProtocolState {
                 self.restarts.note_found(self.rate.baud, is_idle);
                 self.problem.take_if(|trouble| matches!(trouble, Problem::NoReply { .. } | Problem::Silence));
                 if request == Request::Type {
-                    // The line was silent before the request, so the scanner does not stream. The status is requested
-                    // at the target rate.
+                    // The line was silent before the request, so the scanner does not stream. The session requests the
+                    // status at the target rate.
                     self.sensor.streams = false;
                 }
                 self.proceed(Start::CHECK.after_reply(request, reply.as_ref()), now);
@@ -376,12 +381,12 @@ impl ProtocolState {
         }
     }
 
-    /// Handles the missing reply to the open request: sends the request again, not before `not_before`, or continues
-    /// without it.
+    /// Handles the missing reply to the open request. Sends the request again, not before `not_before`, or continues
+    /// without a reply.
     fn retry(&mut self, not_before: Nanos) {
         let Some(pending) = &mut self.open_request else { return };
         let request = pending.request;
-        // A mode change may have been executed. Check the state instead of repeating the request.
+        // The scanner may have executed a mode change. Check the state instead of repeating the request.
         let is_acknowledged = pending.reply() == MODE_REPLY && pending.is_acknowledged;
         if !is_acknowledged && pending.retry(not_before) {
             return;
@@ -395,17 +400,17 @@ impl ProtocolState {
         }
     }
 
-    /// Sends `request` instead of the open one, not before `not_before`, at most `tries` times.
+    /// Replaces the open request with `request`. Sends it not before `not_before`, and at most `tries` times.
     fn send_request(&mut self, request: Request, not_before: Nanos, tries: u8) {
         self.restored_identity = None;
         let address = self.sensor.address.map_or(0, |address| address & !REPLY);
-        // The scanner must drop a partial request first.
+        // The scanner must first discard a partly sent request.
         let is_partial = self.open_request.as_ref().is_some_and(PendingRequest::is_partly_sent);
         let not_before = if is_partial { not_before + PARTIAL_REQUEST_TIMEOUT } else { not_before };
         self.open_request = Some(PendingRequest::new(request, address, not_before, tries));
     }
 
-    /// Begins like a new session: listens at the target rate and sends nothing.
+    /// Starts like a new session: listens at the target rate and sends nothing.
     fn begin(&mut self, now: Nanos) {
         let was_paused = core::mem::take(&mut self.is_paused);
         if was_paused {
@@ -419,7 +424,7 @@ impl ProtocolState {
         self.listen(now, State::Probing);
     }
 
-    /// Begins at `baud`, at which the port is open and a search has found the scanner.
+    /// Starts at `baud`. The port is open at this rate, and a search has found the scanner at this rate.
     pub(crate) fn begin_at(&mut self, baud: Baud, now: Nanos) {
         self.rate.begin_at(baud);
         self.listen(now, State::Probing);
@@ -430,17 +435,17 @@ impl ProtocolState {
         self.open_request = None;
         self.has_received = false;
         let give_up_at = now + LISTEN_TIME.max(2 * self.scan_period());
-        // An interrupted stream may continue, and bytes from a network arrive in bursts, so a short silence does not
+        // An interrupted stream may continue, and bytes from a network arrive in bursts. A short silence then does not
         // prove that there is no stream.
         let may_pause = shown == State::Silent || self.settings.fixed_rate;
         let quiet_at = if may_pause { give_up_at } else { now + QUIET_TIME };
         self.phase = Phase::Listening { deadline: give_up_at, quiet_at, shown, attempt: 0 };
     }
 
-    /// Sends request number `attempt` of the search. It requests the status. On a silent line at a rate other than the
-    /// target rate, it requests the type instead, because the 160 bytes of a status take 0.17 s at 9,600 baud. The
-    /// status is then requested after the change of the rate. Every other round always requests the status, because
-    /// some scanners do not report their type.
+    /// Sends request number `attempt` of the search, which normally requests the status. On a silent line at a rate
+    /// other than the target rate, it requests the type instead, because the 160 bytes of a status take 0.17 s at 9,600
+    /// baud. The session then requests the status after the change of the rate. Every other round always requests the
+    /// status, because some scanners do not report their type.
     fn probe(&mut self, now: Nanos, attempt: usize) {
         self.phase = Phase::Probing { attempt };
         // The next reply may come from another scanner. Address 0 reaches every scanner.
@@ -458,8 +463,9 @@ impl ProtocolState {
         }
     }
 
-    /// Continues the search after `attempt` got no reply. After a round without a single byte, the session pauses at
-    /// the rate of the boot message, which a scanner sends up to a minute after power-on (Telegram listing 7.1).
+    /// Continues the search after request number `attempt` got no reply. After a round without a single byte, the
+    /// session pauses at the rate of the boot message. A scanner sends this message up to a minute after power-on
+    /// (Telegram listing 7.1).
     fn continue_search(&mut self, attempt: usize, now: Nanos) {
         let next = attempt + 1;
         if !next.is_multiple_of(SEARCH_ORDER.len()) {
@@ -501,7 +507,7 @@ impl ProtocolState {
         self.send_request(request, now, tries);
     }
 
-    /// Handles the `reply` to `request`, which was sent for the step of `start`.
+    /// Handles the `reply` to `request`, which belongs to the step of `start`.
     fn on_step(&mut self, start: Start, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
         let is_refused = matches!(reply, Some(Reply::Refused | Reply::Mode { done: false }));
         let is_done = matches!(reply, Some(Reply::Variant { done: true, .. }));
@@ -529,7 +535,7 @@ impl ProtocolState {
                 }
                 self.enter_step(start.next_setting(&self.sensor, self.settings.variant), now);
             }
-            // The stream begins with its first telegram. Until then, the timeout is that of a stream.
+            // The stream begins with its first telegram. Until then, the timeout is the timeout of a stream.
             Step::Stream => {
                 let until = self.silence_deadline(now);
                 self.phase =
@@ -538,8 +544,8 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a missing reply to `request`, which was sent for the step of `start`: it had no reply in all its tries,
-    /// or the scanner acknowledged it but did not report the result.
+    /// Handles a missing reply to `request`, which belongs to the step of `start`. Either no try got a reply, or the
+    /// scanner acknowledged the request but did not report the result.
     fn on_no_reply(&mut self, start: Start, request: Request, is_acknowledged: bool, at: Nanos) {
         let is_optional = match start.step {
             Step::Variant => {
@@ -551,7 +557,7 @@ impl ProtocolState {
             Step::Check | Step::Baud => false,
         };
         if is_optional {
-            // The scanner may be unavailable. Check that with few tries.
+            // The scanner may be unavailable. Check this with few tries.
             self.phase = Phase::Starting(start.with_check());
             return self.send_request(Request::Status, at, TRIES);
         }
@@ -561,7 +567,8 @@ impl ProtocolState {
         self.probe(at, 0);
     }
 
-    /// Returns whether a stream has the requested beams. A stream of a scanner that refused them is accepted as it is.
+    /// Returns whether a stream has the requested number of beams. Also returns `true` if the scanner refused this
+    /// number.
     fn is_requested(&self, measured: MeasuredValues<'_>) -> bool {
         measured.count() == self.settings.variant.beams() || self.variant_refused
     }
@@ -572,13 +579,13 @@ impl ProtocolState {
         variant.period(2 * variant.beams() + OVERHEAD_BYTES, self.rate.target.rate())
     }
 
-    /// Returns the time at which a stream without further data counts as silent: after a second, or on a slow line
-    /// after two and a half telegram periods.
+    /// Returns the time at which the stream counts as silent if no more data arrive. It is one second from `now`, or on
+    /// a slow line two and a half telegram periods.
     fn silence_deadline(&self, now: Nanos) -> Nanos {
         now + SILENCE_TIMEOUT.max(5 * self.scan_period() / 2)
     }
 
-    /// Starts streaming with the first measured data, and accepts their settings as they are.
+    /// Starts to stream with the first measured data. Accepts the settings that these data show.
     fn begin_stream(&mut self, telegram: Telegram<'_>, measured: Option<MeasuredValues<'_>>, now: Nanos) {
         let Some(&header) = telegram.bytes().first_chunk::<{ size_of::<StreamHeader>() }>() else { return };
         let is_requested = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
@@ -590,8 +597,8 @@ impl ProtocolState {
         self.sensor.streams = true;
         self.restarts.streamed_at = Some(self.rate.baud);
         let silent_at = self.silence_deadline(now);
-        // The reply to a complete request may still arrive. The scanner must drop a partial request before the next
-        // one.
+        // The reply to a completely sent request may still arrive. The scanner must discard a partly sent request
+        // before the next request.
         let unsent_request = self.open_request.take_if(|open| !open.is_sent());
         let first_request_at = if unsent_request.is_some_and(|open| open.is_partly_sent()) {
             now + PARTIAL_REQUEST_TIMEOUT
@@ -602,8 +609,8 @@ impl ProtocolState {
         self.send_question(now);
     }
 
-    /// Sends the next of the [`Questions`] right after a scan. A reply costs the scan that it interrupts, so there is
-    /// at most one request per scan.
+    /// Sends the next of the [`Questions`] right after a scan. A reply costs the scan that it interrupts, so the
+    /// session sends at most one request per scan.
     fn send_question(&mut self, now: Nanos) {
         let Phase::Streaming { questions, .. } = &mut self.phase else { return };
         if self.open_request.is_some() {
@@ -620,8 +627,9 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a request of a user. A pause stops the scanner, after a search for it if necessary. In the end, the
-    /// session reports that the scanner has stopped, or that this is unknown.
+    /// Handles a request of a user. A pause stops the scanner. If the baud rate is unknown, the session first searches
+    /// for the scanner. Finally, the session reports that the scanner has stopped, or that it does not know whether the
+    /// scanner has stopped.
     pub(crate) fn control(&mut self, control: Control, now: Nanos) {
         match (control, self.phase) {
             (_, Phase::Replaying) => {}
@@ -653,7 +661,7 @@ impl ProtocolState {
         self.send_request(Request::Stop, now, TRIES);
     }
 
-    /// Stops the scanner again if bytes have arrived since the last stop, because the stream may continue.
+    /// Stops the scanner again if bytes have arrived since the last stop request, because the stream may continue.
     fn repeat_stop(&mut self, now: Nanos) {
         match self.phase {
             // The line is silent, so the scanner has stopped or is not connected.
@@ -672,30 +680,31 @@ impl ProtocolState {
 #[derive(Clone, Copy, Debug, Default)]
 struct Restarts {
     count: u64,
-    /// Whether a telegram has arrived since the session began or since the last boot message. Otherwise, a boot message
-    /// is the first contact or a copy of the last one.
+    /// Whether a telegram has arrived since the start of the session or since the last boot message. If not, a boot
+    /// message is the first contact with the scanner, or a copy of the last boot message.
     is_in_contact: bool,
-    /// Rate of the last stream, until a request stops it or the scanner is found again.
+    /// Baud rate of the last stream. `None` after a request has stopped the stream, or after a search has found the
+    /// scanner again.
     streamed_at: Option<Baud>,
 }
 
 impl Restarts {
-    /// Records a boot message. An expected restart is not counted.
+    /// Records a boot message. Counts a restart, unless it `is_expected`.
     fn note_boot_message(&mut self, is_expected: bool) {
         let is_restart = core::mem::take(&mut self.is_in_contact) && !is_expected;
         self.count += u64::from(is_restart);
         self.streamed_at = None;
     }
 
-    /// Records that the scanner was found at `baud`. If it streamed, no request stopped it, and it now has another rate
-    /// or `is_idle`, it has restarted and its boot message was lost.
+    /// Records that a search found the scanner at `baud`. A scanner that streamed, and that no request has stopped, has
+    /// restarted if it now has another rate or `is_idle`. Its boot message was then lost.
     fn note_found(&mut self, baud: Baud, is_idle: bool) {
         let has_restarted = self.streamed_at.take().is_some_and(|old_rate| old_rate != baud || is_idle);
         self.count += u64::from(has_restarted);
     }
 }
 
-/// Rounds seconds down to coarse steps for messages, so that a message does not change every second.
+/// Rounds seconds down to coarse steps, so that a message does not change every second.
 fn round_down_seconds(seconds: u64) -> u32 {
     const HOUR_SECONDS: u32 = 3_600;
     const STEP_SECONDS: [u32; 9] = [1, 3, 10, 30, 60, 300, 600, 1_800, HOUR_SECONDS];
@@ -705,26 +714,28 @@ fn round_down_seconds(seconds: u64) -> u32 {
 
 /// Command byte of the reply to a change of mode or rate.
 const MODE_REPLY: u8 = MODE | REPLY;
-/// Time to listen for a stream: more than two scans of the slowest variant. On a line that is slower than the scans,
-/// the session listens longer.
+/// Time for which the session listens for a stream. It is longer than two scans of the slowest variant. On a line that
+/// is slower than the scans, the session listens longer.
 pub(crate) const LISTEN_TIME: Nanos = 120 * MILLIS;
-/// Silence after which a line is known to carry no stream of complete scans: two telegram times of the usual variant.
-/// The slowest variant begins a scan every 53 ms and has bytes on the line for at least a third of that.
+/// Silence after which a line carries no stream of complete scans. It is the duration of two telegrams of the usual
+/// variant. The slowest variant begins a scan every 53 ms, and its bytes are on the line for at least a third of this
+/// time.
 const QUIET_TIME: Nanos = 55 * MILLIS;
 /// Time without measured data after which the session restarts (paper: resynchronize after one second).
 pub const SILENCE_TIMEOUT: Nanos = 1_000 * MILLIS;
 /// Pause after a refusal, before the search begins.
 const REFUSAL_PAUSE: Nanos = 500 * MILLIS;
-/// Time after a request at which the beginning of a complete scan shows that the scanner overlooked the request, which
-/// would have interrupted the stream. It allows for bytes that an adapter still buffers.
+/// If a complete scan begins this long after a request, the scanner overlooked the request, because a reply would have
+/// interrupted the stream. The time also covers bytes that an adapter still buffers.
 const OVERLOOK_TIME: Nanos = 25 * MILLIS;
-/// Pauses before the next round of the search, by the number of completed rounds.
+/// Pauses before the next round of the search. The index is the number of completed rounds.
 const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
-/// Number of rounds of the search for a scanner that must stop: one short and one patient round.
+/// Number of rounds of the search for a scanner that must stop: one round with short timeouts and one round with long
+/// timeouts.
 const STOP_SEARCH_ROUNDS: usize = 2;
 /// Additional time for the reply in every other round, so that a slow scanner is found too.
 const EXTRA_REPLY_TIME: Nanos = 250 * MILLIS;
-/// Number of bytes of a telegram other than its values: STX to count word, status and checksum.
+/// Number of bytes of a telegram in addition to its values: STX to count word, status and checksum.
 const OVERHEAD_BYTES: usize = 10;
 
 #[cfg(test)]

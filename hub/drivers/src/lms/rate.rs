@@ -1,14 +1,14 @@
-//! Baud rate of the line: the target rate for the stream, and the order in which the search for a scanner tries the
-//! others.
+//! Baud rate of the line. It consists of the target rate for the stream, and the order in which the search tries the
+//! other rates.
 //!
-//! A line such as RS-232 cannot carry 500,000 baud. On it, the scanner acknowledges the switch to that rate and is then
-//! unreachable until its power is cycled. After [`MAX_SILENT_SWITCHES`] such switches in a row, a session with an
-//! automatic rate streams at 38,400 baud, the highest rate of RS-232. The count outlives boot messages, sessions and
-//! runs of the hub, because the power of a scanner is often cycled together with that of its host.
+//! A line such as RS-232 cannot carry 500,000 baud. On this line, the scanner acknowledges the switch to 500,000 baud
+//! and is then unreachable until a power cycle. After [`MAX_SILENT_SWITCHES`] consecutive switches with this result, a
+//! session with an automatic rate streams at 38,400 baud, the highest rate of RS-232. The count survives boot messages,
+//! sessions and runs of the hub, because the scanner's power is often cycled together with the host's power.
 //!
-//! The port may not support 500,000 baud either. For a link with a configured LMS, opening the port at that rate fails.
-//! If a search has found the scanner at another rate, the session therefore sets the port to 500,000 baud for a moment
-//! before it switches the scanner.
+//! The port may not support 500,000 baud either. On a link with a configured LMS, the port then fails to open at this
+//! rate. If a search has found the scanner at another rate, the session therefore sets the port to 500,000 baud for a
+//! moment before it switches the scanner.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -27,9 +27,9 @@ pub(crate) struct LineRate {
     is_fixed: bool,
     /// Rate for the stream.
     pub(crate) target: Baud,
-    /// Rate for the stream if the line can carry it.
+    /// Rate for the stream, if the line can carry this rate.
     preferred: Baud,
-    /// Whether the preferred rate is kept even if the line cannot carry it.
+    /// Whether the session keeps the preferred rate even if the line cannot carry it.
     is_preferred_forced: bool,
     /// Most likely rate of a scanner that does not stream when a session begins.
     idle_rate: Baud,
@@ -88,7 +88,7 @@ impl LineRate {
         core::mem::take(&mut self.needs_change).then_some(self.baud)
     }
 
-    /// Handles the port's refusal of the rate that [`LineRate::take_change`] returned.
+    /// Handles the port's rejection of the rate that [`LineRate::take_change`] returned.
     pub(crate) fn reject(&mut self) {
         if self.trial == Trial::Running {
             (self.trial, self.target, self.needs_change) = (Trial::Failed, RS232_BAUD, true);
@@ -102,7 +102,7 @@ impl LineRate {
         }
     }
 
-    /// Starts at `baud`, at which the port is open and a search has found the scanner.
+    /// Starts at `baud`. The port is open at this rate, and a search has found the scanner at this rate.
     pub(crate) fn begin_at(&mut self, baud: Baud) {
         (self.idle_rate, self.first_tried) = (baud, baud);
         (self.baud, self.needs_change) = (baud, false);
@@ -111,8 +111,8 @@ impl LineRate {
         }
     }
 
-    /// Starts at the target rate. If no stream arrives, the search first tries the target rate if the scanner was
-    /// stopped there (`is_stopped`), otherwise the most likely rate.
+    /// Starts at the target rate. If no stream arrives, the search first tries the most likely rate. If the scanner was
+    /// stopped at the target rate (`is_stopped`), the search first tries the target rate.
     pub(crate) fn begin(&mut self, is_stopped: bool) {
         self.first_tried = if is_stopped { self.target } else { self.idle_rate };
         self.set(self.target);
@@ -123,8 +123,8 @@ impl LineRate {
         self.first_tried = self.target;
     }
 
-    /// Returns the rate at `position` in a round of the search: first the most likely rate, then the target rate, then
-    /// the others.
+    /// Returns the rate at `position` in a round of the search. The order is the most likely rate, the target rate, and
+    /// the other rates.
     pub(crate) fn nth_rate(&self, position: usize) -> Baud {
         let (first, target) = (self.first_tried, self.target);
         let second = (first != target).then_some(target);
@@ -154,7 +154,7 @@ impl LineRate {
         }
     }
 
-    /// Records that a request got no reply in all its tries.
+    /// Records that no try of a request got a reply.
     pub(crate) fn note_no_reply(&mut self) {
         if self.baud == FAST_BAUD {
             self.fast_switches.note_no_reply();
@@ -175,19 +175,19 @@ impl LineRate {
         self.limit_to_rs232()
     }
 
-    /// Returns the number of silent switches to 500,000 baud in a row, at most [`MAX_SILENT_SWITCHES`].
+    /// Returns the number of consecutive silent switches to 500,000 baud, at most [`MAX_SILENT_SWITCHES`].
     pub(crate) fn silent_switches(&self) -> u8 {
         self.fast_switches.silent_switches
     }
 
     /// Returns the rate that the next session should try first, and the number of silent switches. If the line cannot
-    /// carry 500,000 baud, it is the rate in use. Returns `None` if there was no search.
+    /// carry 500,000 baud, this rate is the rate in use. Returns `None` if there was no search.
     pub(crate) fn known(&self) -> Option<KnownRate> {
         let baud = self.replacement().or(self.found_at)?;
         Some(KnownRate { baud: baud.rate(), silent_switches: self.silent_switches() })
     }
 
-    /// Returns whether the scanner has been silent since a switch and therefore needs a power cycle.
+    /// Returns whether the scanner has been silent since a switch, so that it needs a power cycle.
     pub(crate) fn has_lost_scanner(&self) -> bool {
         self.fast_switches.have_lost()
     }
@@ -201,19 +201,19 @@ impl LineRate {
         has_failed.then(|| Problem::NeedsRs422 { fallback: self.replacement() })
     }
 
-    /// Returns the rate that is used instead of the requested one if the line or the port does not support that one.
+    /// Returns the rate that replaces the requested rate if the line or the port does not support the requested rate.
     fn replacement(&self) -> Option<Baud> {
         Some(self.target).filter(|&baud| baud != self.preferred)
     }
 
-    /// Makes [`known`](Self::known) return a rate even without a search, so that the number of silent switches is
-    /// saved.
+    /// Makes [`known`](Self::known) return a rate even without a search, so that the next session gets the number of
+    /// silent switches.
     fn save_count(&mut self) {
         self.found_at = self.found_at.or(Some(self.idle_rate));
     }
 
-    /// Replaces the target rate of 500,000 baud by 38,400 baud if the line cannot carry it. Returns whether the target
-    /// changed.
+    /// Replaces a target rate of 500,000 baud with 38,400 baud if the line cannot carry 500,000 baud. Returns whether
+    /// the target rate changed.
     fn limit_to_rs232(&mut self) -> bool {
         let is_limited =
             self.fast_switches.have_failed() && self.target == FAST_BAUD && !self.is_preferred_forced;
@@ -224,15 +224,15 @@ impl LineRate {
     }
 }
 
-/// Counts switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
+/// Counter of switches to 500,000 baud that the scanner acknowledged and after which the line was silent.
 #[derive(Clone, Copy, Debug, Default)]
 struct FastSwitches {
-    /// Number of silent switches in a row.
+    /// Number of consecutive silent switches.
     silent_switches: u8,
-    /// Whether the scanner acknowledged a switch and no telegram has arrived at the new rate yet.
+    /// Whether the scanner acknowledged a switch, but no telegram has arrived at the new rate yet.
     is_pending: bool,
-    /// Whether the last switch was followed by silence and no telegram has arrived at any rate since. The scanner may
-    /// need a power cycle.
+    /// Whether the line was silent after the last switch, and no telegram has arrived at any rate since then. The
+    /// scanner may need a power cycle.
     is_lost: bool,
 }
 
@@ -242,8 +242,8 @@ impl FastSwitches {
         self.is_pending = true;
     }
 
-    /// Records the arrival of a telegram. At 500,000 baud (`is_fast`), it proves that the line can carry that rate.
-    /// Returns whether the number of silent switches changed.
+    /// Records the arrival of a telegram. A telegram at 500,000 baud (`is_fast`) proves that the line can carry this
+    /// rate. Returns whether the number of silent switches changed.
     fn receive(&mut self, is_fast: bool) -> bool {
         self.is_lost = false;
         if is_fast {
@@ -253,7 +253,7 @@ impl FastSwitches {
         false
     }
 
-    /// Records that a request got no reply in all its tries.
+    /// Records that no try of a request got a reply.
     fn note_no_reply(&mut self) {
         if core::mem::take(&mut self.is_pending) {
             self.silent_switches = self.silent_switches.saturating_add(1).min(MAX_SILENT_SWITCHES);
@@ -261,18 +261,19 @@ impl FastSwitches {
         }
     }
 
-    /// Returns whether the line is treated as unable to carry 500,000 baud.
+    /// Returns whether the session assumes that the line cannot carry 500,000 baud.
     fn have_failed(self) -> bool {
         self.silent_switches >= MAX_SILENT_SWITCHES
     }
 
-    /// Returns whether the last silent switch lost the scanner and the line is treated as unable to carry 500,000 baud.
+    /// Returns whether the last silent switch lost the scanner, and the session assumes that the line cannot carry
+    /// 500,000 baud.
     fn have_lost(self) -> bool {
         self.have_failed() && self.is_lost
     }
 }
 
-/// Number of silent switches after which the line is treated as unable to carry 500,000 baud.
+/// Number of silent switches after which the session assumes that the line cannot carry 500,000 baud.
 const MAX_SILENT_SWITCHES: u8 = 2;
 /// Baud rate that needs RS-422.
 const FAST_BAUD: Baud = Baud::B500000;
@@ -280,7 +281,8 @@ const FAST_BAUD: Baud = Baud::B500000;
 const RS232_BAUD: Baud = Baud::B38400;
 /// Baud rate of a scanner after power-on, unless its EEPROM contains another one.
 pub(crate) const POWER_ON_BAUD: Baud = Baud::B9600;
-/// Baud rates in the order of a search, the most likely ones first: after power-on, after a hub, the others.
+/// Baud rates in the order of a search, the most likely rates first: the rate after power-on, the rate that a hub
+/// leaves behind, and the other rates.
 pub(crate) const SEARCH_ORDER: [Baud; 4] = [Baud::B9600, Baud::B500000, Baud::B38400, Baud::B19200];
 /// Pause after a change of the baud rate, for the UARTs of scanner and adapter.
 pub(crate) const SETTLE_TIME: Nanos = 20 * MILLIS;

@@ -1,5 +1,5 @@
-//! Replies of a scanner: to requests, and without a request in a stream and after power-on. Every reply ends with a
-//! status byte, see [`crate::lms::status::StatusByte`].
+//! Replies of a scanner. A scanner also sends some of them without a request, in a stream and after power-on. Every
+//! reply ends with a status byte, see [`crate::lms::status::StatusByte`].
 
 use crate::lms::command as request;
 use crate::lms::command::{Parameter as _, SubRange};
@@ -19,11 +19,11 @@ pub enum Reply<'a> {
     PowerOn(&'a [u8]),
     /// 91h: the reset begins. 90h follows within 60 s.
     Reset,
-    /// 92h: the command is well-formed, but the scanner cannot execute it, or not now.
+    /// 92h: the command is well-formed, but the scanner cannot execute it, or cannot execute it now.
     Refused,
     /// A0h: result of a change of the operating mode or of the baud rate.
     Mode {
-        /// Whether it was changed.
+        /// Whether the scanner changed it.
         done: bool,
     },
     /// B0h: a scan, on request or in a stream.
@@ -41,7 +41,7 @@ pub enum Reply<'a> {
     },
     /// B6h: mean values.
     Means {
-        /// Number of averaged scans.
+        /// Number of scans over which the values are averaged.
         scans: u8,
         /// The values.
         values: MeasuredValues<'a>,
@@ -68,7 +68,7 @@ pub enum Reply<'a> {
     RangeFields(Rows<'a>),
     /// BFh: mean values of a sub-range.
     RangeMeans {
-        /// Number of averaged scans.
+        /// Number of scans over which the values are averaged.
         scans: u8,
         /// Indices of the values.
         span: SubRange,
@@ -79,7 +79,7 @@ pub enum Reply<'a> {
     Reflectivity(Rows<'a>),
     /// E6h: result of a change of the baud rate after power-on.
     PowerOnSet {
-        /// Result code. [`StatusReport::has_permanent_baud`] has the present state.
+        /// Result code. [`StatusReport::has_permanent_baud`] returns the present state.
         outcome: u8,
         /// The byte that was set.
         set: u8,
@@ -90,7 +90,7 @@ pub enum Reply<'a> {
     Reflectivities(Rows<'a>),
     /// F7h: result of writing the first part of the configuration.
     ConfigurationWritten {
-        /// Whether it was changed.
+        /// Whether the scanner changed the configuration.
         done: bool,
         /// The configuration in effect.
         configuration: Configuration<'a>,
@@ -99,12 +99,12 @@ pub enum Reply<'a> {
     Configuration2(&'a [u8]),
     /// FCh: result of writing the second part of the configuration.
     Configuration2Written {
-        /// Whether it was changed.
+        /// Whether the scanner changed the configuration.
         done: bool,
         /// The bytes in effect.
         parameters: &'a [u8],
     },
-    /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h, whose layout is not known here.
+    /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h. This module does not know their layout.
     Undecoded {
         /// The command byte.
         command: u8,
@@ -114,8 +114,8 @@ pub enum Reply<'a> {
 }
 
 impl<'a> Reply<'a> {
-    /// Returns the measuring mode in the reply. `Some(None)` for the boot message: the mode of earlier replies is no
-    /// longer valid.
+    /// Returns the measuring mode in the reply. Returns `Some(None)` for the boot message, because the mode in earlier
+    /// replies is no longer valid.
     pub fn mode(&self) -> Option<Option<Mode>> {
         match self {
             Reply::Configuration(configuration) => Some(Some(configuration.mode())),
@@ -125,8 +125,8 @@ impl<'a> Reply<'a> {
         }
     }
 
-    /// Decodes `telegram`. Returns `None` for a request, an unknown command, or data that do not match the command's
-    /// layout.
+    /// Decodes `telegram`. Returns `None` if it is a request, if its command is unknown, or if its data do not match
+    /// the command's layout.
     pub fn decode(telegram: Telegram<'a>) -> Option<Reply<'a>> {
         if !telegram.is_reply() || telegram.status().is_none() {
             return None;
@@ -178,8 +178,8 @@ impl<'a> Reply<'a> {
         })
     }
 
-    /// Encodes the reply of the scanner at `address`, with `status` as its status byte. Returns `None` if it exceeds
-    /// the maximum length of a telegram. Names are padded with spaces to their 21 characters.
+    /// Encodes the reply of the scanner at `address`, with `status` as the status byte. Returns `None` if the reply
+    /// exceeds the maximum length of a telegram. Names are padded with spaces to 21 characters.
     pub fn encode(&self, address: u8, status: u8) -> Option<EncodedTelegram> {
         let writer = Writer::new(address | REPLY, self.command());
         let writer = match *self {
@@ -304,7 +304,7 @@ const REFLECTIVITIES: u8 = request::REFLECTIVITIES | REPLY;
 const CONFIGURATION_WRITTEN: u8 = 0xF7;
 const CONFIGURATION_2: u8 = request::CONFIGURATION_2 | REPLY;
 const CONFIGURATION_2_WRITTEN: u8 = 0xFC;
-/// Command bytes of replies whose layout is not known here.
+/// Command bytes of replies whose layout this module does not know.
 const UNDECODED_COMMANDS: [u8; 8] = [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6];
-/// Number of characters of model, number and firmware.
+/// Number of characters of the text with model, number and firmware.
 const NAME_LEN: usize = 21;

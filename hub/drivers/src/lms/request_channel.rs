@@ -1,5 +1,5 @@
-//! Sender of requests with their timeouts and retries. [`crate::lms::inquiry`] and a change of the configuration use
-//! [`RequestChannel`]. A session has its own framer and uses only `PendingRequest`.
+//! Sends requests, and handles their timeouts and retries. [`crate::lms::inquiry`] and a change of the configuration
+//! use [`RequestChannel`]. A session has its own framer and uses only `PendingRequest`.
 //!
 //! The scanner requires at least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror
 //! rotates (Telegram listing 4.3). A request is therefore sent byte by byte.
@@ -21,7 +21,7 @@ pub struct RequestChannel<R> {
     change_baud: bool,
     /// Baud rate of the port.
     pub baud: Baud,
-    /// Time of the last call that had a time.
+    /// Time of the last call with a parameter `now`.
     pub now: Nanos,
     last_byte: Nanos,
     /// Address of the scanner, or 0 for all scanners while it is unknown.
@@ -69,8 +69,8 @@ impl<R: EncodeRequest> RequestChannel<R> {
     }
 
     /// Restarts the request if its next byte is late, like
-    /// [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). The gaps on the line of a serial server
-    /// are not known, so its requests are not restarted.
+    /// [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). The channel does not restart requests to
+    /// a serial server, because it does not know the gaps on the line of the server.
     pub fn restart_if_late(&mut self, now: Nanos) -> bool {
         self.now = now;
         !self.is_behind_server
@@ -100,7 +100,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
         self.open_request = Some(PendingRequest::new(request, self.address, not_before, tries));
     }
 
-    /// Sends the open request again, not before `not_before`. Returns whether there is one with a try left.
+    /// Sends the open request again, not before `not_before`. Returns whether a request was open and had a try left.
     pub fn retry(&mut self, not_before: Nanos) -> bool {
         let has_try = self.open_request.as_mut().is_some_and(|open| open.retry(not_before));
         if !has_try {
@@ -109,7 +109,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
         has_try
     }
 
-    /// Handles a NAK. Returns whether the request will be sent again, or `None` if no request was sent.
+    /// Handles a NAK. Returns whether the channel will send the request again. Returns `None` if no request was sent.
     pub fn on_nak(&mut self) -> Option<bool> {
         self.open_request
             .as_ref()
@@ -117,7 +117,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
             .then(|| self.retry(self.now + NAK_PAUSE))
     }
 
-    /// Removes and returns the open request if a telegram with this `command` is its reply or a refusal.
+    /// Removes and returns the open request, if a telegram with this `command` is its reply or a refusal.
     pub fn take_answered(&mut self, command: u8) -> Option<R> {
         let is_answer = |open: &mut PendingRequest<R>| {
             open.is_sent() && (command == REFUSED || command == open.request.command() | REPLY)
@@ -125,7 +125,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
         self.open_request.take_if(is_answer).map(|open| open.request)
     }
 
-    /// Returns the next telegram or NAK in the received bytes, and handles acknowledgments on the way.
+    /// Returns the next telegram or NAK in the received bytes. Handles the acknowledgments before it.
     pub fn advance(&mut self) -> Option<ChannelEvent> {
         // Bytes that arrived before a change of the rate are discarded.
         while !self.change_baud {
@@ -170,7 +170,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
         Action::Wait { until }
     }
 
-    /// Returns the counters of bytes, and the number of buffered bytes that are not counted in a class yet.
+    /// Returns the counters of bytes, and the number of buffered bytes, which no other counter includes yet.
     pub fn byte_counters(&self) -> (&FramerCounters, usize) {
         (self.framer.counters(), self.framer.buffered())
     }
@@ -193,7 +193,8 @@ pub trait EncodeRequest {
     fn command(&self) -> u8;
     /// Returns the maximum time from the acknowledgment to the reply.
     fn reply_timeout(&self) -> Nanos;
-    /// Returns the maximum time to the acknowledgment, or to the first byte of a reply without one.
+    /// Returns the maximum time to the acknowledgment. If the scanner sends none, this is the maximum time to the first
+    /// byte of the reply.
     fn acknowledge_timeout(&self) -> Nanos {
         ACKNOWLEDGE_TIMEOUT
     }
@@ -236,7 +237,7 @@ pub(crate) struct PendingRequest<R = Request> {
     /// Additional time until the acknowledgment, for each try.
     extra_time: Nanos,
     pub(crate) is_acknowledged: bool,
-    /// Whether a byte has arrived since the last one was sent.
+    /// Whether a byte has arrived since the last byte of the request was sent.
     has_received: bool,
     /// Time at which the last byte of the request was sent.
     pub(crate) sent_at: Option<Nanos>,
@@ -275,7 +276,7 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.encoded.bytes().get(self.sent..=self.sent).unwrap_or_default()
     }
 
-    /// Returns the earliest time of the next byte, or `None` if all bytes were sent.
+    /// Returns the earliest time of the next byte. Returns `None` if all bytes were sent.
     pub(crate) fn next_at(&self) -> Option<Nanos> {
         (!self.is_sent()).then_some(self.not_before)
     }
@@ -286,7 +287,7 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.not_before = now + line_time(1, baud.rate()) + BYTE_GAP;
         if self.sent == self.encoded.bytes().len() {
             self.sent_at = Some(now);
-            // A slow scanner needs a longer wait, not more tries, because each try interrupts the previous one.
+            // A slow scanner needs a longer wait, not more tries, because each try interrupts the try before it.
             let previous_tries = Nanos::from(self.max_tries - self.tries_left - 1);
             self.deadline = now
                 + self.request.acknowledge_timeout()
@@ -296,15 +297,15 @@ impl<R: EncodeRequest> PendingRequest<R> {
     }
 
     /// Records the arrival of bytes, and extends the deadline once. If the request interrupted a scan, the framer does
-    /// not detect the acknowledgment, so the bytes may be the beginning of the reply.
+    /// not detect the acknowledgment. The bytes may then be the beginning of the reply.
     pub(crate) fn on_byte(&mut self, baud: Baud) {
         if self.is_sent() && !core::mem::replace(&mut self.has_received, true) {
             self.deadline += line_time(1 + MAX_REPLY_LEN, baud.rate());
         }
     }
 
-    /// Handles an acknowledgment, after which the reply may take longer. Only the first one counts, because a stream at
-    /// another rate looks like endless acknowledgments, which must not extend the deadline repeatedly.
+    /// Handles an acknowledgment, after which the reply may take longer. Only the first acknowledgment extends the
+    /// deadline, because a stream at another rate looks like endless acknowledgments.
     pub(crate) fn on_acknowledged(&mut self, now: Nanos, baud: Baud) {
         if core::mem::replace(&mut self.is_acknowledged, true) {
             return;
@@ -312,7 +313,7 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.deadline = now + self.request.reply_timeout() + line_time(MAX_REPLY_LEN, baud.rate());
     }
 
-    /// Starts the request again, not before `not_before`. Returns whether there was a try left.
+    /// Starts the request again, not before `not_before`. Returns whether a try was left.
     pub(crate) fn retry(&mut self, not_before: Nanos) -> bool {
         self.sent = 0;
         self.not_before = not_before;
@@ -323,9 +324,9 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
     }
 
-    /// Restarts the request if `now` is too late for its next byte, and returns whether it did. The scanner has dropped
-    /// the request, whose last byte was not sent yet. A restart does not use up a try. After [`MAX_RESTARTS`] the
-    /// request is sent to its end anyway, so that the wait for its reply ends.
+    /// Restarts the request if `now` is too late for its next byte. Returns whether it did. The scanner has discarded
+    /// the incomplete request. A restart does not use up a try. After [`MAX_RESTARTS`] restarts, the whole request is
+    /// sent even if bytes are late, so that the wait for its reply ends.
     pub(crate) fn restart_if_late(&mut self, now: Nanos, baud: Baud) -> bool {
         let is_gap =
             self.is_partly_sent() && now > self.min_sent_at + line_time(1, baud.rate()) + MAX_BYTE_GAP;
@@ -343,7 +344,7 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.request.command() | REPLY
     }
 
-    /// Returns whether some of the bytes were sent, but not all.
+    /// Returns whether some bytes were sent, but not all bytes.
     pub(crate) fn is_partly_sent(&self) -> bool {
         self.sent > 0 && !self.is_sent()
     }
@@ -359,27 +360,28 @@ impl<R: EncodeRequest> PendingRequest<R> {
 pub const TRIES: u8 = 3;
 /// Number of tries of requests that are necessary for a stream.
 pub const ESSENTIAL_TRIES: u8 = 5;
-/// Time after which the scanner has dropped a partial request. It drops it after 6 ms (Telegram listing 4.3).
+/// Time after which the scanner has discarded a partly sent request. It discards the request after 6 ms (Telegram
+/// listing 4.3).
 pub(crate) const PARTIAL_REQUEST_TIMEOUT: Nanos = 10 * MILLIS;
 /// Time from the end of a byte to the next one: more than 55 us, and much less than 6 ms (Telegram listing 4.3).
 const BYTE_GAP: Nanos = 120 * MICROS;
-/// Maximum number of restarts of a request because a byte was late. On a machine that is late more often, the request
-/// cannot be sent.
+/// Maximum number of restarts of a request because a byte was late. If a machine is late more often, it cannot send the
+/// request.
 const MAX_RESTARTS: u8 = 50;
-/// Longest time from the end of a byte to the next one: 6 ms (Telegram listing 4.3), less the time of the write.
+/// Maximum time from the end of a byte to the next one: 6 ms (Telegram listing 4.3), minus the duration of the write.
 const MAX_BYTE_GAP: Nanos = 5 * MILLIS;
-/// Time before a byte is due at which the session returns it. A byte that is due later is a deadline first.
+/// Maximum time before a byte is due at which the session returns the byte. Until then, the session returns a deadline.
 pub(crate) const SEND_AHEAD: Nanos = 5 * MILLIS;
-/// Timeout of the acknowledgment. ACK or NAK arrives within 60 ms (Telegram listing 4.3), and captured replies begin
-/// within 100 ms. The rest is for adapters.
+/// Timeout of the acknowledgment. An ACK or NAK arrives within 60 ms (Telegram listing 4.3), and captured replies begin
+/// within 100 ms. The remaining time is for adapters.
 const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
-/// Timeout of the acknowledgment of a stop. A captured reply takes 94 ms, and the acknowledgment is hidden in the
-/// stream. A long timeout costs little, because a scanner that overlooked the stop continues to stream.
+/// Timeout of the acknowledgment of a stop request. A captured reply takes 94 ms, and the stream hides the
+/// acknowledgment. A long timeout costs little, because a scanner that overlooked the request continues to stream.
 const STOP_TIMEOUT: Nanos = 300 * MILLIS;
 /// Timeout of a reply. Captured replies with type, status and configuration take up to 158 ms.
 pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
-/// Timeout of a change of mode. It takes up to 3 s (Telegram listing 7.3), but usually 0.1 s. A status request before
-/// its end returns the previous mode and undoes the change.
+/// Timeout of a change of mode. The change takes up to 3 s (Telegram listing 7.3), but usually 0.1 s. A status request
+/// before the end of the change returns the previous mode and undoes the change.
 pub const MODE_TIMEOUT: Nanos = 3_200 * MILLIS;
 /// Length of the longest expected reply, the status, in bytes.
 const MAX_REPLY_LEN: usize = 160;
@@ -490,7 +492,8 @@ mod tests {
         }
         assert!(outgoing.is_sent());
         assert_eq!(outgoing.deadline, now + ACKNOWLEDGE_TIMEOUT);
-        // The bytes may be the beginning of the longest reply. It begins only once, so the second call adds nothing.
+        // The bytes may be the beginning of the longest reply. A reply begins only once, so the second call does not
+        // extend the deadline.
         for _ in 0..2 {
             outgoing.on_byte(Baud::B500000);
             assert_eq!(outgoing.deadline, now + ACKNOWLEDGE_TIMEOUT + line_time(161, 500_000));

@@ -1,8 +1,8 @@
-//! Counters of losses in a stream: scans that were due but did not arrive, and bytes that were damaged on the line.
+//! Counts the losses of a stream: scans that were due but did not arrive, and bytes that the line damaged.
 //!
-//! A scanner sends scans one period apart, even if they do not arrive. Lost scans can therefore be counted, and a scan
-//! in a backlog can be stamped. A silence that is longer than the session's timeout is not a loss on the line, because
-//! the session restarts the stream.
+//! A scanner sends scans one period apart, even if they do not arrive. The schedule can therefore count lost scans and
+//! stamp a scan in a backlog. A silence that is longer than the session's timeout is not a loss on the line, because
+//! the session then restarts the stream.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -13,17 +13,18 @@ use crate::lms::framer::FramerCounters;
 pub(crate) struct ScanSchedule {
     /// Period that follows from the scanner's settings.
     nominal: Nanos,
-    /// Measured period. It differs from the nominal one because the scanner's motor and the host's clock are not exact.
+    /// Measured period. It differs from the nominal period because the scanner's motor and the host's clock are not
+    /// exact.
     period: Nanos,
     /// Due time of the last scan. `None` if the next scan begins a stream.
     last_due: Option<Nanos>,
-    /// Whether two scans have arrived one period apart, so that the scanner is known to send every period.
+    /// Whether two scans have arrived one period apart, which shows that the scanner sends a scan in every period.
     is_steady: bool,
     window: PeriodWindow,
-    /// Number of scans that were due after the first one of each stream.
+    /// Number of scans that were due after the first scan of each stream.
     pub(crate) due: u64,
     arrived: u64,
-    /// Number of scans that were missing for a second.
+    /// Number of scans that counted as lost because they were missing for a second.
     pub(crate) lost: u64,
     /// Minimum number of missing scans since `min_since`. A scan that is only late is missing for a short time.
     min_missing: u64,
@@ -54,13 +55,13 @@ impl ScanSchedule {
         }
     }
 
-    /// Returns the due time `slots` periods after the last scan, or `None` until the scanner is known to send every
-    /// period.
+    /// Returns the due time `slots` periods after the last scan. Returns `None` until the scanner has sent scans in
+    /// consecutive periods.
     pub(crate) fn due_after(&self, slots: u64) -> Option<Nanos> {
         self.last_due.filter(|_| self.is_steady).map(|last| last + slots * self.period)
     }
 
-    /// Ends the stream of due times, because the scanner stopped or skips scans for a request.
+    /// Ends the sequence of due times, because the scanner stopped, or skips scans to send a reply.
     pub(crate) fn end_stream(&mut self) {
         if self.last_due.take().is_some() {
             self.lost = self.lost.max(self.due.saturating_sub(self.arrived));
@@ -68,7 +69,7 @@ impl ScanSchedule {
         }
     }
 
-    /// Records a scan that began at `at`. The scanner's settings have the period `nominal`.
+    /// Records a scan that began at `at`. `nominal` is the period that follows from the scanner's settings.
     pub(crate) fn note_scan(&mut self, at: Nanos, estimated: bool, nominal: Nanos) {
         if nominal != self.nominal {
             self.end_stream();
@@ -83,7 +84,7 @@ impl ScanSchedule {
         let (since, period) = (at as i64 - last as i64, self.period as i64);
         let slots = (since + period / 2).div_euclid(period).max(0);
         let off = since - slots * period;
-        // A busy host may delay a stamp. The due times follow a deviation only in part.
+        // A busy host may delay a stamp. The due times therefore follow only a part of a deviation.
         let due = last.saturating_add_signed(slots * period + off / if estimated { 8 } else { 2 });
         self.last_due = Some(due);
         let slots = slots as u64;
@@ -99,7 +100,7 @@ impl ScanSchedule {
         }
     }
 
-    /// Adopts the mean of the measurement as the period, if it is plausible.
+    /// Uses the measured mean as the period, if the mean is plausible.
     fn update_period(&mut self, due: Nanos) {
         let PeriodWindow { begin, slots, length } = self.window;
         let mean = due.saturating_sub(begin) / slots;
@@ -121,11 +122,11 @@ impl ScanSchedule {
     }
 }
 
-/// Number of periods of the first measurement. Later ones are longer, up to `MAX_WINDOW_SCANS`.
+/// Number of periods of the first measurement. Later measurements are longer, up to `MAX_WINDOW_SCANS`.
 const FIRST_WINDOW_SCANS: u64 = 64;
 const MAX_WINDOW_SCANS: u64 = 256;
-/// Largest plausible deviation of a mean from the nominal period, as its divisor. A mean that differs more is due to
-/// miscounted scans.
+/// Inverse of the maximum plausible deviation of a mean from the nominal period. If a mean deviates more, scans were
+/// counted wrongly.
 const TOLERANCE_DIVISOR: u64 = 6;
 /// Time after which a missing scan is lost. A network may delay scans for some tenths of a second.
 const LOSS_TIMEOUT: Nanos = 1_000 * MILLIS;
@@ -142,7 +143,7 @@ pub(crate) struct LineDamage {
 }
 
 impl LineDamage {
-    /// Adds the damage since the last check. Begins a stream if there is none.
+    /// Adds the damage since the last check. Starts a stream if there is none.
     pub(crate) fn note_bytes(&mut self, counters: &FramerCounters, now: Nanos) {
         let unassigned = unassigned_bytes(counters);
         if let Some(checked) = self.checked.replace(unassigned)
@@ -153,7 +154,7 @@ impl LineDamage {
         }
     }
 
-    /// Ends the stream. Bytes outside telegrams are not damage until the next one begins.
+    /// Ends the stream. Until the next stream starts, bytes outside telegrams do not count as damage.
     pub(crate) fn end_stream(&mut self) {
         self.checked = None;
     }
@@ -173,7 +174,7 @@ fn unassigned_bytes(counters: &FramerCounters) -> u64 {
     counters.discarded - counters.broken_off
 }
 
-/// Time after the last damage for which the line is considered to damage telegrams.
+/// Time after the last damage during which the line counts as damaging.
 const RECENT_DAMAGE_TIME: Nanos = 10_000 * MILLIS;
 
 #[cfg(test)]
@@ -182,7 +183,7 @@ mod tests {
 
     const PERIOD: Nanos = 26_640_000;
 
-    /// Returns the schedule after scans at these times, in periods.
+    /// Returns the schedule after scans at the times `scans`, in periods.
     fn after_scans(scans: impl IntoIterator<Item = f64>) -> ScanSchedule {
         let mut cadence = ScanSchedule::new();
         for at in scans {
@@ -235,17 +236,17 @@ mod tests {
 
     #[test]
     fn ambiguous_gaps_are_not_counted() {
-        // A scanner that always sends every other scan.
+        // The scanner always skips every other scan.
         let slow = after_scans((0..100).map(|n| f64::from(2 * n)));
         assert_eq!((slow.due, slow.lost), (0, 0));
-        // A pause.
+        // The scanner pauses.
         let mut cadence = ScanSchedule::new();
         (0..50).for_each(|n| cadence.note_scan(n * PERIOD, false, PERIOD));
         cadence.end_stream();
         assert_eq!(cadence.due_after(1), None);
         (900..950).for_each(|n| cadence.note_scan(n * PERIOD, false, PERIOD));
         assert_eq!((cadence.due, cadence.lost), (98, 0));
-        // Another resolution.
+        // The scanner now has another resolution.
         cadence.note_scan(960 * PERIOD, false, PERIOD / 2);
         (1921..1950).for_each(|n| cadence.note_scan(n * PERIOD / 2, false, PERIOD / 2));
         cadence.end_stream();

@@ -1,4 +1,4 @@
-//! State of a scanner as its telegrams have reported it, for messages and for the next session. It is discarded when
+//! State of a scanner according to its telegrams, for messages and for the next session. The session discards it when
 //! the next telegram may come from another scanner.
 
 use core::fmt;
@@ -17,7 +17,7 @@ use crate::lms::variant::{Baud, Mode, Unit, Variant};
 pub enum Problem {
     /// The scanner does not reply at any rate.
     NoReply {
-        /// The only rate that the session tried; `None` if it tried all.
+        /// Only baud rate that the session tried. `None` if it tried all rates.
         baud: Option<Baud>,
         /// Seconds without a reply, rounded down to steps of increasing length.
         seconds: u32,
@@ -26,13 +26,13 @@ pub enum Problem {
     Unanswered(Request),
     /// The scanner refused a request.
     Refused(Request),
-    /// The scanner keeps another angle or resolution than the requested one, and streams with it.
+    /// The scanner keeps an angle or resolution that differs from the requested one, and streams with it.
     VariantRefused,
     /// No measured data arrived for one second.
     Silence,
-    /// The line cannot carry 500,000 baud: it was silent after two switches to that rate.
+    /// The line cannot carry 500,000 baud, because it was silent after two switches to this rate.
     NeedsRs422 {
-        /// Rate that the session uses instead; `None` if the settings require 500,000 baud.
+        /// Baud rate that the session uses instead. `None` if the settings require 500,000 baud.
         fallback: Option<Baud>,
     },
     /// The port does not support 500,000 baud.
@@ -42,12 +42,12 @@ pub enum Problem {
     },
     /// The session is paused, but bytes arrive, and the scanner has not confirmed the stop.
     NotStopped,
-    /// The scanner is a version S14, which scans 90 degrees with as many values as other scanners use for 180.
+    /// The scanner is a version S14. It scans 90 degrees with as many values as other scanners use for 180 degrees.
     AnglesUnknown,
     /// The scanner's measuring mode has values that are not ranges, or whose layout is not documented.
     NoRanges(Mode),
-    /// The scanner does not report its measuring mode, so the number of range bits among the 16 bits of a value is
-    /// unknown.
+    /// The scanner does not report its measuring mode, so the session does not know how many of the 16 bits of a value
+    /// are the range.
     ModeUnknown,
 }
 
@@ -95,12 +95,12 @@ impl fmt::Display for Problem {
     }
 }
 
-/// State of a scanner as its telegrams have reported it. A field is `None` before its first report.
+/// State of a scanner according to its telegrams. A field is `None` before its first report.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sensor {
     /// Address byte of the scanner's telegrams: its own address + 80h.
     pub address: Option<u8>,
-    /// Measuring mode, which defines how values are split into range and upper bits.
+    /// Measuring mode, which determines the range bits and the upper bits of a value.
     pub mode: Option<Mode>,
     /// Unit of its ranges.
     pub unit: Option<Unit>,
@@ -108,8 +108,8 @@ pub struct Sensor {
     pub variant: Option<Variant>,
     /// Whether the scanner sends scans without a request, or is in a mode in which it does not measure.
     pub streams: bool,
-    /// Status byte of the telegrams. A worse one is accepted at once, a better one only after some hundred telegrams,
-    /// because the status byte may change with every scan.
+    /// Status byte of the telegrams. The session accepts a worse status byte at once, but a better one only after some
+    /// hundred telegrams, because the status byte may change with every scan.
     pub status_byte: Option<StatusByte>,
     /// Whether the scanner reports that it is defective.
     pub defective: Option<bool>,
@@ -127,9 +127,10 @@ pub struct Sensor {
     family: Option<LmsModel>,
     /// Number of consecutive telegrams with a better status byte.
     better_telegrams: u16,
-    /// Whether the line damages telegrams, so that a single telegram does not prove a worse status.
+    /// Whether the line damages telegrams. A single telegram then does not prove a worse status.
     is_line_damaged: bool,
-    /// Number of reports of a worse status on a damaging line, and number of telegrams since the first one.
+    /// Number of reports of a worse status on a line that damages telegrams, and number of telegrams since the first
+    /// report.
     worse_reports: u8,
     worse_since: u16,
     /// Number of reports of a fatal status.
