@@ -1,6 +1,6 @@
-//! Session on a port, with a scanner of the configured family or with the scanner that a [`Search`] finds.
+//! Session on a port. Its scanner has the configured family, or a [`Search`] finds it.
 //!
-//! After the search, a session of the scanner's family takes over. If that session receives nothing for 10 s, the
+//! After the search, a session of the scanner's family takes over. If this session receives nothing for 10 s, the
 //! search starts again, with the same family first. The driver handles a search like a session, and calls
 //! [`PortSession::advance`] at each wait.
 
@@ -24,7 +24,7 @@ pub struct PortSession {
     /// Whether the family is `auto`, so that the session searches for the scanner.
     is_auto: bool,
     phase: Phase,
-    /// Reads of the search that the session has not processed yet. The oldest one is the last element.
+    /// Reads of the search that the session has not processed yet. The last element is the oldest read.
     captured: Vec<(Nanos, Vec<u8>)>,
     memory: Option<Memory>,
     /// Baud rate at which the search found the scanner, in bits per second.
@@ -34,7 +34,7 @@ pub struct PortSession {
     known_rate: Option<KnownRate>,
     /// Family, model and number of beams of the last scanner.
     last: Option<(Family, Model, usize)>,
-    /// Problem of the last session, until the search has its own.
+    /// Problem of the last session. It is reported until the search has its own problem.
     problem: Option<Problem>,
     /// Whether a user has paused the search.
     is_paused: bool,
@@ -59,8 +59,8 @@ enum Phase {
 }
 
 impl PortSession {
-    /// Creates a session on a port that was opened at `now`. With a `family`, the port is open at the baud rate of
-    /// `settings`, or at the default rate of the model. Without a family, the port is open at the [rate of the
+    /// Creates a session on a port that was opened at `now`. If `family` is set, the port is open at the baud rate of
+    /// `settings`, or at the default rate of the model. If `family` is `None`, the port is open at the [rate of the
     /// search](Search::opening_rate), which starts with the scanner in `memory`.
     pub fn begin(
         family: Option<Family>,
@@ -122,15 +122,15 @@ impl PortSession {
         }
         let (family, stream_rate) = (session.family(), session.rate());
         let found_rate = self.found_rate.unwrap_or(stream_rate);
-        // A scanner that streamed when the search found it has not shown at which baud rate it replies.
+        // If the scanner streamed when the search found it, the baud rate of its replies is still unknown.
         let before = self.memory.filter(|memory| memory.family == family && found_rate == stream_rate);
         let reply_rate = before.map_or(found_rate, |memory| memory.reply_rate);
         Some(Memory { family, stream_rate, reply_rate })
     }
 
     /// Continues after [`poll_action`](line::Protocol::poll_action) has returned a wait. Returns whether the driver
-    /// must drain the session again, because the search has found a scanner, captured bytes were processed, or the
-    /// search has restarted.
+    /// must drain the session again. It must if the search has found a scanner or has restarted, or if the session has
+    /// processed captured bytes.
     pub fn advance(&mut self) -> bool {
         if !self.is_auto {
             return false;
@@ -198,7 +198,7 @@ impl PortSession {
         self.phase = Phase::Found(session);
     }
 
-    /// Ends the session, because it receives nothing from its scanner any more, and starts a search.
+    /// Ends the session, because it no longer receives anything from its scanner, and starts a search.
     fn restart_search(&mut self) {
         let Phase::Found(session) = &self.phase else { return };
         let stats = session.stats();
@@ -214,7 +214,7 @@ impl PortSession {
         self.search();
     }
 
-    /// Starts a search. The port may be open at any baud rate, so the search sets it first.
+    /// Starts a search. The port may be open at any baud rate, so the search first sets the baud rate.
     fn search(&mut self) {
         if let Phase::Searching(search) = &self.phase {
             self.searched += search.stats().read;
@@ -255,7 +255,7 @@ impl line::Protocol for PortSession {
         (self.now, self.session_now) = (now, now);
         match &mut self.phase {
             Phase::Searching(search) => {
-                // The scanner that replies may not be the one whose identity was saved.
+                // The scanner that replies may differ from the scanner whose identity was saved.
                 self.identity = None;
                 search.handle_transmitted(now);
             }
@@ -291,7 +291,8 @@ impl line::Protocol for PortSession {
     }
 }
 
-/// Defines methods that call the same method of the session. During a search they return the value after `=`.
+/// Defines methods that call the method with the same name of the session. During a search, a method returns the value
+/// after `=`.
 macro_rules! found {
     ($(fn $name:ident($($arg:ident: $Arg:ty),*) -> $Ret:ty = $searching:expr;)*) => {
         $(fn $name(&self $(, $arg: $Arg)*) -> $Ret {
@@ -500,5 +501,5 @@ fn sum(a: SessionStats, b: SessionStats) -> SessionStats {
 /// Time without an event from a found scanner after which the search starts again. Until then, the session handles
 /// silence and power cycles.
 const LOSS_TIMEOUT: Nanos = 10_000 * MILLIS;
-/// Baud rate to report while the rate of the port is unknown, in bits per second.
+/// Baud rate that the session reports while the rate of the port is unknown, in bits per second.
 const FALLBACK_RATE: u32 = 9_600;

@@ -1,4 +1,4 @@
-//! Recognition of the scanner family from raw bytes, such as those of a stream file. It counts the bytes that each
+//! Recognition of the scanner family from raw bytes, such as the bytes of a stream file. It counts the bytes that each
 //! family's framer accepts.
 
 use scanhub_schema::{Family, MILLIS, Nanos};
@@ -8,11 +8,11 @@ use crate::line::{Action, Event, Protocol as _, ScannerSession as _};
 use crate::lms::framer::{Framer, VETO_HOLD_TIME};
 use crate::{Session, Settings, features};
 
-/// Number of bytes at the start of a stream that are examined.
+/// Number of bytes at the start of a stream that this module examines.
 pub const EXAMINED_BYTES: usize = 64 * 1024;
 
-/// Returns the family whose telegrams or packets contain at least half of the first [`EXAMINED_BYTES`] bytes of
-/// `bytes`, and more of them than those of any other family. Returns `None` if there is no such family.
+/// Returns the family whose telegrams or packets contain most of the first [`EXAMINED_BYTES`] bytes of `bytes`. Returns
+/// `None` if they contain less than half of these bytes.
 pub fn family_of(bytes: &[u8]) -> Option<Family> {
     let examined = bytes.len().min(EXAMINED_BYTES);
     let [(first, max_bytes), ..] = bytes_by_family(bytes);
@@ -28,8 +28,8 @@ pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
     counts
 }
 
-/// Returns the name of a scan mode that determines how `bytes` are split into packets of `family`. Returns `None` if
-/// the bytes determine it themselves. The packets of some modes look alike, so decoding may require another mode.
+/// Returns the name of a scan mode that determines how `bytes` are divided into packets of `family`. Returns `None` if
+/// the bytes alone determine it. The packets of some modes look alike, so decoding may require another mode.
 pub fn framing_mode(family: Family, bytes: &[u8]) -> Option<&'static str> {
     bytes_in_mode(family, &bytes[..bytes.len().min(EXAMINED_BYTES)])?.1
 }
@@ -43,8 +43,8 @@ fn accepted_bytes(family: Family, bytes: &[u8]) -> usize {
     }
 }
 
-/// Returns the number of bytes in packets of `family`, and the [mode](framing_mode) by which they are split. Returns
-/// `None` if the family does not send packets.
+/// Returns the number of bytes in packets of `family`, and the [mode](framing_mode) that determines how the bytes are
+/// divided. Returns `None` if the family does not send packets.
 fn bytes_in_mode(family: Family, bytes: &[u8]) -> Option<(usize, Option<&'static str>)> {
     let in_mode = |mode| {
         let settings = Settings { mode, fixed_rate: true, listen_only: true, ..Settings::default() };
@@ -72,7 +72,7 @@ fn bytes_in_telegrams(mut bytes: &[u8]) -> usize {
         let len = fill(framer.read_buffer(), &mut bytes);
         framer.commit(len);
     }
-    // No more bytes can show that the held telegram is not one.
+    // No more bytes will arrive, so the held telegram cannot be disproved.
     framer.release(VETO_HOLD_TIME);
     while framer.poll().is_some() {}
     framer.counters().in_telegrams as usize
@@ -98,7 +98,7 @@ fn bytes_in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
         session.commit(0, len);
         if len == 0 {
             is_ended = true;
-            // No more bytes can show that the held packets are not packets.
+            // No more bytes will arrive, so the held packets cannot be disproved.
             session.handle_timeout(HOLD_TIMEOUT);
         }
     }
@@ -106,7 +106,7 @@ fn bytes_in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
 
 /// Time after which a session releases packets that it holds back.
 const HOLD_TIMEOUT: Nanos = 100 * MILLIS;
-/// Maximum number of bytes that may be noise with a checksum that is right by chance.
+/// Maximum number of bytes that may be noise whose checksum is right by chance.
 const MAX_CHANCE_BYTES: usize = 100;
 
 #[cfg(test)]

@@ -27,7 +27,7 @@ pub use session::{Problem, RplidarSession};
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &MODELS,
-    // Enough for every model except the S2 and the S3.
+    // Sufficient for every model except the S2 and the S3.
     defaults: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
     modes: &MODES,
     keys: &[Key::ModeName, Key::Idle],
@@ -163,8 +163,8 @@ impl Model {
         (points_per_second / self.revolutions_per_second() + 0.5) as usize
     }
 
-    /// Returns the number of beams for a scan mode with `points_per_second`. If it is close to the number of the
-    /// fastest mode, it is that number.
+    /// Returns the number of beams for a scan mode with `points_per_second`. If this number is close to the number of
+    /// beams of the fastest mode, returns the latter.
     pub(crate) fn beams_in_mode(self, points_per_second: f32) -> usize {
         let (beams, fastest) = (self.beams_of(points_per_second), self.beams());
         let is_close = (beams as f64 / fastest as f64 - 1.0).abs() <= MAX_BEAM_DEVIATION;
@@ -246,7 +246,8 @@ impl crate::line::family::Probe for Probe {
         *self = Probe::default();
     }
 
-    // Discard everything, because a fragment of an earlier reply would swallow the descriptor of the next one.
+    // Discard everything, because the framer would take the next descriptor for the rest of an earlier, incomplete
+    // reply.
     fn expect_reply(&mut self, is_expected: bool) {
         let expect = if is_expected { ExpectedBytes::Responses } else { ExpectedBytes::AnyPackets(None) };
         *self = Probe { framer: Framer::new(expect), is_reply_expected: is_expected, ..Probe::default() };

@@ -113,7 +113,8 @@ pub struct Search {
     opened_at: Nanos,
     now: Nanos,
     last_byte: Nanos,
-    /// Number of bytes read; below it, the same number at the start of the round and of the step.
+    /// Number of bytes that the search has read. `round_read` and `step_read` are this number at the start of the round
+    /// and of the step.
     read: u64,
     round_read: u64,
     step_read: u64,
@@ -121,7 +122,7 @@ pub struct Search {
     round_began: Nanos,
     /// Bytes per second of the last step in this round that listened and received a byte.
     step_bytes_per_second: Option<u32>,
-    /// Bytes per second of the last complete round. `None` if no byte arrived in it.
+    /// Bytes per second of the last complete round. `None` if no byte arrived in that round.
     bytes_per_second: Option<u32>,
     found: Option<FoundScanner>,
 }
@@ -149,7 +150,7 @@ enum StepCondition {
 
 #[derive(Clone, Copy, Debug)]
 enum StepAction {
-    /// Listens for the first duration, and up to the second duration longer if a transmission has begun.
+    /// Listens for the first duration. If a transmission has begun, listens for up to the second duration longer.
     Listen(Nanos, Nanos),
     /// Sends the request of the probe with this index.
     Request(usize),
@@ -180,12 +181,12 @@ struct RequestState {
     repeats: u8,
     /// Remaining repetitions of the request after damaged replies.
     retries: u8,
-    /// Whether the request being sent is the one that stops a stream.
+    /// Whether the request that is being sent is the stop request.
     is_stop: bool,
 }
 
-/// Request that is being sent, with the number of its sent bytes. If the scanner requires gaps, bytes are sent one by
-/// one.
+/// Request that is being sent, and the number of bytes that were sent. If the scanner requires gaps, bytes are sent one
+/// by one.
 #[derive(Clone, Copy, Debug)]
 struct OutgoingRequest {
     request: &'static [u8],
@@ -359,12 +360,14 @@ impl Search {
         }
     }
 
-    /// Returns whether the reply to the request of this probe was damaged, or has begun and is incomplete.
+    /// Returns whether the reply to the request of the probe with index `probe` was damaged, or has begun and is
+    /// incomplete.
     fn is_damaged(&self, probe: usize) -> bool {
         matches!(self.probes[probe].evidence(), Evidence::Damaged | Evidence::Partial)
     }
 
-    /// Extends the wait a little, up to `at_most`, if a transmission has begun. Returns whether one has begun.
+    /// Extends the wait a little, up to `at_most`, if a transmission has begun. Returns whether a transmission has
+    /// begun.
     fn extend(&mut self, until: Nanos, at_most: Nanos) -> bool {
         let mut probes = self.probes.iter().filter(|probe| listens_at(probe.approach(), self.rate));
         if self.now >= at_most || !probes.any(|probe| probe.evidence() == Evidence::Partial) {
@@ -481,7 +484,7 @@ impl Search {
         let bytes = self.read - self.round_read;
         let mean = per_second(bytes, self.now.saturating_sub(self.round_began));
         let measured = (bytes > 0).then_some(self.step_bytes_per_second.unwrap_or(mean));
-        // Keep a number that is about the same, so that the message does not change.
+        // Keep the old number if the new number is similar, so that the message does not change.
         let is_same = |old: &u32| measured.is_some_and(|new| new / 3 <= old / 2 && old / 3 <= new / 2);
         self.bytes_per_second = self.bytes_per_second.filter(is_same).or(measured);
         let pause = if bytes == 0 { PAUSES[self.round.min(PAUSES.len() - 1)] } else { 0 };
@@ -581,7 +584,7 @@ impl Search {
         self.probes[number].approach().family
     }
 
-    /// Returns the baud rates at which the search sends requests of a family, those in `memory` first.
+    /// Returns the baud rates at which the search sends requests of a family. The rates in `memory` come first.
     fn rates(&self, number: usize) -> Vec<u32> {
         let approach = self.probes[number].approach();
         let mut rates = approach.request_steps.map_or_else(Vec::new, |asks| asks.rates.to_vec());
@@ -638,7 +641,7 @@ impl Protocol for Search {
 
     fn handle_transmitted(&mut self, now: Nanos) {
         self.now = now;
-        // The baud rate of a serial server is unknown, so assume the slowest one.
+        // The baud rate of a serial server is unknown, so assume the slowest baud rate.
         let byte_time = line_time(1, self.rate.unwrap_or(BOOT_RATE));
         let Phase::Sending { ask, outgoing } = &mut self.phase else { return };
         outgoing.transmitted(now, byte_time, ask.steps.gap);
@@ -710,8 +713,8 @@ impl OutgoingRequest {
         &self.request[self.sent..end]
     }
 
-    /// Updates the state after the next bytes were written at `now`. If they were too late, the scanner has dropped the
-    /// request, so it starts over.
+    /// Updates the state after the next bytes were written at `now`. If these bytes were too late, the scanner has
+    /// discarded the request, so the request starts over.
     fn transmitted(&mut self, now: Nanos, byte_time: Nanos, gap: Option<(Nanos, Nanos)>) {
         let Some((min_gap, max_gap)) = gap else {
             self.sent = self.request.len();
@@ -735,7 +738,7 @@ struct Capture {
     bytes: Vec<u8>,
     /// Number of stored bytes.
     len: usize,
-    /// End of each read, as an index of the bytes, and its time.
+    /// End of each read as an index of the bytes, and the time of the read.
     reads: Vec<(usize, Nanos)>,
 }
 
@@ -754,7 +757,7 @@ impl Capture {
         surplus
     }
 
-    /// Removes the first `len` bytes, and the reads that end in them.
+    /// Removes the first `len` bytes, and the reads that end within these bytes.
     fn discard(&mut self, len: usize) {
         self.bytes.copy_within(len..self.len, 0);
         self.len -= len;
@@ -815,7 +818,7 @@ impl fmt::Display for Problem {
     }
 }
 
-/// Returns whether scanners of a family may use `rate`. If the rate is unknown, they may.
+/// Returns whether scanners of a family may use `rate`. Returns `true` if the rate is unknown.
 fn listens_at(approach: &Approach, rate: Option<u32>) -> bool {
     let asks = approach.request_steps.map_or(&[][..], |asks| asks.rates);
     let mut rates = approach.listen_steps.iter().map(|listen| listen.rate).chain(asks.iter().copied());
@@ -829,29 +832,30 @@ fn per_second(bytes: u64, span: Nanos) -> u32 {
     ((exact + unit / 2) / unit * unit) as u32
 }
 
-/// Time after the open in which the search sends no byte, so that it can recognize a scanner that streams.
+/// Time after the port was opened in which the search sends no byte, so that it can recognize a scanner that streams.
 const SILENT_AFTER_OPEN: Nanos = 150 * MILLIS;
 /// Duration of a step on a serial server.
 const SERVER_STEP_TIME: Nanos = 500 * MILLIS;
-/// Pauses after rounds without a byte, by the index of the round. The last one applies to all later rounds.
+/// Pauses after rounds without a byte, by the index of the round. The last pause applies to all later rounds.
 const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
 /// Time from the first byte in a pause to the end of the pause. A boot message takes this time.
 const BOOT_MESSAGE_TIME: Nanos = 60 * MILLIS;
 /// Interval at which the search checks whether a transmission that has begun is complete.
 const EXTENSION_INTERVAL: Nanos = 20 * MILLIS;
-/// Time before its earliest moment at which a byte is passed to the driver, which waits for the rest.
+/// Maximum time before its earliest sending time at which the search passes a byte to the driver. The driver waits for
+/// the remaining time.
 const TRANSMIT_AHEAD: Nanos = 5 * MILLIS;
 /// Number of times that the search sends a request again because its reply may have been damaged.
 const MAX_RETRIES: u8 = 2;
 /// Number of times that a request starts over because a byte was late.
 const MAX_RESTARTS: u8 = 3;
-/// Lowest baud rate, in bits per second. It sets the speed of requests if the rate is unknown.
+/// Lowest baud rate, in bits per second. It determines the speed of requests if the rate is unknown.
 const BOOT_RATE: u32 = 9_600;
 /// Value of `rate` after the port has rejected a baud rate.
 const UNKNOWN_RATE: u32 = 0;
-/// Number of captured bytes that are kept. The longest telegram has 814.
+/// Number of captured bytes that the search keeps. The longest telegram has 814 bytes.
 const CAPTURE_LEN: usize = 16 * 1_024;
-/// Length of the buffer of one read. A tty returns no more bytes at once.
+/// Length of the buffer of one read, in bytes. A tty returns no more bytes at once.
 const READ_LEN: usize = 4_096;
 /// Durations in messages, in seconds. They differ by more than a minute, because the hub logs each new message.
 const MESSAGE_SECONDS: [u32; 7] = [10, 100, 300, 600, 1_800, 3_600, 36_000];

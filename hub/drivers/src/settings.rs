@@ -101,8 +101,8 @@ impl fmt::Display for Value<'_> {
 /// Reason why a setting is not valid, as text for the user.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Refusal {
-    /// Keys whose values cause the problem, the main one first. If it is not set, the next one that is set takes its
-    /// place.
+    /// Keys whose values cause the problem, the most important key first. If this key is not set, the next key that is
+    /// set replaces it.
     pub keys: Vec<Key>,
     /// Problem, with the value.
     pub what: String,
@@ -116,13 +116,13 @@ impl Refusal {
     }
 }
 
-/// Checked settings of a session. They are the same type for all families, so models and modes are names. A family
+/// Checked settings of a session. All families have the same type of settings, so models and modes are names. A family
 /// ignores settings that it does not have.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Settings {
     /// Name of one of the [`Features::models`]. `None` if the session detects the model.
     pub model: Option<&'static str>,
-    /// Name of one of the [`Features::modes`]. `None` if the session chooses the best one.
+    /// Name of one of the [`Features::modes`]. `None` if the session chooses the best mode.
     pub mode: Option<&'static str>,
     /// Number of beams of the grid. `None` for the model's number, up to [`max_beams`](Self::max_beams).
     pub beams: Option<usize>,
@@ -133,11 +133,14 @@ pub struct Settings {
     pub view: Option<(u16, u16)>,
     /// Baud rate for the stream, in bits per second. `None` for the default of the model or family.
     pub baud: Option<u32>,
-    /// Type that the scanner is expected to report. The session compares it and never changes the scanner's.
+    /// Type that the scanner is expected to report. The session only compares it, and never changes the type of the
+    /// scanner.
     pub expected_type: Option<&'static str>,
-    /// Expected unit of ranges, in millimeters. The session compares it and never changes the scanner's.
+    /// Expected unit of ranges, in millimeters. The session only compares it, and never changes the unit of the
+    /// scanner.
     pub unit_mm: Option<u8>,
-    /// Number of the measurement mode, which defines the meaning of values, for a recording that does not contain it.
+    /// Number of the measurement mode, which defines the meaning of values. Used for a recording that does not contain
+    /// this number.
     pub mode_number: Option<u8>,
     /// Whether the port has a fixed baud rate, and bytes do not arrive at the speed of a line. This applies to a serial
     /// server on the network and to a recording.
@@ -152,7 +155,7 @@ pub struct Settings {
 }
 
 impl SettingsRequest {
-    /// Sets `key` to `value`. The name of a mode replaces a mode number, and the reverse.
+    /// Sets `key` to `value`. The name of a mode replaces a mode number, and a mode number replaces the name of a mode.
     ///
     /// # Errors
     ///
@@ -180,8 +183,7 @@ impl SettingsRequest {
         Ok(())
     }
 
-    /// Returns the keys of this request that only one family has. Each comes with its family and its text for a
-    /// message.
+    /// Returns the keys of this request that only one family has, each with its family and its text for a message.
     pub fn family_keys(&self) -> impl Iterator<Item = (Key, Family, String)> {
         Key::ALL.into_iter().filter_map(|key| {
             let (family, what) = match (key, &self.model, &self.mode) {
@@ -244,8 +246,8 @@ impl SettingsRequest {
         Err(Refusal::new(&[key], what, remedy))
     }
 
-    /// Returns the settings for `family`, which has models in its `features`, after checking the names of the model and
-    /// the mode.
+    /// Checks the names of the model and the mode. Returns the settings for `family`. The models of the family are in
+    /// `features`.
     pub(crate) fn check_models(&self, family: Family, features: &Features) -> Result<Settings, Refusal> {
         let mut settings = self.unchecked_settings();
         if let Some(model) = &self.model {
@@ -286,7 +288,7 @@ impl SettingsRequest {
 }
 
 impl Settings {
-    /// Returns the value of `key` as in a configuration. Returns `None` if it is not set and has no default.
+    /// Returns the value of `key`, as in a configuration. Returns `None` if the key is not set and has no default.
     pub fn value(&self, key: Key) -> Option<Value<'static>> {
         let whole = |number: u32| Value::Whole(number.into());
         match key {
@@ -312,7 +314,7 @@ fn owning_family(key: Key) -> Option<Family> {
     Family::ALL.into_iter().find(|&family| features(family).keys.contains(&key))
 }
 
-/// Returns the family with a model of this name. A name belongs to only one family.
+/// Returns the family with a model whose name is `model`. A name belongs to only one family.
 pub fn family_of(model: &str) -> Option<Family> {
     let has =
         |family: &Family| features(*family).models.iter().any(|known| known.name.eq_ignore_ascii_case(model));

@@ -162,7 +162,7 @@ impl ProtocolState {
         let Some(open) = &mut self.open_request else { return };
         open.on_byte_sent(now, self.rate.baud);
         if self.settings.fixed_rate {
-            // A network may deliver the complete reply in one read, so its arrival does not extend the deadline.
+            // A network may deliver the complete reply in one read, so extend the deadline before the first byte.
             open.on_byte(self.rate.baud);
         }
     }
@@ -204,8 +204,8 @@ impl ProtocolState {
                 self.resyncs += 1;
                 self.problem = Some(Problem::Silence);
                 self.sensor.reset_identity();
-                // The cable may be connected again although the power was on, so search first at the rate of the
-                // stream.
+                // Perhaps only the cable was unplugged. The scanner then still uses the rate of the stream, so search
+                // first at this rate.
                 self.rate.expect_target();
                 return self.listen(now, State::Silent);
             }

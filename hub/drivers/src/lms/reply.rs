@@ -23,7 +23,7 @@ pub enum Reply<'a> {
     Refused,
     /// A0h: result of a change of the operating mode or of the baud rate.
     Mode {
-        /// Whether the scanner changed it.
+        /// Whether the scanner changed the mode or the rate.
         done: bool,
     },
     /// B0h: a scan, on request or in a stream.
@@ -57,7 +57,7 @@ pub enum Reply<'a> {
     Type(&'a [u8]),
     /// BBh: result of a change of the variant, with the variant in effect.
     Variant {
-        /// Whether it was changed.
+        /// Whether the scanner changed the variant.
         done: bool,
         /// Angle in degrees, as reported.
         angle_deg: u16,

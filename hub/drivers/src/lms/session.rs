@@ -1,4 +1,4 @@
-//! Session with one LMS. Its inputs are bytes and the time; its outputs are telegrams, bytes to send and the next
+//! Session with one LMS. Its inputs are bytes and the time. Its outputs are telegrams, bytes to send and the next
 //! deadline.
 
 use scanhub_schema::{Counter, Counters, Nanos, Status};
@@ -23,23 +23,24 @@ use crate::settings;
 /// Settings of a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
-    /// Requested angle and resolution. If the scanner refuses them, it streams with its own.
+    /// Requested angle and resolution. A scanner that refuses them streams with its own angle and resolution.
     pub variant: Variant,
     /// Baud rate for the stream.
     pub baud: Baud,
-    /// Whether nothing can be sent, because the bytes come from a recording.
+    /// Whether the session cannot send, because the bytes come from a recording.
     pub listen_only: bool,
     /// Whether [`baud`](Self::baud) is the only rate of the port, as with a serial server on the network.
     pub fixed_rate: bool,
-    /// Whether [`baud`](Self::baud) is kept even if the line cannot carry it. Otherwise, the session streams at 38,400
-    /// baud after two switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
+    /// Whether the session keeps [`baud`](Self::baud) even if the line cannot carry it. Otherwise, the session streams
+    /// at 38,400 baud after two switches to 500,000 baud that the scanner acknowledged and after which the line was
+    /// silent.
     pub keep_baud: bool,
     /// Measuring mode for a recording that does not contain it.
     pub mode: Option<Mode>,
 }
 
-/// Session with one scanner. It does not detect a replacement of the scanner within a second if the new one already
-/// streams with the same number of values and the same address.
+/// Session with one scanner. If the scanner is replaced within a second, the session does not detect this if the new
+/// scanner already streams with the same number of values and the same address.
 #[derive(Clone, Debug)]
 pub struct LmsSession {
     settings: Settings,
@@ -58,9 +59,9 @@ pub struct LmsSession {
     first_frame_truncated: bool,
     /// Length of the buffer of the next read.
     buffer_len: usize,
-    /// Whether the last read filled its buffer, so that more bytes may be waiting.
+    /// Whether the last read filled its buffer, so that the port may have more bytes.
     has_more: bool,
-    /// Time until which waiting bytes are not read.
+    /// Time until which the session leaves bytes unread.
     deferred_until: Option<Nanos>,
     /// Measuring mode in the last telegrams of a recording.
     recorded_mode: Option<Mode>,
@@ -89,14 +90,15 @@ impl LmsSession {
         }
     }
 
-    /// Restores the [number of silent switches](Self::silent_switches) that the previous session counted. After two of
-    /// them, the session streams at 38,400 baud, unless its settings require 500,000. Call this before the first read.
+    /// Restores the [number of silent switches](Self::silent_switches) that the previous session counted. After two
+    /// silent switches, the session streams at 38,400 baud, unless its settings require 500,000 baud. Call this before
+    /// the first read.
     pub fn restore_silent_switches(&mut self, count: u8) {
         self.protocol.restore_silent_switches(count, self.now);
     }
 
-    /// Returns the number of switches to 500,000 baud in a row that the scanner acknowledged and that were followed by
-    /// silence, at most 2. It outlives restarts of the scanner.
+    /// Returns the number of consecutive switches to 500,000 baud that the scanner acknowledged and after which the
+    /// line was silent, at most 2. A restart of the scanner does not change this number.
     pub fn silent_switches(&self) -> u8 {
         self.protocol.rate.silent_switches()
     }
@@ -131,11 +133,11 @@ impl LmsSession {
         let period = self.period(telegram, reply.as_ref());
         let mut first = self.arrivals.stamp(span.offset, baud);
         let last = self.arrivals.stamp(span.offset + len - 1, baud);
-        // The line may have held back only the end of a telegram.
+        // The line may have delayed only the end of a telegram.
         let estimated = first.estimated || last.estimated;
         let due = period.and(self.due_time(&first, span.offset, len));
-        // A later read may show that bytes are older than estimated. The stamps of earlier bytes are already published,
-        // so a stamp is never earlier than the last one.
+        // A later read may show that bytes are older than estimated. Stamps of earlier bytes are already published, so
+        // a stamp is never earlier than the previous stamp.
         first.at = due.unwrap_or(first.at).max(self.last_stamp);
         let last = match due.and(self.timing.duration) {
             Some(duration) => (first.at + duration).min(last.latest.unwrap_or(last.at)),
@@ -155,7 +157,8 @@ impl LmsSession {
         self.last_scan = if is_scan { span.offset } else { self.last_scan };
         self.first_frame_truncated |=
             is_scan && self.framer_counters().telegrams == 1 && self.framer_counters().discarded > 0;
-        // Only scans of a live stream are measured. Replies depend on requests, and a recording on its reader.
+        // Measure only scans of a live stream. The duration of a reply depends on its request, and the duration of a
+        // recorded telegram depends on the reader of the recording.
         let is_measurable = is_scan && self.is_live() && !first.estimated;
         let elapsed = last.saturating_sub(first.at);
         let is_slow = is_measurable && self.timing.is_slow(elapsed);
@@ -176,22 +179,23 @@ impl LmsSession {
         ReceivedTelegram { first: first.at, last, estimated, reasons, ..received }
     }
 
-    /// Returns the arrival of the first byte that is not in a telegram yet.
+    /// Returns the arrival time of the first byte that does not belong to a telegram yet.
     fn next_start(&self) -> Nanos {
         let open = self.framer_counters().read - self.framer.buffered() as u64;
         self.arrivals.stamp(open, self.baud().rate()).at
     }
 
-    /// Returns the time between two scans like `telegram`, which decodes to `reply`. Returns `None` unless it is a
-    /// complete scan of a live stream whose number of beams belongs to a variant.
+    /// Returns the time between two scans like `telegram`. `reply` is the decoded telegram. Returns `None` unless
+    /// `telegram` is a complete scan of a live stream and its number of beams belongs to a variant.
     fn period(&self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>) -> Option<Nanos> {
         let Some(Reply::Measured(measured)) = reply.filter(|_| self.is_live()) else { return None };
         let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
         Some(variant.period(telegram.bytes().len(), self.baud().rate()))
     }
 
-    /// Returns the time at which the scan of `len` bytes at `offset` began, if it was in a backlog of a stopped host.
-    /// The time follows from its position in the backlog and is limited by the time of the read.
+    /// Returns the time at which a scan in a backlog began. The scan has `len` bytes and starts at `offset`. The time
+    /// follows from the scan's position in the backlog, and is limited by the time of the read. Returns `None` if the
+    /// scan was not in a backlog.
     fn due_time(&self, first: &Timestamp, offset: u64, len: u64) -> Option<Nanos> {
         let latest = first.latest?;
         let slots = (offset - self.last_scan + len / 2) / len;
@@ -203,13 +207,13 @@ impl LmsSession {
         self.protocol.state() == State::Streaming && !self.settings.listen_only
     }
 
-    /// Returns whether the line has the target rate, so that periods and durations are those of that rate.
+    /// Returns whether the line has the target rate. Only then are periods and durations valid for the target rate.
     fn is_at_rate(&self) -> bool {
         let rate = &self.protocol.rate;
         !rate.needs_change && rate.baud == rate.target
     }
 
-    /// Returns whether bytes arrive at the rate of the line, unlike those of a recording or a network.
+    /// Returns whether bytes arrive at the rate of the line. Bytes of a recording or a network do not.
     fn has_line_rate(&self) -> bool {
         !(self.settings.listen_only || self.settings.fixed_rate)
     }
@@ -250,7 +254,7 @@ impl line::Protocol for LmsSession {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
         if self.is_live() {
-            // Bytes outside telegrams must be counted even if the stream has ended.
+            // Count bytes outside telegrams even if the stream has ended.
             self.damage.note_bytes(self.framer.counters(), now);
         }
         self.protocol.handle_timeout(now);
@@ -318,8 +322,8 @@ impl line::ScannerSession for LmsSession {
 
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
         self.now = now;
-        // If the bytes of more than a revolution are waiting, the host was stopped. The read must then determine their
-        // age.
+        // If the host has more unread bytes than the scanner sends in a revolution, the host was stopped. The read must
+        // then determine the age of these bytes.
         if (1..=BYTES_PER_REVOLUTION).contains(&waiting) && self.can_defer_read() {
             self.arrivals.note_unread(now, waiting);
             let start = self.next_start();
@@ -383,7 +387,7 @@ impl line::ScannerSession for LmsSession {
         self.protocol.identity()
     }
 
-    /// Makes the search try this rate instead of 9,600 baud if no stream arrives.
+    /// Makes the search try the rate in `known` instead of 9,600 baud if no stream arrives.
     fn hint_rate(&mut self, known: KnownRate) {
         if let Some(baud) = Baud::of_rate(known.baud) {
             self.protocol.restore_rate(baud);
@@ -485,7 +489,7 @@ impl line::ScannerSession for LmsSession {
     }
 }
 
-/// Converts `telegram`, which decodes to `reply`, with stamps of 0. A scan is split according to `mode`.
+/// Converts `telegram`, with stamps of 0. `reply` is the decoded telegram. `mode` determines the range bits of a value.
 fn to_received<'a>(
     telegram: Telegram<'a>,
     reply: Option<&Reply<'a>>,
@@ -499,7 +503,7 @@ fn to_received<'a>(
     };
     let beams = measured.map_or(0, |measured| measured.count());
     let period = nominal_period(beams, baud.rate());
-    // Without a valid mode there is no scan, because a wrong range is worse than none.
+    // Without a valid mode, the result contains no scan, because a wrong range is worse than no range.
     let split = measured.zip(mode.filter(|mode| mode.has_ranges()));
     let is_forbidden = split.is_some_and(|(measured, mode)| measured.is_forbidden(mode));
     let scan = split.map(|(measured, mode)| RawScan { number, period, ..measured.scan(mode) });
@@ -530,7 +534,8 @@ impl From<settings::Settings> for Settings {
     }
 }
 
-/// Counters of rejected telegrams, except for a wrong checksum, which has a counter in every family.
+/// Counters of rejected telegrams, by reason. A wrong checksum is missing here, because it has a counter in every
+/// family.
 const REJECTS: [(Reject, Counter); Reject::COUNT - 1] = [
     (Reject::Address, Counter::RejectedAddress),
     (Reject::Length, Counter::RejectedLength),

@@ -1,5 +1,5 @@
-//! Sequences of requests: the steps that bring a scanner to the requested stream, and the requests to a scanner that
-//! already streams. Settings that the scanner does not have, or does not report after a reset, are skipped.
+//! Sequences of requests: the steps that start the requested stream, and the requests to a scanner that already
+//! streams. The session skips settings that the scanner does not have, or does not report after a reset.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -9,8 +9,9 @@ use crate::lms::request_channel::{ESSENTIAL_TRIES, TRIES};
 use crate::lms::sensor::Sensor;
 use crate::lms::variant::{Baud, Variant};
 
-/// Step of a [`Start`], which sends one request. Between two changes of mode or rate, whose replies look the same,
-/// there is always another step, so that a late or repeated reply is not taken for the reply to the next change.
+/// Step of a [`Start`], which sends one request. The replies to a change of mode and to a change of rate look the same.
+/// Another step is therefore always between two changes, so that a late or repeated reply does not count as the reply
+/// to the next change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Step {
     /// Ends a stream or the installation mode.
@@ -30,7 +31,7 @@ pub(crate) enum Step {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Start {
     pub(crate) step: Step,
-    /// Number of stops that may still be sent.
+    /// Number of stop requests that the session may still send.
     stops_left: u8,
     /// Remaining steps after the scanner has stopped at the target rate.
     setting_steps: &'static [Step],
@@ -63,8 +64,8 @@ impl Start {
         }
     }
 
-    /// Returns the start after the `reply` to `request`. The type is not requested again from a scanner that refuses to
-    /// report it.
+    /// Returns the start after the `reply` to `request`. If a scanner refuses to report its type, the session does not
+    /// request the type again.
     pub(crate) fn after_reply(self, request: Request, reply: Option<&Reply<'_>>) -> Start {
         Start {
             has_status: self.has_status || matches!(reply, Some(Reply::Status(_))),
@@ -78,8 +79,8 @@ impl Start {
         Start { step: Step::Check, ..self }
     }
 
-    /// Returns whether the mode of the scanner may be the reason why it refused to change its rate: its status is
-    /// unknown, and no stop was sent.
+    /// Returns whether the scanner may have refused to change its rate because of its mode. This is the case if its
+    /// status is unknown and no stop request was sent.
     pub(crate) fn may_be_in_other_mode(&self) -> bool {
         !self.has_status && self.stops_left > MAX_STOPS
     }
@@ -93,9 +94,9 @@ impl Start {
         }
     }
 
-    /// Returns the step for the next setting that is not known to be right.
+    /// Returns the step for the next setting that may be wrong.
     pub(crate) fn next_setting(mut self, sensor: &Sensor, variant: Variant) -> Start {
-        // If no setting is left, the stream was already requested, and its result is unknown.
+        // If no setting is left, the session has already requested the stream, but does not know the result.
         self.step = Step::Stream;
         while let Some((&step, rest)) = self.setting_steps.split_first() {
             self.setting_steps = rest;
@@ -113,9 +114,9 @@ impl Start {
     }
 }
 
-/// Requests to a scanner that already streams: its type, which may imply other angles, and its measuring mode, which
-/// two replies report. A reply costs the scan that it interrupts. After some rounds, requests are rare and continue
-/// only while the measuring mode is unknown, because there are no scans without it.
+/// Requests to a scanner that already streams. It requests the type, because other angles may follow from it, and the
+/// measuring mode, which two replies report. A reply costs the scan that it interrupts. After some rounds, requests are
+/// rare. They continue only while the measuring mode is unknown, because the session cannot return scans without it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Questions {
     /// Remaining requests of this round.
@@ -133,19 +134,19 @@ pub(crate) enum NextQuestion {
     Send(Request),
     /// Send nothing now. Another round follows.
     Later,
-    /// Everything is known, or as much as the scanner reports.
+    /// The scanner has reported everything that it can report.
     Done,
     /// The scanner does not report its measuring mode.
     ModeUnknown,
 }
 
 impl Questions {
-    /// Creates the requests, not to be sent before `start_at`.
+    /// Creates the requests. The first request is sent at `start_at` or later.
     pub(crate) fn new(start_at: Nanos) -> Questions {
         Questions { remaining: STATUS_REQUESTS, rounds: 0, next_at: start_at }
     }
 
-    /// Returns the next action at `now`, right after a scan, while no request is open.
+    /// Returns the next action at `now`. Call it right after a scan, while no request is open.
     pub(crate) fn next(&mut self, sensor: &Sensor, now: Nanos) -> NextQuestion {
         if now < self.next_at {
             return NextQuestion::Later;
@@ -176,10 +177,10 @@ impl Questions {
     }
 }
 
-/// Number of stops after the first one. A scanner that continues to stream after them does not receive requests.
+/// Number of stop requests after the first one. A scanner that streams even after them does not receive requests.
 pub(crate) const MAX_STOPS: u8 = 2;
 const STATUS_REQUESTS: &[Request] = &[Request::Type, Request::Status, Request::Configuration];
-/// Number of rounds of requests without a pause.
+/// Number of rounds of requests before the first pause.
 const ROUNDS: u8 = 5;
 /// Pause between later rounds.
 const ROUND_PAUSE: Nanos = 10_000 * MILLIS;

@@ -1,7 +1,7 @@
 //! Health of a scanner: the status byte that ends every reply, the status report B1h, and the errors of B2h (Telegram
 //! listing 7-5, 7-18, 8 and 9).
 //!
-//! The status byte of the same scanner may be 10h on one day and 11h on the next, so only its single bits have a
+//! The status byte of the same scanner may be 10h on one day and 11h on the next. Only its single bits therefore have a
 //! meaning. The offsets in the status report were checked against a real scanner.
 
 use core::fmt;
@@ -17,7 +17,7 @@ impl StatusByte {
     /// Status byte of a healthy LMS type 6.
     pub const OK: StatusByte = StatusByte(0x10);
 
-    /// Returns the severity, or `None` for an undefined code.
+    /// Returns the severity. Returns `None` for an undefined code.
     pub fn severity(self) -> Option<Severity> {
         Severity::of_code(self.0 & 7)
     }
@@ -92,7 +92,7 @@ impl Severity {
 pub struct StatusReport<'a>(&'a [u8; REPORT_LEN]);
 
 impl<'a> StatusReport<'a> {
-    /// Returns the view of `bytes`, or `None` if there are not exactly 152.
+    /// Returns the view of `bytes`. Returns `None` if `bytes` does not have exactly 152 bytes.
     pub fn new(bytes: &'a [u8]) -> Option<StatusReport<'a>> {
         bytes.try_into().ok().map(StatusReport)
     }
@@ -107,7 +107,8 @@ impl<'a> StatusReport<'a> {
         self.0[..7].trim_ascii()
     }
 
-    /// Returns the operating mode, as in the byte after command 20h (24h: streaming, 25h: on request).
+    /// Returns the operating mode. The values are those of the byte after command 20h (24h: streaming, 25h: on
+    /// request).
     pub fn operating_mode(&self) -> u8 {
         self.0[7]
     }
@@ -132,7 +133,7 @@ impl<'a> StatusReport<'a> {
         self.word(82)
     }
 
-    /// Returns the measuring mode, which defines how a value is split into range and upper bits.
+    /// Returns the measuring mode, which determines the range bits and the upper bits of a value.
     pub fn mode(&self) -> Mode {
         Mode(self.0[101])
     }
@@ -147,7 +148,8 @@ impl<'a> StatusReport<'a> {
         baud_of_divisor(self.word(115))
     }
 
-    /// Returns whether the baud rate after power-on is not the factory's 9600 (byte 119, which the factory sets to 0).
+    /// Returns whether the baud rate after power-on differs from the factory setting of 9600 baud (byte 119, which the
+    /// factory sets to 0).
     pub fn has_permanent_baud(&self) -> bool {
         self.0[118] != 0
     }
@@ -177,9 +179,9 @@ impl<'a> StatusReport<'a> {
 pub struct SimulatedStatus {
     /// Firmware version, 7 ASCII characters.
     pub software: [u8; 7],
-    /// Operating mode, as in the byte after command 20h.
+    /// Operating mode. The values are those of the byte after command 20h.
     pub operating_mode: u8,
-    /// Measuring mode, which defines how a value is split into range and upper bits.
+    /// Measuring mode, which determines the range bits and the upper bits of a value.
     pub mode: Mode,
     /// Current angle and resolution.
     pub variant: Variant,
@@ -190,8 +192,8 @@ pub struct SimulatedStatus {
 }
 
 impl SimulatedStatus {
-    /// Returns a report with these settings, with the motor at its nominal speed and the laser on. All other values are
-    /// 0.
+    /// Returns a status report with these settings. The motor has its nominal speed, and the laser is on. All other
+    /// values are 0.
     pub fn report(&self) -> [u8; REPORT_LEN] {
         let mut data = [0; REPORT_LEN];
         data[..7].copy_from_slice(&self.software);
@@ -215,7 +217,8 @@ pub fn status_reply(address: u8, health: &SimulatedStatus, status: u8) -> Encode
         .finish()
 }
 
-/// Returns the divisor word of a baud rate: n with the upper bit set, where the rate is 16 MHz / (16 (n + 1)).
+/// Returns the divisor word of a baud rate. Its upper bit is set, and the other bits are n in the equation rate = 16
+/// MHz / (16 (n + 1)).
 fn divisor_of(baud: Baud) -> u16 {
     match baud {
         Baud::B500000 => 0x8001,
@@ -225,7 +228,7 @@ fn divisor_of(baud: Baud) -> u16 {
     }
 }
 
-/// Returns the baud rate of a divisor word, or `None` if it is unknown.
+/// Returns the baud rate of a divisor word. Returns `None` if the word is unknown.
 pub(crate) fn baud_of_divisor(divisor: u16) -> Option<Baud> {
     Baud::ALL.into_iter().find(|&baud| divisor_of(baud) == divisor)
 }
@@ -246,7 +249,7 @@ pub enum ValueFormat {
 /// Position, format and name of a value in the report.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Item {
-    /// Offset of its first byte.
+    /// Offset of the value's first byte.
     pub at: usize,
     /// Length in bytes.
     pub len: usize,
@@ -260,8 +263,8 @@ const fn item(at: usize, len: usize, name: &'static str, kind: ValueFormat) -> I
     Item { at, len, name, kind }
 }
 
-/// All values of the report, in their order and without gaps. The listing counts from the command byte, so its offsets
-/// are higher by one.
+/// All values of the report. Their order is the order of the bytes, without gaps. The listing counts from the command
+/// byte, so its offsets are greater by one.
 pub const ITEMS: [Item; 50] = [
     item(0, 7, "software version", ValueFormat::Text),
     item(7, 1, "operating mode", ValueFormat::Number),
@@ -317,7 +320,7 @@ pub const ITEMS: [Item; 50] = [
 
 /// Transmission in percent below which the window is dirty (Telegram listing, errors 18 and 19).
 pub(crate) const DIRTY_BELOW_PERCENT: u16 = 75;
-/// Number of channels of the pollution measurement that measure the window. The other channels are its reference.
+/// Number of channels of the pollution measurement that measure the window. The other channels are the reference.
 const WINDOW_CHANNELS: usize = 8;
 
 /// Length of the report in bytes: LENGTH 9Ah without command and status (Telegram listing 7-5).
@@ -328,7 +331,7 @@ pub const REPORT_LEN: usize = 152;
 pub struct Errors<'a>(&'a [u8]);
 
 impl<'a> Errors<'a> {
-    /// Returns the view of the pairs in `bytes`, or `None` if the last pair is incomplete.
+    /// Returns the view of the pairs of bytes in `bytes`. Returns `None` if the last pair is incomplete.
     pub fn new(bytes: &'a [u8]) -> Option<Errors<'a>> {
         bytes.len().is_multiple_of(2).then_some(Errors(bytes))
     }
@@ -359,7 +362,7 @@ impl Fault {
         Severity::of_code(self.kind & !PAST_FLAG)
     }
 
-    /// Returns whether the error has ended and is only in the error memory, which command 10h clears.
+    /// Returns whether the error has ended. It is then only in the error memory, which command 10h clears.
     pub fn is_past(self) -> bool {
         self.kind & PAST_FLAG != 0
     }
@@ -407,7 +410,7 @@ impl fmt::Display for Fault {
     }
 }
 
-/// Bit in the type of an error that has ended.
+/// Bit of an error's type which states that the error has ended.
 const PAST_FLAG: u8 = 0x80;
 
 #[cfg(test)]
@@ -470,7 +473,7 @@ mod tests {
 
     #[test]
     fn reads_captured_errors() {
-        // Captured: B2 84 16 (84 31)x8 84 16 01 31. Repeated pairs are left out here.
+        // Captured: B2 84 16 (84 31)x8 84 16 01 31. This test omits repeated pairs.
         let errors = Errors::new(&[0x84, 0x16, 0x84, 0x31, 1, 0x31]).unwrap();
         let words: Vec<_> = errors.iter().map(|fault| fault.to_string()).collect();
         assert_eq!(

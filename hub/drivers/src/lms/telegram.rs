@@ -7,15 +7,15 @@ use core::fmt;
 
 /// First byte of every telegram.
 pub const STX: u8 = 0x02;
-/// Byte before a reply: address and checksum of the request were right.
+/// Byte before a reply. It states that the address and the checksum of the request were right.
 pub const ACK: u8 = 0x06;
-/// Byte instead of a reply: the address of the request was right, but its checksum was not.
+/// Byte instead of a reply. It states that the address of the request was right, but its checksum was wrong.
 pub const NAK: u8 = 0x15;
-/// Bit that is added to the scanner's address in its telegrams, and to the command of a request in its reply.
+/// Bit that a scanner adds to its address in its telegrams, and to the command of a request in the reply.
 pub const REPLY: u8 = 0x80;
 /// Number of bytes that LENGTH does not count: STX, address, two length bytes, two checksum bytes.
 pub const FRAME_LEN: usize = 6;
-/// Maximum LENGTH: that of 401 values with real-time indices.
+/// Maximum LENGTH, which a telegram with 401 values and real-time indices has.
 pub const MAX_LENGTH: usize = 808;
 /// Length of the longest telegram in bytes.
 pub const MAX_TELEGRAM: usize = MAX_LENGTH + FRAME_LEN;
@@ -25,13 +25,13 @@ pub const MAX_TELEGRAM: usize = MAX_LENGTH + FRAME_LEN;
 pub struct Telegram<'a>(&'a [u8]);
 
 impl<'a> Telegram<'a> {
-    /// Returns the telegram in `bytes`, from STX to the second checksum byte, or `None` if they are not exactly one
-    /// telegram.
+    /// Returns the telegram in `bytes`, from STX to the second checksum byte. Returns `None` if `bytes` is not exactly
+    /// one telegram.
     pub fn check(bytes: &'a [u8]) -> Option<Self> {
         Telegram::check_with(bytes, Checksum::default())
     }
 
-    /// Checks `bytes` like [`Telegram::check`]. `checksum` may already include the first bytes.
+    /// Checks `bytes` like [`Telegram::check`]. `checksum` may already include the first bytes of the telegram.
     pub(crate) fn check_with(bytes: &'a [u8], checksum: Checksum) -> Option<Self> {
         let [STX, _, low, high, _, .., crc_low, crc_high] = *bytes else { return None };
         let length = usize::from(u16::from_le_bytes([low, high]));
@@ -67,7 +67,7 @@ impl<'a> Telegram<'a> {
         self.0.len() - FRAME_LEN
     }
 
-    /// Returns the command byte. In a reply, it is that of the request + 80h.
+    /// Returns the command byte. In a reply, it is the command byte of the request + 80h.
     pub fn command(&self) -> u8 {
         self.0[4]
     }
@@ -97,7 +97,7 @@ impl fmt::Debug for Telegram<'_> {
     }
 }
 
-/// Writer of a telegram, with a buffer for the longest one.
+/// Writer of a telegram. Its buffer has room for a telegram of the maximum length.
 #[derive(Clone)]
 pub struct Writer {
     bytes: [u8; MAX_TELEGRAM],
@@ -105,7 +105,8 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Begins a telegram with `command` to `address`, or from it with [`REPLY`] added.
+    /// Starts a telegram with `command` to the scanner at `address`. If `address` includes [`REPLY`], the telegram is
+    /// from this scanner.
     pub fn new(address: u8, command: u8) -> Self {
         let mut bytes = [0; MAX_TELEGRAM];
         bytes[..5].copy_from_slice(&[STX, address, 0, 0, command]);
@@ -136,17 +137,17 @@ impl Writer {
         self
     }
 
-    /// Appends bytes. Returns `None` if there is no space left for the status byte at the end of a reply.
+    /// Appends bytes. Returns `None` if no space is left for the status byte at the end of a reply.
     pub(crate) fn reply_slice(self, bytes: &[u8]) -> Option<Self> {
         (self.length() + bytes.len() < MAX_LENGTH).then(|| self.slice(bytes))
     }
 
-    /// Returns the LENGTH so far: that of the command and everything appended.
+    /// Returns the LENGTH so far. It counts the command and all appended bytes.
     pub fn length(&self) -> usize {
         self.len - 4
     }
 
-    /// Writes length and checksum. Append the status byte of a reply before.
+    /// Writes the length and the checksum. Append the status byte of a reply before this call.
     pub fn finish(mut self) -> EncodedTelegram {
         let [low, high] = (self.length() as u16).to_le_bytes();
         self.bytes[2] = low;
@@ -185,7 +186,8 @@ impl fmt::Debug for EncodedTelegram {
     }
 }
 
-/// Returns the checksum of `bytes`, from STX to the last byte before the checksum. It is sent low byte first.
+/// Returns the checksum of `bytes`, from STX to the last byte before the checksum. A telegram contains the checksum
+/// with its low byte first.
 pub fn crc(bytes: &[u8]) -> u16 {
     Checksum::default().of(bytes)
 }
@@ -193,8 +195,8 @@ pub fn crc(bytes: &[u8]) -> u16 {
 /// Incremental checksum of a telegram.
 ///
 /// The manual defines it byte by byte: `crc = crc * x + previous * x^8 + byte`, modulo x^16 + x^15 + x^2 + 1 over GF(2)
-/// (Telegram listing 4, checked against 54 printed telegrams). It can be computed from the sum S of all bytes, each
-/// multiplied by x for every byte after it: `crc = S + (S + last byte) * x^7`. Eight bytes are added to S at once.
+/// (Telegram listing 4, checked against 54 printed telegrams). It also follows from a sum S, in which each byte is
+/// multiplied by x once for every byte after it: `crc = S + (S + last byte) * x^7`. Each step adds eight bytes to S.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Checksum {
     /// Number of bytes in the sum, a multiple of 8.
@@ -203,8 +205,8 @@ pub(crate) struct Checksum {
 }
 
 impl Checksum {
-    /// Adds the `bytes` of the telegram that are not included yet. `bytes` begins with the first byte of the telegram.
-    /// Up to seven bytes are left for the next call.
+    /// Adds the bytes of the telegram that the sum does not include yet. `bytes` starts with the first byte of the
+    /// telegram. Up to seven bytes stay for the next call.
     pub(crate) fn extend(&mut self, bytes: &[u8]) {
         let (words, _) = bytes[self.len..].as_chunks();
         let add = |(sum, carry), &word| {
@@ -216,7 +218,7 @@ impl Checksum {
         self.len += 8 * words.len();
     }
 
-    /// Returns the checksum of `bytes`, which begin with the bytes that are already included.
+    /// Returns the checksum of `bytes`. `bytes` starts with the bytes that the sum already includes.
     fn of(mut self, bytes: &[u8]) -> u16 {
         self.extend(bytes);
         let rest = &bytes[self.len..];

@@ -1,15 +1,16 @@
-//! Settings of a scanner: variant (angle and resolution), unit, measuring mode and baud rate, with the times that
-//! follow from them. The measuring mode defines how the 16 bits of a measured value are split into a range, or a code
-//! in its place, and the bits above it (Telegram listing, 77h block D and 10.8).
+//! Settings of a scanner: variant (angle and resolution), unit, measuring mode and baud rate, and the times that follow
+//! from them. The measuring mode determines which of the 16 bits of a measured value are the range or a code. The other
+//! bits are the upper bits (Telegram listing, 77h block D and 10.8).
 
 use core::fmt;
 
 use scanhub_schema::Nanos;
 
-/// Time of one revolution of the mirror: 75 Hz nominal (Telegram listing 10; a real motor word of 148 gives 13.32 ms).
+/// Duration of one revolution of the mirror: 75 Hz nominal (Telegram listing 10; a real motor word of 148 gives 13.32
+/// ms).
 pub const MIRROR_PERIOD: Nanos = 13_320_000;
-/// Maximum number of bytes that the scanner sends per revolution. A telegram of 732 bytes is therefore sent in two
-/// bursts.
+/// Maximum number of bytes that the scanner sends per revolution. The scanner therefore sends a telegram of 732 bytes
+/// in two bursts.
 pub const BYTES_PER_REVOLUTION: usize = 508;
 /// Maximum number of beams in one telegram: 100 degrees at 0.25.
 pub const MAX_BEAMS: usize = 401;
@@ -27,7 +28,8 @@ impl Variant {
     /// 180 degrees at 0.5 with 361 beams, the factory setting of an LMS 200 and 291.
     pub const HALF: Variant = Variant { angle_deg: 180, resolution_cdeg: 50 };
 
-    /// All variants that fit into a telegram. 180 degrees at 0.25 does not, because the maximum is 401 values.
+    /// All variants whose scans fit into a telegram. The scan of 180 degrees at 0.25 does not fit, because the maximum
+    /// is 401 values.
     pub const ALL: [Variant; 5] = [
         Variant { angle_deg: 180, resolution_cdeg: 100 },
         Variant::HALF,
@@ -36,8 +38,8 @@ impl Variant {
         Variant { angle_deg: 100, resolution_cdeg: 25 },
     ];
 
-    /// Returns the variant of `angle_deg` degrees in steps of `resolution_cdeg` hundredths of a degree, or `None` if it
-    /// does not exist.
+    /// Returns the variant of `angle_deg` degrees in steps of `resolution_cdeg` hundredths of a degree. Returns `None`
+    /// if this variant does not exist.
     pub fn new(angle_deg: u16, resolution_cdeg: u16) -> Option<Variant> {
         Variant::ALL.into_iter().find(|v| v.angle_deg == angle_deg && v.resolution_cdeg == resolution_cdeg)
     }
@@ -63,8 +65,8 @@ impl Variant {
         -500 * i32::from(self.angle_deg)
     }
 
-    /// Returns the time between telegrams of `telegram_len` bytes at `baud`. It is a multiple of the scan time, with
-    /// the smallest factor that the line can carry (Telegram listing table 10-17).
+    /// Returns the time between telegrams of `telegram_len` bytes at `baud`. It is the smallest multiple of the scan
+    /// time that the line can carry (Telegram listing table 10-17).
     pub fn period(self, telegram_len: usize, baud: u32) -> Nanos {
         let scan = self.revolutions() * MIRROR_PERIOD;
         scan * scanhub_schema::line_time(telegram_len, baud).div_ceil(scan).max(1)
@@ -103,8 +105,8 @@ impl Unit {
     }
 }
 
-/// Measuring-mode byte of the configuration, which defines how the 16 bits of a value are split (Telegram listing, 77h
-/// block D).
+/// Measuring-mode byte of the configuration, which determines the range bits and the upper bits of a 16-bit value
+/// (Telegram listing, 77h block D).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Mode(pub u8);
 
@@ -118,7 +120,8 @@ impl Mode {
         }
     }
 
-    /// Returns the number of upper bits that are a reflector level: 3, 2 or 1, or 0 if they are field bits.
+    /// Returns the number of upper bits that are a reflector level: 3, 2 or 1. Returns 0 if the upper bits are field
+    /// bits.
     pub fn intensity_bits(self) -> u8 {
         match self.0 {
             0x01 => 3,
@@ -133,7 +136,7 @@ impl Mode {
         if self.0 == 0x0F { 0x8000 } else { 0 }
     }
 
-    /// Returns the maximum value of the range bits, which means "no return".
+    /// Returns the maximum value of the range bits. A value with this maximum means "no return".
     pub fn max_value(self) -> u16 {
         (1 << self.range_bits()) - 1
     }
@@ -175,15 +178,16 @@ impl Baud {
 /// A measured value, split into its parts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Value {
-    /// The range in device units, or the code that says why there is none.
+    /// Range in device units, or the code with the reason why there is no range.
     pub range: Result<u16, Code>,
-    /// The bits above the range, shifted down: a reflector level or field bits, see [`Mode::intensity_bits`]. The
-    /// documents contradict each other about which field bit is dazzle and which is field A, so field bits are not
-    /// decoded.
+    /// Bits above the range bits, shifted down: a reflector level or field bits, see [`Mode::intensity_bits`]. The
+    /// documents contradict each other about which field bit is dazzle and which is field A. Field bits are therefore
+    /// not decoded.
     pub upper: u8,
 }
 
-/// Reason why a value has no range. The highest values of the range bits are codes, counted down from the maximum.
+/// Reason why a value has no range. The highest values of the range bits are codes. A code is the difference between
+/// the maximum and the value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Code {
     /// 0: no stop signal, because nothing was reflected.
@@ -203,7 +207,7 @@ pub enum Code {
 }
 
 impl Code {
-    /// Returns the code of a value that is `below_max` less than the maximum, or `None` if it is a range.
+    /// Returns the code of a value that is `below_max` less than the maximum. Returns `None` if the value is a range.
     pub fn from_distance(below_max: u16) -> Option<Code> {
         Some(match below_max {
             0 => Code::NoReturn,
@@ -233,7 +237,7 @@ impl fmt::Display for Code {
 }
 
 impl Mode {
-    /// Splits `word` according to this mode.
+    /// Splits `word` into range and upper bits according to this mode.
     pub fn split(self, word: u16) -> Value {
         let range = word & self.max_value();
         let code = Code::from_distance(self.max_value() - range);

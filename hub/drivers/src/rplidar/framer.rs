@@ -1,7 +1,8 @@
 //! Framer of RPLIDAR responses, packets and boot messages, in a stream that may lack bytes.
 //!
-//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like one. The framer accepts these packets
-//! only after several consecutive ones with similar angles, and each of them only if another one follows it.
+//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like such a packet. The framer accepts
+//! these packets only after several consecutive packets with similar angles. It accepts each of them only if another
+//! packet follows it.
 
 use crate::line::framing::{Format, FrameCheck};
 use crate::line::{Buffer, suspect};
@@ -19,8 +20,8 @@ pub(crate) enum ExpectedBytes {
     Responses,
     /// Packets of this format.
     Packets(PacketFormat),
-    /// Packets of any format. Express and dense packets look alike and count as the given format. `None` if it is
-    /// unknown.
+    /// Packets of any format. Express and dense packets look alike, and are treated as packets of the given format. It
+    /// is `None` if the format is unknown.
     AnyPackets(Option<PacketFormat>),
 }
 
@@ -66,7 +67,8 @@ pub(crate) struct Framer {
     has_packet: bool,
     /// Number of bytes discarded since the last packet.
     skipped: u32,
-    /// Number of consecutive printable bytes, the last of them, and whether they contain [`BOOT_MESSAGE_NAME`].
+    /// Number of consecutive printable bytes. `last_text` contains the last of them, and `is_named` is whether they
+    /// contain [`BOOT_MESSAGE_NAME`].
     text_len: usize,
     last_text: [u8; BOOT_MESSAGE_NAME.len()],
     is_named: bool,
@@ -112,7 +114,7 @@ impl Framer {
         }
     }
 
-    /// Sets the expected contents of the open bytes and all later ones.
+    /// Sets the contents that the framer expects in the open bytes and in all later bytes.
     pub(crate) fn expect(&mut self, expect: ExpectedBytes) {
         self.expect = expect;
         (self.is_locked, self.skipped) = (false, 0);
@@ -169,7 +171,7 @@ impl Framer {
     }
 
     /// Shortens `span`, which [`Framer::advance`] returned last, to its first `packets` packets. The framer returns the
-    /// others again.
+    /// other packets again.
     pub(crate) fn shorten(&mut self, span: &mut Span, packets: usize) {
         let len = span.len / span.packets;
         self.buffer.unread((span.packets - packets) * len, span.packets - packets);
@@ -197,8 +199,8 @@ impl Framer {
         self.skipped
     }
 
-    /// Returns whether the open bytes follow a packet and may be the next packet. They then count as a packet even if
-    /// they look like a response. Before the first packet, a scanner may respond to a repeated request.
+    /// Returns whether the open bytes follow a packet and may be the next packet. The framer then treats them as a
+    /// packet even if they look like a response. Before the first packet, a scanner may respond to a repeated request.
     fn is_at_packet(&self) -> bool {
         let may_be = |kind: PacketFormat| match self.buffer.open_bytes().get(..kind.byte_len()) {
             Some(packet) => kind.is_valid(packet),
@@ -310,8 +312,8 @@ impl Framer {
     }
 }
 
-/// Returns the number of consecutive packets of one point, at most `max_packets`, and whether more bytes could extend
-/// the run.
+/// Returns the number of consecutive packets of one point at the start of `open`, at most `max_packets`, and whether
+/// more bytes could extend this number.
 fn count_run(open: &[u8], max_packets: usize) -> (usize, bool) {
     let mut before = None;
     let (points, rest) = open.as_chunks::<5>();
@@ -329,16 +331,18 @@ fn count_run(open: &[u8], max_packets: usize) -> (usize, bool) {
     (points.len().min(max_packets), is_open)
 }
 
-/// Capacity of the buffer: the bytes that a tty can buffer while the hub does not read, and two packets.
+/// Capacity of the buffer, in bytes. It holds the bytes that a tty can buffer while the hub does not read, and two
+/// packets.
 const CAPACITY: usize = 4_096 + 2 * PacketFormat::MAX_LEN;
-/// Time without a byte after which no more bytes are in flight. In the slowest stream, an adapter forwards a packet
-/// every 6 ms.
+/// Time without a byte after which no byte of a packet can still arrive. In the slowest stream, an adapter forwards a
+/// packet every 6 ms.
 const HOLD_TIME: Nanos = 10 * MILLIS;
-/// Minimum number of packets of one point in a run. A wrong position yields such a run once in millions.
+/// Minimum number of consecutive packets of one point. At a wrong position, so many packets occur once in millions of
+/// positions.
 const MIN_RUN: usize = 6;
 /// Maximum angle between consecutive points in degrees, even if some points are missing between them.
 const MAX_STEP_DEG: f32 = 30.0;
-/// Minimum length of the text of a boot message, in bytes. A complete one has 64 bytes.
+/// Minimum length of the text of a boot message, in bytes. A complete boot message has 64 bytes.
 const MIN_BOOT_MESSAGE_LEN: usize = 40;
 /// Word near the beginning of the boot message.
 const BOOT_MESSAGE_NAME: &[u8; 5] = b"LIDAR";

@@ -1,7 +1,8 @@
 //! Position of each packet in its stream: the next packet, the first one after a gap, or an outlier.
 //!
-//! Packets have no counter. A head rotates at a constant speed, so the angle from packet to packet is known. The number
-//! of missing packets follows from the angle of the gap, and the number of missing revolutions from its time.
+//! Packets have no counter. A head rotates at a constant speed, so the angle from one packet to the next is known. The
+//! number of missing packets follows from the angle of the gap. The number of missing revolutions follows from the
+//! duration of the gap.
 
 /// State of a stream: its last packet, the speed of the head, and the packet counters. A packet has one point or
 /// several.
@@ -49,18 +50,18 @@ pub(crate) enum Step {
     First,
     /// The packet follows the previous one directly.
     Next,
-    /// Packets are missing before this one, or may be missing. The previous packet was at the angle `from`.
+    /// Packets are missing before this packet, or may be missing. The previous packet was at the angle `from`.
     Gap {
         /// Angle in degrees, as in [`PacketPosition::angle`].
         from: f64,
-        /// Duration in nanoseconds, by the number of counted packets.
+        /// Duration of the gap in nanoseconds, according to the number of counted packets.
         ns: f64,
     },
     /// The packet does not fit into the sequence.
     Outlier,
 }
 
-/// Received packet, as the sequencer needs it.
+/// Data of a received packet that the sequencer needs.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ReceivedPacket {
     /// Angle of the first point, in degrees clockwise.
@@ -108,15 +109,15 @@ impl PacketSequencer {
         (self.received, self.lost)
     }
 
-    /// Returns the angle from one packet to the next, in degrees. Returns `None` until it is known, and if the head
-    /// does not rotate.
+    /// Returns the angle from one packet to the next, in degrees. Returns `None` until the angle is known, and if the
+    /// head does not rotate.
     pub(crate) fn advance(&self) -> Option<f64> {
         (self.learned_packets >= LEARNING_PACKETS && self.advance > MIN_PACKET_DEG).then_some(self.advance)
     }
 
-    /// Returns the position of a packet of several points. `delay` takes the time of its first point and whether there
-    /// is a gap before the packet. It returns the delay of the packet's arrival in nanoseconds, compared with the usual
-    /// arrival.
+    /// Returns the position of a packet of several points. `delay` is called with the time of the packet's first point,
+    /// and with whether there is a gap before the packet. It returns by how many nanoseconds the packet arrived later
+    /// than usual.
     pub(crate) fn locate(
         &mut self,
         packet: ReceivedPacket,
@@ -145,7 +146,8 @@ impl PacketSequencer {
         let late = |time: f64| delay(time, true);
         let angle = angle + 360.0 * speed.missing_revolutions(late(last.time + speed.time(angle)));
         let packets = f64::from((angle / advance + 0.5) as u32);
-        // During a long gap, the speed of the head may have changed. The time then gives a better number of packets.
+        // During a long gap, the speed of the head may have changed. The number of packets is then more exact if it
+        // follows from the time.
         let max_correction = f64::from((0.1 * packets) as u32);
         let late_by = late(last.time + packets * packet.packet_ns) / packet.packet_ns;
         let off = (late_by + 0.5f64.copysign(late_by)).clamp(-max_correction, max_correction) as i32;
@@ -173,8 +175,8 @@ impl PacketSequencer {
         let angle = clockwise(last.start, packet.start);
         let angle = if angle > 360.0 - MAX_BACKWARD_DEG { angle - 360.0 } else { angle };
         self.is_whole &= packet.is_adjacent();
-        // The skipped bytes may have been points that lost bytes or had extra ones. If they took less time than points,
-        // they were not points.
+        // The skipped bytes may have been points that lost bytes or contained extra bytes. If the skipped bytes took
+        // less time than points, they were not points.
         let points = f64::from(1 + (packet.skipped + 3) / POINT_LEN);
         let early =
             if packet.is_adjacent() { 0.0 } else { -delay(last.time + points * packet.packet_ns, false) };
@@ -315,8 +317,8 @@ impl RotationSpeed {
         f64::from((late.max(0.0) / self.time(360.0) + 0.5) as u32)
     }
 
-    /// Returns whether a packet `angle` degrees after the previous one arrived before it can have been measured. The
-    /// tolerance covers the drift of the clocks.
+    /// Returns whether a packet arrived earlier than the scanner can have measured it. It is `angle` degrees after the
+    /// previous packet. The tolerance covers the drift of the clocks.
     fn is_early(self, late: f64, angle: f64) -> bool {
         late < -(MAX_EARLY_NS + MAX_DRIFT * self.time(angle))
     }
@@ -327,23 +329,25 @@ impl RotationSpeed {
     }
 }
 
-/// Number of packets in agreement after which the angle between them counts, and number of consecutive outliers after
-/// which they start a new sequence.
+/// Number of packets that must agree before the angle between them counts. Also the number of consecutive outliers that
+/// start a new sequence.
 const LEARNING_PACKETS: u32 = 3;
-/// Number of packets in agreement after which missing packets count as lost. Before, the head may still be spinning up.
+/// Number of packets that must agree before missing packets count as lost. Before that, the head may still be spinning
+/// up.
 const STEADY_PACKETS: u32 = 12;
-/// Maximum angle of a packet in degrees. If it is larger, a revolution has fewer than four packets.
+/// Maximum angle from one packet to the next, in degrees. With a larger angle, a revolution has fewer than four
+/// packets.
 const MAX_PACKET_DEG: f64 = 100.0;
-/// Angle of a packet in degrees up to which the head counts as stopped.
+/// Maximum angle from one packet to the next at which the head counts as stopped, in degrees.
 const MIN_PACKET_DEG: f64 = 0.02;
 /// Start of the scanner's clock in nanoseconds. It is large enough that no time is negative.
 const CLOCK_START_NS: f64 = 1e10;
-/// Maximum angle in degrees by which a point may precede the previous one; below it, by which it may follow without a
-/// gap.
+/// Maximum angle by which a point may precede the previous point, in degrees. `MAX_FORWARD_DEG` is the maximum angle by
+/// which a point may follow the previous point without a gap.
 const MAX_BACKWARD_DEG: f64 = 25.0;
 const MAX_FORWARD_DEG: f64 = 25.0;
-/// Maximum time in nanoseconds by which a packet may be early; below it, the maximum drift between the clocks, as a
-/// ratio.
+/// Maximum time by which a packet may be early, in nanoseconds. `MAX_DRIFT` is the maximum drift between the clocks, as
+/// a ratio.
 const MAX_EARLY_NS: f64 = 3e6;
 const MAX_DRIFT: f64 = 0.02;
 /// Length of a packet of one point, in bytes.
