@@ -1,11 +1,12 @@
-//! Three-dimensional points, background and obstacles from a planar scanner that a mount tilts, sweep by sweep.
+//! Computes three-dimensional points, background and obstacles, sweep by sweep, from the scans of a planar scanner that
+//! a mount tilts.
 //!
-//! A [`Mount`] describes the axis. [`TiltScanner`] takes scans and [`Angle`]s and returns [`Sweep`]s. Each beam gets
-//! the mount's angle at its own time. A beam without a reliable angle produces no point; [`Counts`] has the number of
-//! such beams by reason.
+//! A [`Mount`] describes the axis. [`TiltScanner`] takes scans and [`Angle`]s and returns [`Sweep`]s. For each beam,
+//! the mount's angle at the time of that beam is used. A beam without a reliable angle produces no point. [`Counts`]
+//! has the number of these beams for each reason.
 //!
-//! The module uses neither a clock nor I/O. Time is that of the stamps, so a recording gives the same points at any
-//! speed.
+//! The module uses neither a clock nor I/O. All times are stamps of scans and angles, so a recording gives the same
+//! points at any speed.
 
 mod angles;
 mod background;
@@ -30,20 +31,20 @@ use self::sweep::{Ray, SweepAnalyzer};
 #[doc = include_str!("../../../docs/tilt.md")]
 struct Page;
 
-/// Maximum number of scans that wait for angles. With one more, the oldest is processed at once.
+/// Maximum number of scans that wait for angles. If one more scan arrives, the oldest is processed at once.
 const MAX_WAITING_SCANS: usize = 64;
-/// Maximum number of beams of a sweep. A sweep with more ends without a reversal.
+/// Maximum number of beams of a sweep. A sweep that reaches this number ends without a reversal.
 const MAX_RAYS: usize = 262_144;
-/// Minimum step backward from the last stamp that counts as a clock that was set back, in ns.
+/// Minimum time by which a stamp must be earlier than the last one to show that the clock was set back, in ns.
 const CLOCK_JUMP_NS: u64 = 1_000_000_000;
 /// Counters since the creation of the scanner.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
-    /// Returned sweeps.
+    /// Sweeps that were passed to the caller.
     pub sweeps: u64,
-    /// Returned sweeps that are not complete.
+    /// Sweeps that were passed to the caller and are not complete.
     pub incomplete: u64,
-    /// Returned sweeps that contradict the background.
+    /// Sweeps that were passed to the caller and contradict the background.
     pub unreliable: u64,
     /// Resets of the background, because scans changed or sweeps contradicted it for too long.
     pub background_resets: u64,
@@ -53,14 +54,14 @@ pub struct Counts {
     pub out_of_order: u64,
     /// Created points.
     pub points: u64,
-    /// Beams with a reading but without a point, by [`DropReason`].
+    /// Beams that have a reading but produced no point, by [`DropReason`].
     #[serde(serialize_with = "by_reason")]
     pub points_dropped: [u64; DropReason::COUNT],
     /// Accepted angles.
     pub angles: u64,
     /// Angles that were dropped because later ones had arrived.
     pub angles_out_of_order: u64,
-    /// Angles that were dropped because their stamps are later than those of all scans.
+    /// Angles that were dropped because their stamps are later than the stamps of all scans.
     pub angles_in_future: u64,
     /// Angles that were dropped because they are not numbers.
     pub angles_invalid: u64,
@@ -82,7 +83,7 @@ struct PendingScan {
 #[derive(Clone, Copy)]
 struct SweepEnd {
     stamp_ns: u64,
-    /// Whether the mount reversed. Otherwise, its angle is unknown after this stamp.
+    /// Whether the mount reversed. If false, the mount's angle is unknown after `stamp_ns`.
     is_reversal: bool,
 }
 
@@ -102,7 +103,7 @@ pub struct TiltScanner {
     next_rays: Vec<Ray>,
     analyzer: SweepAnalyzer,
     delay: Delay,
-    /// Number of beams, first angle and step of the scans.
+    /// Shape of the scans: number of beams, first angle, and angle between two beams.
     shape: (usize, f64, f64),
     from_ns: u64,
     /// Whether the sweep started at a reversal and has all beams so far.
@@ -138,13 +139,13 @@ impl TiltScanner {
         Counts { background_resets: self.analyzer.background_resets, ..self.counts }
     }
 
-    /// Returns the estimated delay of the mount's stamps in ns, by which all angles are corrected. It is computed from
-    /// the difference between up and down sweeps.
+    /// Returns the estimated delay of the mount's stamps in ns. All angles are corrected by it. It is computed from the
+    /// difference between up and down sweeps.
     pub fn late_ns(&self) -> i64 {
         self.angles.late_ns()
     }
 
-    /// Returns the reason why beams that are measured now produce no points; `None` if they produce points.
+    /// Returns the reason why the beams of new scans produce no points; `None` if they produce points.
     pub fn problem(&self) -> Option<DropReason> {
         let late_ns = self.scan_ns.unwrap_or(0).saturating_sub(self.settings.delay_ns);
         let is_silent = self.angles.last_ns().is_none_or(|last_ns| last_ns < late_ns);
@@ -188,7 +189,8 @@ impl TiltScanner {
         self.advance(&mut show);
     }
 
-    /// Handles the next scan, whose header has the first stamp `stamp_ns`, and passes each complete sweep to `show`.
+    /// Handles the next scan, and passes each complete sweep to `show`. `stamp_ns` is the first stamp in the scan's
+    /// header.
     pub fn take_scan(&mut self, stamp_ns: u64, scan: &Scan, mut show: impl FnMut(&Sweep<'_>)) {
         if let Some(last_ns) = self.scan_ns.filter(|&last_ns| stamp_ns <= last_ns) {
             if last_ns - stamp_ns < CLOCK_JUMP_NS {
@@ -227,7 +229,7 @@ impl TiltScanner {
         if shape != self.shape {
             self.analyzer.begin(shape.0, self.shape.0 == 0);
             self.delay.reset();
-            // Drop beams of the old shape, because they have other directions.
+            // Drop the beams of earlier scans, because they have other directions.
             self.rays.clear();
             self.spare_scans.extend(self.waiting.drain(..).map(|one| one.scan));
             self.is_whole = false;
@@ -235,7 +237,7 @@ impl TiltScanner {
         }
     }
 
-    /// Ends the sweep at `stamp_ns`, because the angle is unknown after that.
+    /// Ends the sweep at `stamp_ns`, because the mount's angle is unknown after this time.
     fn interrupt_sweep(&mut self, stamp_ns: u64) {
         if self.ends.back().is_none_or(|end| end.is_reversal || end.stamp_ns < stamp_ns) {
             self.ends.push_back(SweepEnd { stamp_ns, is_reversal: false });
@@ -306,8 +308,8 @@ impl TiltScanner {
         }
     }
 
-    /// Adds `more_ns` to the delay of the angles' stamps, and corrects the angles of the beams of this sweep and the
-    /// next one. Returns for both whether they still have all beams. The first beams may need angles that are no longer
+    /// Adds `more_ns` to the delay of the angles' stamps. Then corrects the beams' angles in this sweep and the next
+    /// one. Returns for each sweep whether it still has all beams. The first beams may need angles that are no longer
     /// stored, and the last ones angles that have not arrived.
     fn correct(&mut self, more_ns: i64) -> [bool; 2] {
         self.angles.correct(more_ns);
@@ -369,7 +371,7 @@ pub struct Point {
     pub stamp_ns: u64,
     /// Index of the beam in its scan.
     pub beam: u16,
-    /// Class of the point, compared with the background before this sweep.
+    /// Class of the point: the result of its comparison with the background before this sweep.
     pub class: PointClass,
 }
 
@@ -384,18 +386,18 @@ pub struct Sweep<'a> {
     pub until_ns: u64,
     /// Whether the sweep lasts from one reversal to the next, and every beam had a reliable angle.
     pub is_complete: bool,
-    /// Whether the angles contradict the background, and are therefore unreliable. All points then have class unknown,
-    /// and there are no obstacles.
+    /// Whether the angles are unreliable because they contradict the background. All points of an unreliable sweep have
+    /// class unknown, and it has no obstacles.
     pub is_unreliable: bool,
     /// Generation of the background with which the points were compared. Each reset increases it by 1.
     pub generation: u32,
-    /// Delay of the angles' stamps that was corrected, in ns.
+    /// Delay of the angles' stamps by which the angles were corrected, in ns.
     pub late_ns: i64,
     /// Points in the order of their scans.
     pub points: &'a [Point],
     /// Obstacles, the nearest first.
     pub obstacles: &'a [Obstacle],
-    /// Number of obstacles beyond the maximum.
+    /// Number of obstacles that were dropped because a sweep has a maximum number of obstacles.
     pub dropped: u32,
 }
 
@@ -404,15 +406,16 @@ pub struct Sweep<'a> {
 pub struct Settings {
     /// Maximum time for which a scan waits for the angles of its beams, in ns of the stamps.
     pub delay_ns: u64,
-    /// Maximum time between two angles that can be interpolated, in ns.
+    /// Maximum time between two angles for interpolation, in ns.
     pub gap_ns: u64,
     /// Maximum speed of a mount in rad/s. A faster change counts as a jump of its encoder.
     pub max_speed_rad_s: f64,
-    /// Maximum difference between the speed that two angles show and the rates in their samples, in rad/s.
+    /// Maximum difference between the speed computed from two angles and the rates in the samples of these angles, in
+    /// rad/s.
     pub rate_rad_s: f64,
     /// Time without a jump after which angles are reliable again, in ns.
     pub settle_ns: u64,
-    /// Minimum change of the angle in the other direction that counts as a reversal, in radians.
+    /// Minimum change of the angle in the opposite direction that counts as a reversal, in radians.
     pub reversal_rad: f64,
     /// Time in ns after which the mount counts as standing, if its angle changes by less than a tenth of
     /// [`reversal_rad`](Self::reversal_rad).
@@ -421,13 +424,13 @@ pub struct Settings {
     pub bin_rad: f64,
     /// Minimum distance of foreground from the background, in meters.
     pub threshold_m: f64,
-    /// Number of sweeps that must meet a surface before it becomes background.
+    /// Number of sweeps whose beams must meet a surface before it becomes background.
     pub sweeps: u16,
-    /// Maximum share of the known background that may differ in a sweep. With more, the sweep contradicts the
-    /// background.
-    pub max_displaced_share: f64,
-    /// Maximum error of the angles in a part of a sweep, in radians, as the floor shows it. With more, the sweep
+    /// Maximum share of a sweep's beams on known background whose range may differ from it. If more differ, the sweep
     /// contradicts the background.
+    pub max_displaced_share: f64,
+    /// Maximum error of the angles in a part of a sweep, in radians, measured on the floor. If the error is larger, the
+    /// sweep contradicts the background.
     pub max_error_rad: f64,
     /// Minimum number of points of an obstacle.
     pub points: usize,

@@ -1,12 +1,13 @@
-//! Tracking of people across the sensors and rooms of a site, from the foregrounds of several sensors to people with an
-//! ID.
+//! Tracks people across the sensors and rooms of a site. The input is the foregrounds of several sensors, and the
+//! output is people with IDs.
 //!
 //! A [`Site`] describes sensors, rooms and doors. [`PeopleTracker`] takes scans with their foregrounds and returns
-//! [`Snapshot`]s: the tracks at one time, and the events before it. It processes the scans of all sensors in the order
-//! of their stamps, with a bounded wait for the latest, and estimates the offsets between the clocks of the hubs.
+//! [`Snapshot`]s: the tracks at one time, and the events since the previous snapshot. It processes the scans of all
+//! sensors in the order of their stamps, and waits for late scans for a limited time. It also estimates the offsets
+//! between the clocks of the hubs.
 //!
-//! The module uses neither a clock nor I/O. Time is that of the samples (`wall_ns`), so a recording gives the same
-//! tracks at any speed.
+//! The module uses neither a clock nor I/O. All times are stamps of the samples (`wall_ns`), so a recording gives the
+//! same tracks at any speed.
 
 mod assignment;
 pub mod geometry;
@@ -28,11 +29,11 @@ pub use self::site::Site;
 pub use self::tracker::SNAPSHOT_INTERVAL_NS;
 use self::tracker::{MAX_PEOPLE, Tracker};
 
-/// Maximum number of waiting scans of a sensor. With one more, the oldest is processed at once.
+/// Maximum number of waiting scans of a sensor. If one more scan arrives, the oldest is processed at once.
 const MAX_WAITING_SCANS: usize = 64;
-/// Minimum difference from all other stamps that counts as a jump of the clock, in ns.
+/// Minimum difference between a stamp and all other stamps that counts as a jump of the clock, in ns.
 const CLOCK_JUMP_NS: u64 = 2_000_000_000;
-/// Number of such stamps in a row after which they are accepted as the new time.
+/// Number of stamps in a row that differ by [`CLOCK_JUMP_NS`] or more and are then accepted as the new time.
 const MAX_JUMPS: u32 = 50;
 /// Share of an offset that one correction removes.
 const CORRECTION_GAIN: f64 = 0.05;
@@ -46,9 +47,9 @@ const MAX_OFFSET_NS: f64 = 250e6;
 pub struct Counts {
     /// Processed scans.
     pub scans: u64,
-    /// Scans that were dropped because they arrived after the delay.
+    /// Scans that were dropped because they arrived later than the tracker waits.
     pub late: u64,
-    /// Scans that were dropped because their stamps differ by seconds from all others.
+    /// Scans that were dropped because their stamps differ by seconds from all other stamps.
     pub jumped: u64,
     /// Scans that were dropped because their foreground has another number of beams, or because their sensor is not in
     /// the site.
@@ -56,7 +57,7 @@ pub struct Counts {
 }
 
 struct WaitingScan {
-    /// Original stamp. It is corrected when the scan is processed.
+    /// Stamp of the scan. The offset of the clock is subtracted when the scan is processed.
     wall_ns: u64,
     scan: Box<Scan>,
     foreground: Box<Foreground>,
@@ -121,7 +122,7 @@ impl PeopleTracker {
         self.counts
     }
 
-    /// Returns the number of late scans of each sensor, by its index in the site. The sum is [`Counts::late`].
+    /// Returns the number of late scans of each sensor, by the sensor's index in the site. The sum is [`Counts::late`].
     pub fn late(&self) -> &[u64] {
         &self.late
     }
@@ -132,8 +133,9 @@ impl PeopleTracker {
         self.hub_of.get(sensor).map_or(0.0, |&hub| self.offsets[hub] * 1e-9)
     }
 
-    /// Handles a scan of `sensor`, an index in the site, with its foreground and its wall clock stamp. Passes each
-    /// snapshot that is due to `show`. Scans that arrive within the delay are processed in the order of their stamps.
+    /// Handles a scan with its foreground and its wall clock stamp. `sensor` is the index of its sensor in the site.
+    /// Passes each snapshot that is due to `show`. Scans that arrive within the delay are processed in the order of
+    /// their stamps.
     pub fn take(
         &mut self,
         sensor: usize,
@@ -229,8 +231,8 @@ impl PeopleTracker {
         }
     }
 
-    /// Counts a stamp that differs much from the current time. Returns whether enough have done so in a row, which
-    /// means that the clock was set.
+    /// Counts a stamp that differs much from the current time. After enough of these stamps in a row, returns true,
+    /// because the clock was set.
     fn is_new_time(&mut self, at_ns: u64) -> bool {
         self.jumps += 1;
         let is_new = self.jumps > MAX_JUMPS;
@@ -244,8 +246,8 @@ impl PeopleTracker {
         is_new
     }
 
-    /// Estimates the offsets of the clocks. A sensor whose clock lags sees a walking person ahead of the expected
-    /// position. One whose clock leads sees the person farther back.
+    /// Estimates the offsets of the clocks. If a sensor's clock lags, the sensor sees a walking person ahead of the
+    /// expected position. If the clock leads, the sensor sees the person behind the expected position.
     fn compare_clocks(&mut self) {
         for (sensor, &hub) in self.hub_of.iter().enumerate() {
             if hub == 0 || hub != sensor {
@@ -272,8 +274,8 @@ impl PeopleTracker {
     }
 }
 
-/// Factor from the visible offset to the real one. The filter follows each sensor partly, so only a part of the offset
-/// is visible.
+/// Ratio of the real offset to the measured offset. The filter partly follows each sensor, so only a part of the offset
+/// can be measured.
 const OFFSET_FEEDBACK: f64 = 3.0;
 
 /// Track of a person at one time.
@@ -295,7 +297,7 @@ pub struct Track {
     pub sensors: u32,
     /// Seconds since the person was first seen.
     pub age_s: f64,
-    /// Confidence that this is a person, 0 to 1.
+    /// Confidence that the track is a person, 0 to 1.
     pub score: f64,
 }
 
@@ -330,15 +332,16 @@ pub struct Event {
     pub kind: Kind,
 }
 
-/// A sensor that is not at its position in the site, detected by another sensor that sees the same people. The tracker
-/// corrects its position from then on.
+/// A sensor that is not at its position in the site. It was detected by comparison with another sensor that sees the
+/// same people. From now on, the tracker corrects the position of the misplaced sensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MisplacedSensor {
     /// Index of the sensor in the site.
     pub sensor: usize,
-    /// Index of the other sensor.
+    /// Index of the sensor with which it was compared.
     pub other: usize,
-    /// Offset of the people that this sensor sees from those that the other one sees, in the map, in meters.
+    /// Offset of people's positions as `sensor` sees them from their positions as `other` sees them, in the map, in
+    /// meters.
     pub offset: Point,
 }
 
@@ -440,7 +443,8 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
         people.tracker.capacity() + queues + people.spare_scans.capacity() + picture
     }
 
-    /// Returns a scan of a sensor with a wall 3 m around it, and two legs at a range of 2 m around one beam.
+    /// Returns a scan of a sensor with a wall at 3 m in all directions. `legs` is the beam around which two legs stand
+    /// at 2 m.
     fn scan(legs: Option<usize>) -> Box<Scan> {
         let head = ScanHead {
             first_angle: -std::f64::consts::FRAC_PI_2,
@@ -476,7 +480,8 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
         };
         (0..300).for_each(|_| turn(&mut people, None));
         let mut visit = |people: &mut PeopleTracker, number: usize| {
-            // In 40 of 75 scans, a person walks past. Their track is deleted before the next person arrives.
+            // In 40 of 75 scans, a person walks past. The track of this person is deleted before the next person
+            // arrives.
             for i in 0..SCANS {
                 turn(people, (i < 40).then_some(60 + number % 100 + 3 * i));
             }

@@ -1,5 +1,5 @@
-//! Verbs of this crate, each with its arguments and a function `run`. They subscribe to a hub, and print and publish
-//! the results of [`track`](mod@crate::track) and [`tilt`](mod@crate::tilt).
+//! Verbs of this crate, each with its arguments and a function `run`. The verbs subscribe to a hub, and print and
+//! publish the results of [`track`](mod@crate::track) and [`tilt`](mod@crate::tilt).
 
 mod results;
 mod site;

@@ -7,10 +7,10 @@ use serde::Serialize;
 
 use super::{Counts, Settings};
 
-/// An angle that the encoder or drive of the mount reports.
+/// An angle reported by the mount's encoder or drive.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Angle {
-    /// Time of the measurement in CLOCK_MONOTONIC, not of the report.
+    /// Time of the measurement (not of the report) on CLOCK_MONOTONIC.
     pub stamp_ns: u64,
     /// Angle in radians, in the direction that [`Mount`](super::Mount) defines.
     pub angle_rad: f64,
@@ -23,18 +23,18 @@ pub struct Angle {
 #[serde(rename_all = "snake_case")]
 #[repr(usize)]
 pub enum DropReason {
-    /// No angle was reported for that time, or it arrived too late.
+    /// No angle was reported for the time of the beam, or the angle arrived too late.
     Silent,
-    /// The angle jumps, or has jumped recently.
+    /// The angle jumps, or jumped recently.
     Jumped,
     /// The angles contradict their rates.
     Inconsistent,
-    /// The mount stands, or its encoder is stuck. Both look the same.
+    /// The mount stands, or its encoder is stuck. The angles do not show which of the two.
     Standing,
 }
 
 impl DropReason {
-    /// Number of reasons.
+    /// Number of variants.
     pub const COUNT: usize = 4;
 }
 
@@ -54,14 +54,14 @@ pub(crate) enum AngleUpdate {
     Dropped,
     /// The mount moved to this angle.
     Moved,
-    /// The angles between the last one and this one are unknown.
+    /// The angles between the previous angle and the new one are unknown.
     Interrupted,
 }
 
 #[derive(Clone, Copy)]
 struct Entry {
     angle: Angle,
-    /// Reason why the angles between the last one and this one are unknown.
+    /// Reason why the angles between the previous angle and this one are unknown.
     drop_reason: Option<DropReason>,
 }
 
@@ -73,10 +73,10 @@ pub(crate) struct Angles {
     late_ns: i64,
 }
 
-/// Maximum number of stored angles, which is ten seconds at 100 Hz.
+/// Maximum number of stored angles: ten seconds at 100 Hz.
 const MAX_ANGLES: usize = 1024;
-/// Difference in ns from which on a clock counts as set back, compared with other angles, or an angle is dropped,
-/// compared with the scans.
+/// Two limits in ns. If a stamp is earlier than the previous angle's stamp by more than this, the clock was set back.
+/// If a stamp is later than the latest scan's stamp by more than this, the angle is dropped.
 const CLOCK_JUMP_NS: u64 = 1_000_000_000;
 
 impl Angles {
@@ -133,7 +133,7 @@ impl Angles {
         if angle.stamp_ns <= self.settled_ns {
             return Some(DropReason::Jumped);
         }
-        // At a reversal, the rates of the two angles differ, and the speed is between them.
+        // At a reversal, the rates of the two angles differ, and the speed is between the two rates.
         let (lowest, highest) =
             (before.rate_rad_s.min(angle.rate_rad_s), before.rate_rad_s.max(angle.rate_rad_s));
         let is_off = speed < lowest - settings.rate_rad_s || speed > highest + settings.rate_rad_s;
@@ -160,7 +160,7 @@ impl Angles {
         self.late_ns += more_ns;
     }
 
-    /// Returns the time at which the mount had the angle with stamp `stamp_ns`.
+    /// Returns the time at which the mount had the angle with the stamp `stamp_ns`.
     pub(crate) fn true_ns(&self, stamp_ns: u64) -> u64 {
         stamp_ns.saturating_add_signed(-self.late_ns)
     }
@@ -170,7 +170,7 @@ impl Angles {
         self.entries.back().map(|entry| self.true_ns(entry.angle.stamp_ns))
     }
 
-    /// Returns the reason why the angle is unknown between the last two reports, if it is.
+    /// Returns the reason why the angle is unknown between the last two reports; `None` if it is known.
     pub(crate) fn problem(&self) -> Option<DropReason> {
         self.entries.back().map_or(Some(DropReason::Silent), |entry| entry.drop_reason)
     }
@@ -193,7 +193,7 @@ impl Angles {
     }
 }
 
-/// Event that a new angle shows.
+/// Event that is detected when a new angle arrives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SwingEvent {
     Nothing,
@@ -221,8 +221,8 @@ enum Direction {
     Down(StampedAngle),
 }
 
-/// Detects the reversals of a mount, and whether it stands. Because of a hysteresis, play in the gears counts as
-/// neither.
+/// Detects the reversals of a mount, and whether the mount stands. Play in the gears is not detected as a reversal,
+/// because the detector has a hysteresis.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ReversalDetector {
     direction: Option<Direction>,
@@ -236,7 +236,7 @@ impl ReversalDetector {
         *self = ReversalDetector::default();
     }
 
-    /// Handles the next angle, and returns the event that it shows.
+    /// Handles the next angle, and returns the event that it causes.
     pub(crate) fn take(&mut self, stamp_ns: u64, rad: f64, settings: &Settings) -> SwingEvent {
         use Direction::{Down, Open, Up};
         use SwingEvent::{Nothing, Reversed};
@@ -361,7 +361,8 @@ mod tests {
         events.filter(|event| *event != SwingEvent::Nothing).collect()
     }
 
-    /// Returns the angle in degrees at report `i`: 20 degrees up and down in two seconds, with half a degree of play.
+    /// Returns the angle in degrees at report `i`. The mount swings by 20 degrees up and down in two seconds, with half
+    /// a degree of play.
     fn triangle(i: u32) -> f64 {
         let phase = f64::from(i % 200) / 100.0;
         20.0 * if phase < 1.0 { phase } else { 2.0 - phase } + if i.is_multiple_of(2) { 0.25 } else { -0.25 }

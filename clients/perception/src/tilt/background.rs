@@ -1,6 +1,6 @@
-//! Background in three dimensions: the surface that each beam usually reaches, in each narrow range of the mount's
-//! angle. It is learned as in two dimensions: a surface that a number of sweeps in a row meet replaces the previous
-//! one.
+//! Background in three dimensions: the surface that each beam usually meets, for each narrow range of the mount's
+//! angle. It is learned as the background in two dimensions: if a number of sweeps in a row meet another surface, this
+//! surface replaces the previous one.
 
 use scanhub_schema::PointClass;
 
@@ -23,11 +23,11 @@ pub(crate) struct Reading {
 /// A surface, described by one reading.
 #[derive(Clone, Copy, Default)]
 struct Surface {
-    /// Range in meters; 0 without a surface.
+    /// Range in meters; 0 if there is no surface.
     range_m: f32,
     rise: f32,
-    /// Mean squared differences of the beams from a level surface and from an upright one. Recent beams have more
-    /// weight.
+    /// Mean squared difference between the beams and a level surface, and between the beams and an upright surface.
+    /// Recent beams have more weight.
     off: [f32; 2],
 }
 
@@ -38,21 +38,22 @@ struct Cell {
     candidate: Surface,
     /// Number of sweeps in a row that met the candidate.
     run: u16,
-    /// Surfaces that beams meet occasionally, because they are narrower than the distance between two scans.
+    /// Surfaces that are narrower than the distance between two scans, so that beams meet them only in some sweeps.
     narrow: [NarrowSurface; MAX_NARROW],
-    /// Number of the sweep that last updated the cell, plus 1. Only one reading of a sweep counts.
+    /// Number of the sweep that last updated the cell, plus 1. Each sweep updates a cell only once.
     last_sweep: u32,
 }
 
-/// A surface that the beams of a cell do not meet in every sweep.
+/// A surface that the beams of a cell meet only in some sweeps.
 #[derive(Clone, Copy, Default)]
 struct NarrowSurface {
     surface: Surface,
-    /// Number of sweeps that met the surface. Beams that meet a third surface decrease it. 0 if no surface is stored.
+    /// Number of sweeps that met the surface; 0 if no surface is stored. Beams that meet a third surface decrease this
+    /// number.
     hit_count: u16,
-    /// Number of times that a sweep met the surface after one that did not.
+    /// Number of times that a sweep met the surface after a sweep that missed it.
     visits: u16,
-    /// Number of sweeps since the last one that met the surface. Sweeps that did not measure the cell do not count.
+    /// Number of sweeps since a sweep last met the surface. Sweeps that did not measure the cell do not count.
     miss_count: u16,
 }
 
@@ -72,7 +73,7 @@ impl SurfaceModel {
         SurfaceModel { beams, sweeps: settings.sweeps, rows: (0..rows).map(|_| Box::default()).collect() }
     }
 
-    /// Returns the class of a reading, compared with the model.
+    /// Compares a reading with the model, and returns its class.
     pub(crate) fn class(&self, reading: &Reading, row: usize, threshold_m: f32) -> PointClass {
         let beam = usize::from(reading.beam);
         let own = self.background(row, beam);
@@ -107,9 +108,9 @@ impl SurfaceModel {
         self.background(row, reading.beam.into()).is_some()
     }
 
-    /// Returns the error of the mount's angle that the reading shows, in radians: the difference from the angle at
-    /// which the reading would be on the background. Returns `None` unless the background is a level surface that the
-    /// beam meets at a steep angle.
+    /// Returns the error of the mount's angle in radians, computed from the reading. It is the difference between the
+    /// mount's angle and the angle at which the reading would be on the background. Returns `None` unless the
+    /// background is a level surface that the beam meets at a steep angle.
     pub(crate) fn angle_off(&self, reading: &Reading, row: usize, threshold_m: f32) -> Option<f32> {
         let known = self.background(row, reading.beam.into())?;
         let [level, upright] = known.ends(reading);
@@ -170,7 +171,7 @@ impl SurfaceModel {
 }
 
 impl Cell {
-    /// Counts the sweeps that meet surfaces other than the background.
+    /// Counts sweeps that meet other surfaces than the background.
     fn learn_narrow(&mut self, reading: &Reading, sweeps: u16, threshold_m: f32) {
         let explains = |narrow: &&mut NarrowSurface| {
             narrow.hit_count > 0 && narrow.surface.explains(reading, threshold_m)
@@ -188,13 +189,13 @@ impl Cell {
 }
 
 impl NarrowSurface {
-    /// Returns whether the surface is background. An object that stands for a while and leaves has one visit. People
-    /// who walk do not return to the same range.
+    /// Returns whether the surface is background. An object that stands for a while and then leaves causes only one
+    /// visit. People who walk do not return to the same range.
     fn is_background(&self, sweeps: u16) -> bool {
         self.hit_count >= sweeps && self.visits >= MIN_VISITS.min(sweeps)
     }
 
-    /// Starts a sweep that measures this cell. Removes the surface if too many sweeps have met another one.
+    /// Starts a sweep that measures this cell. Removes the surface if too many sweeps have missed it.
     fn begin_sweep(&mut self, sweeps: u16) {
         self.miss_count = self.miss_count.saturating_add(1);
         if self.miss_count > sweeps.saturating_mul(FORGET_FACTOR) {
@@ -217,8 +218,8 @@ fn width_rad(settings: &Settings) -> f64 {
     settings.bin_rad.max(MIN_BIN_RAD)
 }
 
-/// Returns the row of the model for a beam at `beam_rad` that was measured at `angle_rad`, and the reading to compare
-/// with it.
+/// Returns the row of the model for a beam with direction `beam_rad` at the mount's angle `angle_rad`, and the reading
+/// to compare with this row.
 pub(crate) fn row_for(
     mount: &Mount,
     settings: &Settings,
@@ -243,8 +244,9 @@ impl Surface {
         self.range_m > 0.0
     }
 
-    /// Returns two ranges of a beam that rises as `reading` does: the one if the surface is level and keeps its height,
-    /// and the one if it is upright and keeps its horizontal distance.
+    /// Returns two ranges at which a beam with the rise of `reading` would meet the surface. The first is right if the
+    /// surface is level, so that its height is constant. The second is right if the surface is upright, so that its
+    /// horizontal distance is constant.
     fn ends(&self, reading: &Reading) -> [f32; 2] {
         let Surface { range_m, rise, .. } = *self;
         let over_ground = |rise: f32| (1.0 - rise * rise).max(0.0).sqrt();
@@ -253,8 +255,9 @@ impl Surface {
         [if is_slope { range_m * rise / reading.rise } else { upright }, upright]
     }
 
-    /// Returns the minimum and maximum range of that beam. Orientations that earlier beams have ruled out do not count.
-    /// A surface that is neither level nor upright lies between the two.
+    /// Returns the minimum and maximum range at which a beam with the rise of `reading` would meet the surface.
+    /// Orientations that earlier beams have ruled out do not count. If the surface is neither level nor upright, the
+    /// range is between these two.
     fn expected(&self, reading: &Reading, threshold_m: f32) -> (f32, f32) {
         let [level, upright] = self.ends(reading);
         let most = (threshold_m / 2.0).powi(2);
@@ -284,24 +287,25 @@ impl Surface {
     }
 }
 
-/// Number of narrow surfaces that a cell stores, for example the edge and the top of a board.
+/// Maximum number of narrow surfaces in a cell, for example the edge and the top of a board.
 const MAX_NARROW: usize = 2;
-/// Minimum number of visits of a narrow surface that is background. People, and objects that are put down, can have two
-/// visits.
+/// Minimum number of visits after which a narrow surface is background. People, and objects that are put down, can
+/// cause two visits.
 const MIN_VISITS: u16 = 3;
 /// Number of sweeps in a row that must miss a narrow surface before it is removed, as a multiple of
 /// [`Settings::sweeps`].
 const FORGET_FACTOR: u16 = 20;
-/// Minimum width of a row in radians. A planar scanner does not measure more exactly.
+/// Minimum width of a row in radians. A narrower row would be below the accuracy of a planar scanner.
 const MIN_BIN_RAD: f64 = 0.002;
-/// Weight of the latest beam in the mean squares of a surface.
+/// Weight of the latest beam in the mean squared differences of a surface.
 const UPDATE_WEIGHT: f32 = 0.25;
-/// Minimum horizontal share of a beam that is nearly vertical, to avoid a division by zero.
+/// Minimum horizontal distance per meter of range, which avoids a division by zero for a vertical beam.
 const MIN_OVER_GROUND: f32 = 0.02;
-/// Minimum change of the rise per radian. Beams along the axis keep their height at any angle.
+/// Minimum change of the rise per radian for a beam that shows an error of the angle. A beam along the axis has the
+/// same height at any angle.
 const MIN_RISE_CHANGE: f32 = 0.3;
-/// Minimum rise of a beam that is compared with a level surface. A flatter beam ends on a level surface within reach
-/// only if the surface is near the plane of the scanner: at 8 m, within 0.16 m.
+/// Minimum absolute rise of a beam that is compared with a level surface. A flatter beam meets a level surface within
+/// reach only if the surface's height is close to the scanner's: at 8 m, within 0.16 m.
 const MIN_RISE: f32 = 0.02;
 
 #[cfg(test)]
@@ -351,8 +355,8 @@ mod tests {
         assert_eq!(model.class(&Reading { beam: 6, ..reading(2.0) }, 91, 0.06), Background, "beside it");
     }
 
-    /// Returns whether the reading at 2 m is background after `sweeps`, each with a range, or `None` if it did not
-    /// measure the cell.
+    /// Returns whether the reading at 2 m is background after `sweeps`. Each item is the range of one sweep, or `None`
+    /// if the sweep did not measure the cell.
     fn is_narrow_background(settings: &Settings, sweeps: impl IntoIterator<Item = Option<f32>>) -> bool {
         let mut model = SurfaceModel::new(11, settings);
         for (sweep, range_m) in sweeps.into_iter().enumerate() {
@@ -401,7 +405,7 @@ mod tests {
             }
         };
         learn_ranges(&[4.0; 5], 0, &mut model);
-        // An object stands there until it is background, and then leaves.
+        // An object stands at 2 m until it is background, and then leaves.
         learn_ranges(&[2.0, 2.0, 2.0, 2.0, 4.0, 4.0, 4.0, 4.0], 5, &mut model);
         assert_eq!(model.class(&reading(2.0), 90, 0.06), Foreground);
         let walks = [1.5, 4.0, 2.5, 3.0, 4.0, 2.0, 1.7, 4.0, 3.3, 2.5, 4.0, 1.5, 2.2, 4.0, 3.6, 2.8, 4.0];
@@ -430,7 +434,7 @@ mod tests {
         assert!(floor.explains(&at(-0.21, 1.0 / 0.21), 0.05), "seen to be level");
         assert!(!floor.explains(&at(-0.21, 5.0), 0.05), "and no wall any more");
         // A table top a little below the scanner. A small change of the angle changes the range at which a beam meets
-        // it.
+        // this top.
         let mut top = Surface { range_m: 4.76, rise: -0.042, off: [0.0; 2] };
         (1..5).for_each(|i| top.update(&at(-0.042 - 0.001 * i as f32, 0.2 / (0.042 + 0.001 * i as f32))));
         assert!(top.explains(&at(-0.047, 0.2 / 0.047), 0.06) && !top.explains(&at(-0.047, 3.9), 0.06));
@@ -438,8 +442,8 @@ mod tests {
         assert!(sky.explains(&at(0.1, f32::INFINITY), 0.01) && !sky.explains(&at(0.1, 9.0), 0.01));
     }
 
-    /// Computes the background by definition, from all ranges of a cell, with one surface per sweep. The background is
-    /// the last surface that enough sweeps in a row have met.
+    /// Computes the background of a cell from all its ranges, one per sweep, by the definition: the background is the
+    /// last surface that enough sweeps in a row have met.
     fn reference_background(ranges: &[f32], scans: usize) -> Option<f32> {
         let same = |a: f32, b: f32| a == b || (a - b).abs() <= 0.06;
         let mut background = None;

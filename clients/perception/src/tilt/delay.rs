@@ -1,22 +1,22 @@
-//! Estimates the delay of a mount's stamps relative to its angles. With late stamps, a surface appears too low in
-//! sweeps in one direction and too high in the other. Play in the gears looks the same.
+//! Estimates the delay of a mount's stamps relative to its angles. If the stamps are late, a surface appears too low in
+//! sweeps in one direction, and too high in sweeps in the other direction. Play in the gears has the same effect.
 
 use super::sweep::Ray;
 
-/// Number of directions of the scanner that are compared.
+/// Number of beam directions that are compared.
 const COLUMN_COUNT: usize = 24;
-/// Minimum number of points on slopes that are needed to measure a delay.
+/// Minimum number of points on slopes for a measurement of the delay.
 const MIN_VOTES: usize = 60;
-/// Minimum distance between two sweeps that counts as a delay, in radians: 0.1 degrees.
+/// Minimum angle between the surfaces in two sweeps that counts as a delay, in radians: 0.1 degrees.
 const MIN_SHIFT_RAD: f64 = 0.0017;
 /// Maximum delay that is corrected, in seconds.
 pub(crate) const MAX_DELAY_S: f64 = 0.15;
-/// Minimum distance in meters by which the end of a beam moves per radian of the mount's angle. On flatter slopes,
+/// Minimum distance by which the end of a beam moves per radian of the mount's angle, in meters. If it moves less,
 /// noise hides the delay.
 const MIN_SLOPE_M: f64 = 3.0;
 /// Maximum relative difference between neighboring slopes on one surface.
 const MAX_SLOPE_DIFFERENCE: f64 = 0.3;
-/// Maximum distance in radians between points that are joined.
+/// Maximum angle between two points on one surface, in radians.
 const MAX_GAP_RAD: f64 = 0.06;
 
 /// A beam of a sweep.
@@ -40,9 +40,9 @@ struct Profile {
 pub(crate) struct Delay {
     before: Profile,
     now: Profile,
-    /// Delay that each point shows, in seconds.
+    /// Delay computed from each point, in seconds.
     votes: Vec<f64>,
-    /// Delay that the last pair of sweeps showed, in seconds.
+    /// Delay computed from the last pair of sweeps, in seconds.
     last: Option<f64>,
 }
 
@@ -52,8 +52,8 @@ impl Delay {
         (self.before.until_ns, self.now.until_ns, self.last) = (0, 0, None);
     }
 
-    /// Adds a sweep of scans that have `beams` beams. Returns the delay in seconds that remains after earlier
-    /// corrections, once two successive pairs of sweeps agree on it.
+    /// Adds a sweep, whose scans have `beams` beams. Once two successive pairs of sweeps agree on the delay that
+    /// remains after earlier corrections, returns it in seconds.
     pub(crate) fn take(
         &mut self,
         rays: &[Ray],
@@ -74,7 +74,7 @@ impl Delay {
         (agrees && is_significant).then_some(late_s)
     }
 
-    /// Returns the delay in seconds, and the rate at which it moves the two sweeps apart, in rad/s.
+    /// Returns the delay in seconds, and the rate in rad/s at which a delay moves the two sweeps apart.
     fn measure(&mut self) -> Option<(f64, f64)> {
         let mut late_s = 0.0;
         for _ in 0..4 {
@@ -103,8 +103,8 @@ impl Delay {
     }
 }
 
-/// Returns the delay in seconds that the middle of three samples shows in addition to `late_s`, and the rate at which
-/// it moves the sweeps apart, in rad/s.
+/// Computes the delay from the middle one of three samples. Returns the part in seconds that exceeds `late_s`, and the
+/// rate in rad/s at which a delay moves the sweeps apart.
 fn vote(window: &[Sample], before: &[Sample], late_s: f64) -> Option<(f64, f64)> {
     let [first, here, last] = window else { return None };
     let rate = (last.angle_rad - first.angle_rad) / (last.time_s - first.time_s);
@@ -113,12 +113,12 @@ fn vote(window: &[Sample], before: &[Sample], late_s: f64) -> Option<(f64, f64)>
     let there = slopes(before, angle_rad)?;
     let expected = there.at.inverse + there.slope * (angle_rad - there.at.angle_rad);
     let is_steep = there.slope.abs() > MIN_SLOPE_M * here.inverse * here.inverse;
-    // Near a reversal, the sweeps are too close to show a delay.
+    // Near a reversal, the two sweeps are too close to each other to measure a delay.
     let goes_back = rate * there.rate < 0.0 && apart.abs() > rate.abs();
     (is_steep && goes_back).then(|| ((here.inverse - expected) / (there.slope * apart), apart.abs()))
 }
 
-/// A sample, with the rates at which its surroundings change with the angle.
+/// Slope of the surface around a sample.
 struct Slopes {
     at: Sample,
     slope: f64,
@@ -138,7 +138,7 @@ fn slopes(column: &[Sample], angle_rad: f64) -> Option<Slopes> {
 }
 
 impl Profile {
-    /// Fills the profile with the beams that are compared, by increasing angle.
+    /// Fills the profile with the beams that are compared, in the order of increasing angle.
     fn fill(&mut self, rays: &[Ray], beams: usize, from_ns: u64) {
         let every = (beams / COLUMN_COUNT).max(1);
         self.columns.resize_with(beams.div_ceil(every), Vec::new);
@@ -169,8 +169,9 @@ impl Profile {
 mod tests {
     use super::*;
 
-    /// Returns the delay that each sweep shows. The mount is 0.9 m above the floor and swings like a pendulum from 5 to
-    /// 45 degrees in 2 s. Its encoder has a standard deviation of about 0.05 degrees, and its stamps are `late_s` late.
+    /// Returns the delay that is computed for each sweep. The mount is 0.9 m above the floor and swings like a pendulum
+    /// from 5 to 45 degrees in 2 s. The angles of its encoder have a standard deviation of about 0.05 degrees. Its
+    /// stamps are `late_s` seconds late.
     fn delays(late_s: f64, seed: u64) -> Vec<Option<f64>> {
         let mut random = fastrand::Rng::with_seed(seed);
         let mut noise = |sigma: f64| (0..12).map(|_| random.f64()).sum::<f64>() * sigma - 6.0 * sigma;

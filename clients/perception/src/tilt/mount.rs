@@ -1,5 +1,5 @@
-//! Geometry of a mount, and a check of its description: if axis, arm and level are right, a flat floor is level and a
-//! wall ahead is upright.
+//! Geometry of a mount, and a check of the mount's description. If the axis, the arm and the level angle in the
+//! description are right, the points of a flat floor are level, and the points of a wall ahead are upright.
 
 use super::Sweep;
 
@@ -9,10 +9,10 @@ use super::Sweep;
 pub struct Mount {
     /// A point on the axis.
     pub axis_at: [f64; 3],
-    /// Direction of the axis, with any length except 0. Angles are right-handed: around y, which is the default, a
-    /// larger angle tilts the scanner down; around -y, it tilts the scanner up.
+    /// Direction of the axis. The vector may have any length except 0. Angles are right-handed: around y, which is the
+    /// default, a larger angle tilts the scanner down; around -y, it tilts the scanner up.
     pub axis: [f64; 3],
-    /// Angle at which the scanner measures level. Position and direction below are given for this angle.
+    /// Angle at which the scanner measures level. `sensor_at` and `yaw_rad` are given for this angle.
     pub level_rad: f64,
     /// Origin of the beams.
     pub sensor_at: [f64; 3],
@@ -52,7 +52,7 @@ impl Mount {
         std::array::from_fn(|i| self.axis_at[i] + arm[i])
     }
 
-    /// Returns the point at range `range_m` on that beam.
+    /// Returns the point at range `range_m` on the beam with direction `beam_rad`, at the mount's angle `angle_rad`.
     pub fn point(&self, angle_rad: f64, beam_rad: f64, range_m: f64) -> [f64; 3] {
         let (origin, direction) = (self.origin(angle_rad), self.direction(angle_rad, beam_rad));
         std::array::from_fn(|i| origin[i] + range_m * direction[i])
@@ -76,9 +76,10 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// Maximum distance of the floor from height 0, in meters.
+/// Maximum height of the floor's points above or below 0, in meters.
 const MAX_FLOOR_OFFSET_M: f64 = 0.4;
-/// Maximum distance of a point that is used, in meters. Small errors of the angle move farther points too much.
+/// Maximum distance of a point that is used, in meters. A small error of the angle moves a point at a larger distance
+/// too much.
 const MAX_DISTANCE_M: f64 = 6.0;
 /// Minimum height of the points of a wall, in meters.
 const MIN_WALL_POINT_HEIGHT_M: f64 = 0.3;
@@ -90,15 +91,15 @@ const MIN_POINTS: usize = 300;
 const MIN_WALL_HEIGHT_M: f64 = 0.4;
 /// Maximum standard deviation of the points of a wall, in meters.
 const MAX_ROUGHNESS_M: f64 = 0.07;
-/// Maximum number of points that are stored. Each sweep has the same share, because up and down sweeps can differ.
+/// Maximum number of stored points. Each sweep gets the same share, because up and down sweeps can differ.
 const MAX_POINTS: usize = 40_000;
 
-/// Points of sweeps for a check of the mount's description.
+/// Check of the mount's description, with the points of several sweeps.
 #[derive(Debug, Default)]
 pub struct MountCheck {
     points: Vec<[f64; 3]>,
     sweeps: u32,
-    /// Delay by which the angles of these sweeps were corrected, in ns.
+    /// Delay by which the angles of the stored sweeps were corrected, in ns.
     late_ns: i64,
 }
 
@@ -107,9 +108,9 @@ pub struct MountCheck {
 pub struct Floor {
     /// Height of the floor at the axis, in meters. It is 0 if the description of the mount is right.
     pub height_m: f64,
-    /// Angle in radians by which the mount tilts lower than its description states.
+    /// Angle in radians by which the scanner points lower than the description of the mount states.
     pub level_rad: f64,
-    /// Remaining angle in radians by which the floor rises to the left.
+    /// Angle in radians by which the floor rises to the left.
     pub roll_rad: f64,
     /// Standard deviation of the points in meters.
     pub deviation_m: f64,
@@ -131,8 +132,8 @@ pub struct Wall {
 }
 
 impl MountCheck {
-    /// Adds the points of a complete sweep. If its angles were corrected by another delay than those of earlier sweeps,
-    /// the check restarts with this sweep.
+    /// Adds the points of a complete sweep. If this sweep was corrected by another delay than earlier sweeps, the check
+    /// restarts with this sweep.
     pub fn take(&mut self, sweep: &Sweep<'_>) {
         if !sweep.is_complete {
             return;
@@ -192,8 +193,8 @@ impl MountCheck {
                 if distance >= 0.0
                     && let Some(area) = areas.get_mut((distance / BIN_M) as usize)
                 {
-                    // The beams diverge. Without this weight, a part of a near side wall would have more points than a
-                    // wall ahead.
+                    // The beams diverge. Without this weight, a part of a near side wall would count more than a wall
+                    // ahead.
                     *area += at[0].powi(2) + at[1].powi(2);
                 }
             }
@@ -217,7 +218,7 @@ impl MountCheck {
             return None;
         }
         let plane = Plane::of(on).filter(|plane| plane.deviation < MAX_ROUGHNESS_M)?;
-        // The wall is not exactly perpendicular to the direction in which it was found.
+        // The wall is not exactly perpendicular to the direction of the search that found it.
         let [distance, slope, lean] = plane.terms;
         let across = slope.hypot(1.0);
         Some(Wall {
@@ -229,7 +230,7 @@ impl MountCheck {
     }
 }
 
-/// Coefficients of the plane with the smallest differences from the values of most points.
+/// Coefficients of the plane that fits most points best.
 struct Plane {
     terms: [f64; 3],
     deviation: f64,
@@ -237,7 +238,7 @@ struct Plane {
 }
 
 impl Plane {
-    /// Fits a plane by least squares, up to 8 times, each time without the points that were far from the last plane.
+    /// Fits a plane by least squares, up to 8 times. Each time, drops the points that are far from the previous plane.
     fn of(mut points: Vec<([f64; 3], f64)>) -> Option<Plane> {
         let mut plane = None;
         for _ in 0..8 {
@@ -321,8 +322,8 @@ mod tests {
         assert!(is_near(mount.origin(0.3 + FRAC_PI_2), [0.1, 0.0, 0.9]));
     }
 
-    /// Returns the result of a check in a room with a wall 3 m ahead and a box on the floor. The mount is `real`, and
-    /// its description is `described`.
+    /// Checks a mount in a room with a wall 3 m ahead and a box on the floor. `real` is the mount, and `described` is
+    /// its description.
     fn check_room(real: &Mount, described: &Mount) -> (Floor, Wall) {
         let mut points = Vec::new();
         for tenth in -150..450 {
@@ -359,7 +360,7 @@ mod tests {
         let grid =
             |points: usize| (0..points).map(|i| (0.005 * (i % 100) as f32, 0.1 * (i / 100 % 10) as f32));
         let ahead = grid(2000).map(|(y, z)| [3.0, 4.0 * y - 1.0, 0.4 + z]);
-        // Seen in a direction to the left, the whole wall has negative distances.
+        // Along a direction to the left, all points of the wall have negative distances.
         let right = grid(2500).map(|(x, z)| [0.35 + 4.0 * x, -3.0 - 4.0 * x, 0.4 + z]);
         let points: Vec<Point> = ahead.chain(right).map(|at| Point { at, ..Point::default() }).collect();
         let mut check = MountCheck::default();

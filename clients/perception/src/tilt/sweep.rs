@@ -1,5 +1,5 @@
-//! Analysis of a sweep: it classifies the points against the background, decides whether the angles are reliable, and
-//! finds obstacles, which are clusters of points in three dimensions.
+//! Analyzes a sweep: compares the points with the background, decides whether the angles are reliable, and finds
+//! obstacles, which are clusters of points in three dimensions.
 
 use scanhub_schema::{MAX_OBSTACLES, Obstacle, PointClass};
 
@@ -9,7 +9,7 @@ use super::{Point, Settings, Sweep};
 
 /// Number of parts of a sweep whose angles are checked separately.
 const PART_COUNT: usize = 4;
-/// Minimum number of beams on known background for a check of the angles.
+/// Minimum number of beams on known background that a check of the angles needs.
 const MIN_BEAMS: usize = 200;
 
 /// A beam with the mount's angle at its time.
@@ -33,7 +33,7 @@ pub(crate) struct SweepAnalyzer {
     points: Vec<Point>,
     /// Row of the model for each beam, with its reading.
     readings: Vec<(usize, Reading)>,
-    /// Error of the angle that each beam on a level surface shows, in radians.
+    /// Error of the mount's angle in radians, computed from each beam on a level surface.
     off: Vec<f32>,
     /// Points that may belong to obstacles.
     standing: Vec<Candidate>,
@@ -64,7 +64,7 @@ impl SweepAnalyzer {
         }
     }
 
-    /// Starts a new background for scans with this number of beams.
+    /// Starts a new background for scans with `beams` beams.
     pub(crate) fn begin(&mut self, beams: usize, is_first: bool) {
         self.model = SurfaceModel::new(beams, &self.settings);
         self.background_resets += u64::from(!is_first);
@@ -76,7 +76,7 @@ impl SweepAnalyzer {
     }
 
     /// Clears the background, because all angles are corrected from now on. If the last sweep contradicted the
-    /// background, it was learned with right angles and is kept.
+    /// background, the background was learned with right angles and is kept.
     pub(crate) fn correct(&mut self) {
         if self.unreliable == 0 {
             self.model.clear();
@@ -112,8 +112,8 @@ impl SweepAnalyzer {
         Sweep { is_unreliable, generation, points: &self.points, obstacles, dropped, ..sweep }
     }
 
-    /// Computes the points of the rays. Returns the number of rays whose cell has a known background, and the number of
-    /// these whose range differs from it.
+    /// Computes the points of the rays. Returns the number of rays whose cell has a known background, and how many of
+    /// these rays have a range that differs from it.
     fn compare(&mut self, rays: &[Ray]) -> (usize, usize) {
         self.points.clear();
         self.readings.clear();
@@ -140,7 +140,8 @@ impl SweepAnalyzer {
         (known, elsewhere)
     }
 
-    /// Returns whether the angles in a part of the sweep are wrong, judging by the level surfaces of the background.
+    /// Returns whether the angles in a part of the sweep are wrong. Compares them with the level surfaces of the
+    /// background.
     fn is_angle_off(&mut self) -> bool {
         let most = self.settings.max_error_rad as f32;
         let part = (self.off.len() / PART_COUNT).max(MIN_BEAMS);
@@ -203,9 +204,9 @@ struct ObstacleCluster {
 }
 
 impl ObstacleCluster {
-    /// Returns whether the cluster may be only a level surface that always exists. Nearly level beams graze a top in
-    /// few sweeps, each time at another range, and in a range of the mount's angle that is smaller than the distance
-    /// between two scans. An object that was put down is higher.
+    /// Returns whether the cluster may be only the top of an object that was there from the start. Nearly level beams
+    /// graze a top in few sweeps, and each time at another range. They do so only while the mount's angle changes by
+    /// less than the angle between two scans. An object that was put down is higher.
     fn is_grazed(&self) -> bool {
         let [low, high] = self.angles_rad;
         self.obstacle.flags & Obstacle::NEAR == 0
@@ -214,7 +215,7 @@ impl ObstacleCluster {
     }
 }
 
-/// Maximum range of the mount's angle in which beams graze a top: 0.4 degrees, in radians.
+/// Maximum difference between the mount's angles at which beams graze a top, in radians: 0.4 degrees.
 const MAX_GRAZED_RAD: f32 = 0.007;
 /// Maximum absolute rise of beams that graze a top. Steeper beams meet a top in more than one scan.
 const MAX_GRAZING_RISE: f32 = 0.1;
@@ -224,7 +225,7 @@ const MAX_GRAZING_RISE: f32 = 0.1;
 pub(crate) struct Clusters {
     /// Cube of each point with the point's index, sorted by cube.
     cubes: Vec<([i16; 3], u32)>,
-    /// Whether the search has not reached the cube that starts at this point.
+    /// For each point: whether it is the first one of a cube that the search has not reached.
     open: Vec<bool>,
     /// Cubes at the front of the search, by the index of their first point.
     front: Vec<usize>,
@@ -345,7 +346,8 @@ mod tests {
         assert!((pole.middle[2] - 0.475).abs() < 1e-6);
     }
 
-    /// Computes the sizes by definition: points whose cubes touch get the same name, until nothing changes.
+    /// Computes the sizes of the clusters by definition: points whose cubes touch get the same label, until no label
+    /// changes.
     fn reference_cluster_sizes(points: &[[f32; 3]], cube_m: f32, min_size: usize) -> Vec<usize> {
         let cube = |at: &[f32; 3]| at.map(|value| (value / cube_m).floor() as i32);
         let mut names: Vec<usize> = (0..points.len()).collect();

@@ -1,5 +1,5 @@
-//! Assignment of legs to the expected positions of legs, so that the sum of the gains is maximal. Pairs without
-//! competition are assigned at once, and a solver assigns the others.
+//! Assigns detected legs to expected positions of legs, so that the sum of the gains is maximal. A leg and a position
+//! that have no alternatives are assigned at once. A solver assigns the others.
 
 use pathfinding::matrix::Matrix;
 use pathfinding::prelude::kuhn_munkres;
@@ -9,7 +9,7 @@ use pathfinding::prelude::kuhn_munkres;
 pub(crate) struct Edge {
     pub(crate) leg: usize,
     pub(crate) target: usize,
-    /// Gain compared with leaving both unassigned. It is always positive.
+    /// Gain compared with leaving the leg and the position unassigned. It is always positive.
     pub(crate) gain: f64,
 }
 
@@ -118,7 +118,7 @@ impl Assignment {
 mod tests {
     use super::*;
 
-    /// Returns the best sum by trying each leg with each free position, or with none.
+    /// Returns the maximum sum of the gains. Tries each leg with each free position, and without a position.
     fn best(edges: &[Edge], leg: usize, legs: usize, taken: u32) -> f64 {
         if leg == legs {
             return 0.0;

@@ -43,8 +43,8 @@ pub fn distance_to_segment(point: Point, [a, b]: [Point; 2]) -> f64 {
     distance(point, [a[0] + share * along[0], a[1] + share * along[1]])
 }
 
-/// Returns the position on the first segment at which it crosses the second one, from 0 at its start to 1 at its end.
-/// Segments that only touch at an end, or lie on one line, do not cross.
+/// Returns the position on the first segment at which the second segment crosses it: 0 at the start of the first
+/// segment, 1 at its end. Segments do not cross if they only touch at an end, or lie on one line.
 pub fn crossing([a, b]: [Point; 2], [c, d]: [Point; 2]) -> Option<f64> {
     let (first, second) = (minus(b, a), minus(d, c));
     let across = cross(first, second);
@@ -67,7 +67,7 @@ pub fn area(polygon: &[Point]) -> f64 {
     sides(polygon).map(|[a, b]| cross(a, b)).sum::<f64>() / 2.0
 }
 
-/// Returns whether `point` is inside a polygon, by the number of sides that a ray from it crosses.
+/// Returns whether `point` is inside a polygon. Counts the sides that a ray from `point` crosses.
 pub fn contains(polygon: &[Point], point: Point) -> bool {
     let crossed = sides(polygon).filter(|&[a, b]| {
         (a[1] > point[1]) != (b[1] > point[1])
@@ -81,14 +81,14 @@ pub fn distance_to_border(polygon: &[Point], point: Point) -> f64 {
     sides(polygon).map(|side| distance_to_segment(point, side)).fold(f64::INFINITY, f64::min)
 }
 
-/// Returns whether two polygons overlap by more than `tolerance_m`, which is allowed because plans are measured by
-/// hand.
+/// Returns whether two polygons overlap by more than `tolerance_m`. A smaller overlap is allowed, because plans are
+/// measured by hand.
 pub fn overlap(first: &[Point], second: &[Point], tolerance_m: f64) -> bool {
     let deep =
         |outer: &[Point], point| contains(outer, point) && distance_to_border(outer, point) > tolerance_m;
     let reaches_in = |outer: &[Point], inner: &[Point]| {
-        // All corners may lie outside the other polygon. Points on the sides and the middle detect crossed and equal
-        // polygons.
+        // Even if two polygons overlap, all corners may lie outside the other polygon. Points on the sides and in the
+        // middle detect crossed and equal polygons.
         let centre = inner.iter().fold([0.0, 0.0], |sum, point| [sum[0] + point[0], sum[1] + point[1]]);
         let centre = [centre[0] / inner.len() as f64, centre[1] / inner.len() as f64];
         (contains(inner, centre) && deep(outer, centre))
@@ -138,7 +138,8 @@ mod tests {
 
     #[test]
     fn contains_agrees_with_the_sum_of_angles() {
-        // Compare with the sum of the angles under which the sides are seen. It is a full turn for a point inside.
+        // Compare with the sum of the angles that the sides subtend at the point. The sum is 360 degrees for a point
+        // inside.
         let polygon = [[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]];
         let mut random = fastrand::Rng::with_seed(4);
         for _ in 0..2_000 {

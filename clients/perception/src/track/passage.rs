@@ -1,17 +1,18 @@
-//! Likelihood that a person who comes into view is one who went out of the sensors' view. It is computed from position,
-//! walking speed and time, and from the gaps of the site.
+//! Computes the likelihood that a person who comes into view is the same person as one who went out of the sensors'
+//! view, from position, walking speed and time, and from the gaps of the site.
 
 use super::geometry::{Point, distance_to_segment, length2, middle, minus};
 use super::site::Site;
 
 /// Maximum time of a path that is not in the site file, in seconds.
 pub(crate) const MAX_GAP_S: f64 = 60.0;
-/// Standard deviation of the logarithm of a person's speed, relative to their pace.
+/// Standard deviation of the logarithm of a person's speed divided by their pace.
 const PACE_SPREAD: f64 = 0.2;
-/// Share of people who walk on without a stop: those who walked when they were last seen, and those who stood.
+/// Share of people who walk on without a stop. The first constant is for people who walked when they were last seen,
+/// and the second for people who stood.
 const CONTINUE_SHARE_WALKING: f64 = 0.6;
 const CONTINUE_SHARE_STANDING: f64 = 0.3;
-/// Share of people who stay at their position, and the time for which they stay, in seconds.
+/// Share of people who stay at their position, and the time that they stay there, in seconds.
 const STAY_SHARE: f64 = 0.4;
 const STAY_TIME_S: f64 = 4.0;
 /// Share of people who turn back.
@@ -20,22 +21,22 @@ const TURN_BACK_SHARE: f64 = 0.04;
 const MIN_WALKING_SPEED_M_S: f64 = 0.5;
 /// Minimum speed of a person who turns back, in m/s.
 const MIN_RETURN_SPEED_M_S: f64 = 0.35;
-/// Standard deviations of positions along and across the path, in meters. The one across grows per second, up to the
-/// width of a path.
+/// Standard deviations of a person's position along and across the path, in meters. The deviation across the path grows
+/// every second, up to the width of a path.
 const ALONG_M: f64 = 0.25;
 const ACROSS_M: f64 = 0.25;
 const ACROSS_M_S: f64 = 0.3;
 const MAX_ACROSS_M: f64 = 0.7;
-/// Likelihood of a person who arrives earlier or much later than the gap allows.
+/// Likelihood for a person who arrives earlier or much later than the gap allows.
 const MIN_LIKELIHOOD: f64 = 1e-6;
 /// Length of a path with an unknown end, in meters.
 const DEFAULT_PATH_M: f64 = 5.0;
 
 /// A person who is out of sight.
 pub(crate) struct DepartedPerson {
-    /// Door through which they went.
+    /// Door through which the person went.
     pub(crate) entry: Option<usize>,
-    /// Last position in the map, and speed in m/s.
+    /// Last position in the map, in meters, and speed in m/s.
     pub(crate) at: Point,
     pub(crate) speed: f64,
     /// Walking speed in m/s.
@@ -46,28 +47,27 @@ pub(crate) struct DepartedPerson {
 pub(crate) struct ArrivedPerson {
     /// Nearest door.
     pub(crate) exit: usize,
-    /// Position at which they were first seen.
+    /// Position at which the person was first seen.
     pub(crate) at: Point,
     pub(crate) velocity: Point,
-    /// Whether they are beyond that door, in a room with sensors.
+    /// Whether the person is beyond the door `exit`, in a room with sensors.
     pub(crate) is_out: bool,
 }
 
 impl Site {
-    /// Returns the minimum and maximum time of the gap between two doors, in seconds.
+    /// Returns the minimum and maximum time that the path between two doors takes, in seconds.
     fn gap(&self, [a, b]: [usize; 2]) -> [f64; 2] {
         let found = self.gaps.iter().find(|gap| gap.doors == [a, b] || gap.doors == [b, a]);
         found.map_or([0.0, MAX_GAP_S], |gap| gap.seconds)
     }
 
     /// Returns the likelihood per square meter that `departed`, who went out of sight `after_s` seconds ago, is at the
-    /// position of `arrived`. The model is that people are still on the path, and walk on at their pace, walk on after
-    /// a stop, stay, or turn back.
+    /// position of `arrived`. The model is that people walk on at their pace, walk on after a stop, stay, or turn back.
     pub(crate) fn likelihood(&self, departed: &DepartedPerson, arrived: &ArrivedPerson, after_s: f64) -> f64 {
         let t = after_s.max(0.0);
         let off = minus(arrived.at, departed.at);
         let far_m = length2(off).sqrt();
-        // Distance that they would be ahead, length of the rest of the path, and speed ahead.
+        // Distance that the person would be ahead, length of the rest of the path, and speed forward.
         let (ahead_m, rest_m, speed) = match departed.entry {
             Some(entry) => {
                 let door = self.doors[entry].between;
@@ -124,8 +124,8 @@ fn normal(x: f64, sigma: f64) -> f64 {
     (-x * x / (2.0 * sigma * sigma)).exp() / (sigma * (2.0 * std::f64::consts::PI).sqrt())
 }
 
-/// Returns the probability that a standard normal number is less than `z`, with the error function of Abramowitz and
-/// Stegun 7.1.26, which is exact within 2e-7.
+/// Returns the probability that a number with standard normal distribution is less than `z`. Uses the error function of
+/// Abramowitz and Stegun 7.1.26, whose error is at most 2e-7.
 fn normal_below(z: f64) -> f64 {
     let x = z.abs() / std::f64::consts::SQRT_2;
     let t = 1.0 / (1.0 + 0.327_591_1 * x);

@@ -1,8 +1,9 @@
-//! State of a tracked person: the evidence for and against them, and a linear Kalman filter of position and velocity.
+//! State of a tracked person: the evidence for and against a person, and a linear Kalman filter of position and
+//! velocity.
 //!
-//! The state of the filter is the middle between the legs with its velocity, and half of the vector from one leg to the
-//! other, which oscillates. A leg is at the middle plus or minus this half vector. Both coordinates have the same
-//! covariance.
+//! The state of the filter is the middle between the legs, half of the vector from one leg to the other, and the
+//! velocities of both. The half vector oscillates. A leg is at the middle plus or minus the half vector. Both
+//! coordinates have the same covariance.
 
 use nalgebra::{Matrix4, Matrix4x2, RowVector2, Vector4};
 use scanhub_schema::TrackState;
@@ -18,27 +19,28 @@ pub(crate) struct Person {
     /// Time of the filter's state in ns.
     pub(crate) at_ns: u64,
     pub(crate) first_seen_ns: u64,
-    /// Position at which they were first seen.
+    /// Position at which the person was first seen.
     pub(crate) first_position: Point,
     pub(crate) phase: TrackPhase,
-    /// Time at which one of their legs was last seen.
+    /// Time at which a leg of the person was last seen.
     pub(crate) last_seen_ns: u64,
-    /// Time at which one of their legs was last seen outside the ignored areas.
+    /// Time at which a leg of the person was last seen outside the ignored areas.
     pub(crate) last_free_ns: u64,
-    /// Time at which each sensor last saw them; 0 if it has not.
+    /// Time at which each sensor last saw the person; 0 if the sensor has never seen the person.
     pub(crate) seen_by_ns: [u64; MAX_SENSORS],
-    /// Number of scans that are evidence for them, at most [`MAX_SUPPORT`]. A scan of a slow sensor counts up to twice.
+    /// Number of scans that are evidence for the person, at most [`MAX_SUPPORT`]. A scan of a slow sensor counts up to
+    /// twice.
     pub(crate) support: f64,
     /// Number of scans that showed both legs.
     pub(crate) pairs: f64,
-    /// Seconds for which sensors have seen through their position.
+    /// Time for which sensors have seen through the person's position, in seconds.
     pub(crate) absent_s: f64,
     /// Walking speed in m/s.
     pub(crate) pace: f64,
     pub(crate) room: Option<usize>,
-    /// Door through which they entered the room, if that was seen.
+    /// Door through which the person entered the room, if a sensor saw that.
     pub(crate) entry_door: Option<usize>,
-    /// Share of their recent scans that show both legs.
+    /// Share of the recent scans of the person that show both legs.
     pub(crate) both: f64,
 }
 
@@ -47,22 +49,22 @@ pub(crate) struct Person {
 pub(crate) enum TrackPhase {
     Tentative,
     Known,
-    /// Out of sight since this time, after passing through this door.
+    /// The person has been out of sight since a time, after passing through a door.
     Away {
         since_ns: u64,
         door: usize,
     },
 }
 
-/// Minimum number of scans that confirm a person.
+/// Minimum number of scans that must show a person to confirm it.
 const MIN_SCANS: f64 = 8.0;
 pub(crate) const MAX_SUPPORT: f64 = 20.0;
-/// Maximum period of a sensor whose scans count once, in seconds. Scans of a slower sensor count up to twice.
-/// Otherwise, it would take a second to confirm a person at 7.5 Hz.
+/// Maximum period of a sensor whose scans count once, in seconds. Scans of a slower sensor count up to twice. If they
+/// did not, a sensor with 7.5 Hz would need a second to confirm a person.
 const FULL_WEIGHT_PERIOD_S: f64 = 0.0625;
-/// Minimum number of beams on a leg for which a chair leg can be excluded.
+/// Minimum number of beams on a leg that exclude a chair leg.
 const MIN_CLEAR_BEAMS: usize = 4;
-/// Weight of a leg with fewer beams, compared with a scan that sees through the position.
+/// Weight of a leg with fewer than [`MIN_CLEAR_BEAMS`] beams, compared with a scan that sees through the position.
 pub(crate) const COARSE_WEIGHT: f64 = 0.5;
 /// Minimum age of a person who can be confirmed, in ns.
 const MIN_TRACK_AGE_NS: u64 = 300_000_000;
@@ -105,12 +107,12 @@ impl Person {
         }
     }
 
-    /// Handles a scan of `sensor` that showed `legs` legs of the person, one of them with this number of `beams`. The
-    /// sensor's previous scan was `since_s` earlier.
+    /// Handles a scan of `sensor` that showed `legs` legs of the person. `beams` is the number of beams on one of the
+    /// legs. The sensor's previous scan was `since_s` seconds earlier.
     pub(crate) fn on_detection(&mut self, sensor: usize, since_s: f64, legs: usize, beams: usize) {
         self.last_seen_ns = self.at_ns;
         self.seen_by_ns[sensor] = self.at_ns;
-        // A few beams may also be on a chair leg, so another sensor may contradict.
+        // A few beams may also be on a chair leg, so do not cancel the contradiction of another sensor completely.
         self.absent_s =
             if beams < MIN_CLEAR_BEAMS { (self.absent_s - COARSE_WEIGHT * since_s).max(0.0) } else { 0.0 };
         let both = if legs > 1 { 1.0 } else { 0.0 };
@@ -129,7 +131,7 @@ impl Person {
         (x * x + y * y).sqrt()
     }
 
-    /// Returns whether this is certainly a person: seen often enough, and with two legs or in motion.
+    /// Returns whether this is certainly a person, which was seen often enough, and with two legs or in motion.
     pub(crate) fn is_certain(&self) -> bool {
         let walked_m = distance(self.filter.position(), self.first_position);
         self.support >= MIN_SCANS
@@ -150,7 +152,7 @@ impl Person {
         }
     }
 
-    /// Returns the sensors that have seen them within the last 250 ms. Bit i stands for the sensor with index i.
+    /// Returns the sensors that have seen the person within the last 250 ms. Bit i stands for the sensor with index i.
     pub(crate) fn sensors(&self, now_ns: u64) -> u32 {
         let is_recent = |&at: &u64| at > 0 && now_ns.saturating_sub(at) <= RECENT_NS;
         (0..)
@@ -163,12 +165,12 @@ impl Person {
 
 /// Spectral density of the body's acceleration in m2/s3.
 const BODY_NOISE: f64 = 0.6;
-/// Angular frequency of the oscillation of legs in rad/s: 0.8 double steps per second.
+/// Angular frequency at which legs oscillate, in rad/s: 0.8 double steps per second.
 const SWING_RATE_RAD_S: f64 = 5.0;
-/// Damping of the oscillation as a share of the critical damping.
+/// Damping of the legs' oscillation as a share of the critical damping.
 const DAMPING: f64 = 0.5;
-/// Spectral density of a leg's acceleration in m2/s3. With the two constants above, the distance of a leg from the
-/// middle is 0.14 m.
+/// Spectral density of a leg's acceleration in m2/s3. With this value, [`SWING_RATE_RAD_S`] and [`DAMPING`], the
+/// distance of a leg from the middle is 0.14 m.
 const LEG_NOISE: f64 = 5.0;
 /// Maximum length of a prediction step in seconds, and maximum number of steps.
 const MAX_STEP_S: f64 = 0.05;
@@ -202,7 +204,7 @@ impl Side {
 }
 
 impl Filter {
-    /// Creates the filter of a person who has shown one leg.
+    /// Creates the filter of a person of whom one leg was seen.
     pub(crate) fn of_leg(at: Point, sigma_m: f64) -> Filter {
         let mut covariance = Matrix4::zeros();
         let half = INITIAL_HALF_M * INITIAL_HALF_M;
@@ -217,8 +219,8 @@ impl Filter {
         Filter { state, covariance }
     }
 
-    /// Predicts the state `dt` seconds later, in steps that are short compared with a double step. If `fades` is set,
-    /// the person is not seen, and the velocity decays.
+    /// Predicts the state after `dt` seconds, in time steps that are short compared with a double step of a person.
+    /// With `fades`, for a person who is not seen, the velocity decays.
     pub(crate) fn predict(&mut self, dt: f64, fades: bool) {
         let steps = (dt / MAX_STEP_S).ceil().clamp(1.0, MAX_STEPS);
         (0..steps as usize).for_each(|_| self.step(dt / steps, fades));
@@ -250,7 +252,7 @@ impl Filter {
         ([at[0], at[1]], (row.transpose() * self.covariance * row)[0])
     }
 
-    /// Corrects the state by a measured leg.
+    /// Corrects the state with a measured leg.
     pub(crate) fn correct(&mut self, side: Side, at: Point, sigma_m: f64) {
         let row = side.row();
         let reach = self.covariance * row;
@@ -328,7 +330,7 @@ mod tests {
 
     #[test]
     fn agrees_with_the_textbook_form_by_whole_matrices() {
-        // Textbook form: eight states, with both coordinates and both legs measured at once.
+        // Textbook form of the filter: eight states, with both coordinates and both legs measured at once.
         let mut random = fastrand::Rng::with_seed(2);
         let mut filter = Filter::of_leg([1.0, 2.0], 0.03);
         for _ in 0..200 {

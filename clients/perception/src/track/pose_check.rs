@@ -1,6 +1,6 @@
-//! Detection of sensors that are not at their positions in the site file. When two sensors see legs at the same time,
-//! each pair of legs votes for an offset between the sensors. Votes from different people scatter, and votes from the
-//! same person agree.
+//! Detects sensors that are not at their positions in the site file. When two sensors see legs at the same time, each
+//! pair of legs votes for an offset between the sensors. Votes from different people scatter, and votes from the same
+//! person agree.
 
 use super::MisplacedSensor;
 use super::geometry::Point;
@@ -8,24 +8,26 @@ use super::sensor_view::Leg;
 
 /// Side of a cell of the votes, in meters.
 const CELL_M: f64 = 0.1;
-/// Number of cells on each side of a zero offset.
+/// Number of cells on each side of the cell of a zero offset.
 const REACH_CELLS: usize = 10;
 const GRID_WIDTH: usize = 2 * REACH_CELLS + 1;
-/// Number of votes after which they are evaluated and cleared.
+/// Number of votes that are collected before they are evaluated and cleared.
 const MIN_VOTES: u32 = 2_000;
-/// Minimum offset in meters that is reported. A smaller one may come from the two legs of a person who walks from
-/// sensor to sensor.
+/// Minimum offset that is reported, in meters. A smaller offset may be the distance between the two legs of a person
+/// who walks from sensor to sensor.
 const MIN_OFFSET_M: f64 = 0.35;
-/// Minimum share of the votes that agree, and minimum ratio of these to the votes for no offset.
+/// Minimum share of the votes that must agree on an offset, and minimum ratio of these votes to the votes for a zero
+/// offset.
 const MIN_AGREEING_SHARE: f64 = 0.12;
 const MIN_VOTE_RATIO: u32 = 3;
-/// Maximum standard deviation of a leg that votes, in meters.
+/// Maximum standard deviation of the position of a leg that votes, in meters.
 const MAX_SIGMA_M: f64 = 0.065;
 
 /// Votes of all pairs of sensors.
 pub(crate) struct PoseVotes {
     sensors: usize,
-    /// Votes at index `sensor * sensors + other`, where `sensor` comes later in the site. `None` before the first vote.
+    /// Votes of each pair, at index `sensor * sensors + other`, where `sensor` comes later in the site than `other`.
+    /// `None` before the first vote.
     pairs: Vec<Option<Box<Votes>>>,
 }
 
@@ -39,8 +41,8 @@ impl PoseVotes {
         PoseVotes { sensors, pairs: (0..sensors * sensors).map(|_| None).collect() }
     }
 
-    /// Adds the votes of the legs that two sensors see at the same time. Once the votes agree, returns the offset of
-    /// the sensor that comes later in the site. Its votes are then cleared.
+    /// Adds the votes of the legs that two sensors see at the same time. Once the votes agree, clears them and returns
+    /// the offset of the sensor that comes later in the site.
     pub(crate) fn take(&mut self, one: (usize, &[Leg]), two: (usize, &[Leg])) -> Option<MisplacedSensor> {
         let ((other, other_legs), (sensor, own)) = if one.0 < two.0 { (one, two) } else { (two, one) };
         for leg in own.iter().filter(|leg| has_vote(leg)) {
@@ -68,7 +70,7 @@ fn has_vote(leg: &Leg) -> bool {
 }
 
 fn cell(off: Point) -> Option<usize> {
-    // Cells are centered on the multiples of their side.
+    // The centers of the cells are multiples of [`CELL_M`].
     let [x, y] = off.map(|value| value * (1.0 / CELL_M) + (REACH_CELLS as f64 + 0.5));
     let is_in = |value: f64| (0.0..GRID_WIDTH as f64).contains(&value);
     (is_in(x) && is_in(y)).then_some(y as usize * GRID_WIDTH + x as usize)
@@ -111,7 +113,7 @@ mod tests {
     use super::*;
     use crate::track::sensor_view::DoorProximity;
 
-    /// Returns the result for three people at random positions, if the second sensor is misplaced by `off`.
+    /// Returns the result for three people at random positions. The second sensor is misplaced by `off`.
     fn detect_misplaced(off: Point) -> Option<MisplacedSensor> {
         let mut random = fastrand::Rng::with_seed(4);
         let mut poses = PoseVotes::new(3);

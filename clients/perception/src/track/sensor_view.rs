@@ -1,5 +1,5 @@
-//! View of one sensor in its last scan: the range in each direction, the legs, and whether a position is occupied, free
-//! or occluded.
+//! What one sensor sees in its last scan: the range in each direction, the legs, and whether a position is occupied,
+//! free or occluded.
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 
@@ -12,46 +12,47 @@ use super::site::{Sensor, Site};
 pub(crate) const MAX_LEGS: usize = 64;
 /// Radius of a leg with its trousers, in meters.
 pub(crate) const LEG_M: f64 = 0.06;
-/// Maximum width of a leg in meters. A wider object is two adjacent legs.
+/// Maximum width of a leg in meters. A wider object counts as two adjacent legs.
 const MAX_LEG_WIDTH_M: f64 = 0.26;
 /// Minimum width of a leg with its trousers, in meters. The legs of chairs and tables are thinner.
 const MIN_LEG_WIDTH_M: f64 = 0.09;
-/// Diameter of a beam's light spot at the scanner in meters, and its growth with the range, for an LMS 2xx, which has
-/// the widest spot of the supported scanners.
+/// Diameter of a beam's light spot at the scanner in meters, and its growth with the range. The values are those of an
+/// LMS 2xx. Of all supported scanners, it has the widest spot.
 const SPOT_M: f64 = 0.01;
 const SPOT_RAD: f64 = 0.0045;
 /// Minimum width of a surface, such as the leaf of a door, in meters. A narrower straight object may be legs.
 const MIN_FLAT_WIDTH_M: f64 = 0.4;
-/// Maximum standard deviation of points from the line of a surface, in meters: the noise of the ranges.
+/// Maximum standard deviation of a surface's points from a straight line, in meters. The ranges have noise.
 const FLATNESS_M: f64 = 0.015;
-/// Minimum distance by which the beams next to a free leg reach farther, in meters. Points of a surface are closer
-/// together.
+/// Minimum distance by which the beams next to a free leg reach farther than the leg, in meters. Neighboring points of
+/// a surface differ by less.
 const MIN_FREE_DEPTH_M: f64 = 0.6;
-/// Number of points between the jambs at which a door is checked, and maximum distance of a closed leaf from the line
-/// between them, in meters.
+/// Number of points between the jambs of a door at which the door is checked, and maximum distance between a closed
+/// leaf and the line from jamb to jamb, in meters.
 const CLOSED_POINTS: usize = 9;
 const MAX_CLOSED_OFFSET_M: f64 = 0.25;
 /// Maximum width of a person in meters.
 const MAX_PERSON_WIDTH_M: f64 = 1.3;
-/// Minimum distance of an object from the farthest range of its beam, in meters.
+/// Minimum distance between an object and the farthest range of its beam, in meters.
 const MIN_FOREGROUND_DISTANCE_M: f64 = 0.15;
-/// Number of scans in a row that must reach farther than all before to increase the farthest range.
+/// Number of scans in a row in which a beam must exceed its farthest range before this range is increased.
 const MIN_FARTHER_SCANS: u8 = 5;
-/// Maximum distance of a person's legs from their position, in meters.
+/// Maximum distance between a person's position and a leg of the person, in meters.
 const MAX_LEG_DISTANCE_M: f64 = 0.35;
 
 /// A leg that one sensor sees.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Leg {
-    /// Center of the leg. The sensor sees only the near side, so the position is corrected.
+    /// Center of the leg. The sensor sees only the near side of the leg, so the measured position is corrected.
     pub(crate) at: Point,
     /// Standard deviation of each coordinate in meters.
     pub(crate) sigma_m: f64,
-    /// Whether the leg is in front of the background and is more than a single beam. An object that has become
-    /// background is not fresh.
+    /// Whether the leg is in front of the background and has more than one beam. An object that has become background
+    /// is not fresh.
     pub(crate) is_fresh: bool,
-    /// Whether the leg is evidence for a person. A chair leg is too thin, and a range between two surfaces does not
-    /// belong to any object. Both only support a track that other legs have started.
+    /// Whether the leg is evidence for a person. False for an object that is as thin as a chair leg, and for a range
+    /// between two surfaces, which belongs to no object. Legs that are not solid only support a track that other legs
+    /// have started.
     pub(crate) is_solid: bool,
     /// Number of beams that the leg reflects.
     pub(crate) beams: usize,
@@ -72,7 +73,8 @@ pub(crate) enum DoorProximity {
     Swing,
     /// The position is between the jambs of a door, on the line along which a leaf may slide.
     Line,
-    /// The position is on this line, at a jamb or outside the opening, where an open leaf ends.
+    /// The position is on the line along which a leaf may slide, at a jamb or outside the opening, where an open leaf
+    /// ends.
     Jamb,
 }
 
@@ -87,7 +89,7 @@ pub(crate) enum Visibility {
     Occluded,
 }
 
-/// View of one sensor, with the farthest ranges that it has measured.
+/// Last scan of one sensor, with the farthest range that each beam has measured.
 pub(crate) struct SensorView {
     sensor: Sensor,
     first_angle: f64,
@@ -96,13 +98,14 @@ pub(crate) struct SensorView {
     directions: Vec<Point>,
     /// Ranges in meters; NaN without a reading, and infinite without a return.
     ranges: Vec<f64>,
-    /// Farthest range that each beam has reached in several scans, which shows the empty room.
+    /// Farthest range that each beam has reached in several scans. These ranges show the room without people.
     farthest: Vec<f64>,
-    /// For each beam, the number of scans in a row that have reached farther, and the minimum of their ranges.
+    /// For each beam, the number of scans in a row that exceeded the farthest range, and the minimum range of these
+    /// scans.
     farther: Vec<(u8, f64)>,
     is_foreground: Vec<bool>,
     legs: Vec<Leg>,
-    /// Beams that end at an object: in the foreground, or nearer than their farthest range.
+    /// Beams that end at an object. Their points are in the foreground, or nearer than the farthest range of the beam.
     standing: Vec<usize>,
     /// Beams of the current cluster with their end points.
     points: Vec<(usize, Point)>,
@@ -157,12 +160,12 @@ impl SensorView {
         self.find_legs();
     }
 
-    /// Corrects the sensor's position, because all that it sees is displaced by `off`.
+    /// Corrects the sensor's position. Everything that the sensor sees is displaced by `off`.
     pub(crate) fn shift(&mut self, off: Point) {
         self.sensor.position = minus(self.sensor.position, off);
     }
 
-    /// Marks the legs in the ignored areas of `site`, and those that may be parts of door leaves.
+    /// Marks the legs in the ignored areas of `site`, and the legs that may be parts of door leaves.
     pub(crate) fn mark(&mut self, site: &Site, has_leaves: &[bool]) {
         for leg in &mut self.legs {
             leg.at_door = site.at_door(leg.at, has_leaves);
@@ -172,8 +175,8 @@ impl SensorView {
         }
     }
 
-    /// Returns whether the opening between two jambs is closed: all beams into it end near the line between the jambs.
-    /// With fewer than five beams, it never counts as closed.
+    /// Returns whether a door is closed: all beams into the opening end near the line between the jambs. A door with
+    /// fewer than five beams never counts as closed.
     pub(crate) fn is_closed(&self, [a, b]: [Point; 2]) -> bool {
         let ends_there = |i: usize| {
             let share = (i + 1) as f64 / (CLOSED_POINTS + 1) as f64;
@@ -184,7 +187,7 @@ impl SensorView {
                 .is_some_and(|range| (range - far).abs() <= MAX_CLOSED_OFFSET_M)
                 .then_some(beam)
         };
-        // Begin at the middle, because that is where an open door fails the check.
+        // Begin at the middle, because an open door fails the check there.
         let order = (0..CLOSED_POINTS).map(|i| (i + CLOSED_POINTS / 2) % CLOSED_POINTS);
         let (mut first, mut last) = (usize::MAX, 0);
         for i in order {
@@ -224,7 +227,7 @@ impl SensorView {
             }
             if is_through {
                 through += 1;
-                // Nor can a thin object occlude a person.
+                // A thin object cannot occlude a person either.
                 hidden += if is_thin(occluded_run, spacing) { 0 } else { occluded_run };
                 occluded_run = 0;
             } else {
@@ -236,8 +239,8 @@ impl SensorView {
         if all >= 2 && 5 * through >= 4 * all { Visibility::Free } else { Visibility::Occluded }
     }
 
-    /// Returns the beam to `position` as a fractional index, and the distance in meters. Returns `None` if no beam
-    /// points there.
+    /// Returns the fractional index of the beam to `position`, and the distance in meters. Returns `None` if no beam
+    /// points to `position`.
     fn beam(&self, position: Point) -> Option<(f64, f64)> {
         let offset = minus(position, self.sensor.position);
         let far = (offset[0] * offset[0] + offset[1] * offset[1]).sqrt();
@@ -259,7 +262,7 @@ impl SensorView {
         of_beams + flags + self.legs.capacity() + self.standing.capacity() + self.points.capacity()
     }
 
-    /// Prepares the tables for scans of this shape, if it has changed.
+    /// Prepares the tables for the shape of `scan`, if the shape has changed.
     fn fit(&mut self, scan: &Scan) {
         let (shape, count) = ((scan.first_angle, scan.step), scan.beams());
         if (self.first_angle, self.step) == shape && self.ranges.len() == count {
@@ -366,7 +369,7 @@ impl SensorView {
     }
 }
 
-/// Returns whether an object with this number of beams, which are `spacing_m` apart, is thinner than a leg.
+/// Returns whether an object is thinner than a leg. It has this number of `beams`, which are `spacing_m` apart.
 fn is_thin(beams: usize, spacing_m: f64) -> bool {
     (beams + 1) as f64 * spacing_m < MIN_LEG_WIDTH_M
 }
@@ -385,7 +388,7 @@ fn is_flat(points: &[(usize, Point)]) -> bool {
     across < FLATNESS_M * FLATNESS_M
 }
 
-/// Updates the farthest range of a beam. A single range that is too long counts as noise.
+/// Updates the farthest range of a beam. A longer range in only one scan counts as noise.
 fn update_farthest(range: f64, farthest: &mut f64, (scans, least): &mut (u8, f64)) {
     if range > *farthest {
         (*scans, *least) = (*scans + 1, least.min(range));

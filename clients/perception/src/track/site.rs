@@ -1,5 +1,5 @@
-//! A site: sensors, rooms and doors in one map, as a site file describes them. Reading a file checks the plan: names
-//! are unique, rooms do not overlap, doors are in the walls of their rooms, and every room can be reached.
+//! A site: sensors, rooms and doors in one map, as a site file describes them. A file is checked while it is read:
+//! names are unique, rooms do not overlap, doors are in the walls of their rooms, and every room can be reached.
 
 use std::fmt::Display;
 use std::ops::Range;
@@ -30,7 +30,7 @@ pub struct Site {
     pub rooms: Vec<Area>,
     /// Doors between rooms, or between a room and outside.
     pub doors: Vec<Door>,
-    /// Paths between doors that no sensor covers.
+    /// Paths between doors. No sensor covers these paths.
     pub gaps: Vec<Gap>,
     /// Areas in which legs start no track. They may overlap rooms, doors and each other.
     pub ignored: Vec<Area>,
@@ -49,7 +49,8 @@ pub struct Sensor {
     pub is_upside_down: bool,
 }
 
-/// A room, or an area with a moving object that is not a person, such as a fountain, a revolving door or a curtain.
+/// A room, or an ignored area. An ignored area has a moving object that is not a person: for example a fountain, a
+/// revolving door or a curtain.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Area {
     /// Name in events and in the drawing.
@@ -71,12 +72,12 @@ pub struct Door {
     pub between: [Point; 2],
 }
 
-/// A path between two doors that no sensor covers, and the time that it takes.
+/// A path between two doors, and the time that it takes. No sensor covers the path.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gap {
     /// Indexes of the two doors.
     pub doors: [usize; 2],
-    /// Minimum and maximum duration of the path in seconds.
+    /// Minimum and maximum time that the path takes, in seconds.
     pub seconds: [f64; 2],
 }
 
@@ -86,8 +87,8 @@ impl Site {
         self.ignored.iter().any(|area| contains(&area.polygon, point))
     }
 
-    /// Returns the distance between `point` and a door, in meters. If an ignored area covers the middle of the door, as
-    /// for a revolving door, it is the distance from this area.
+    /// Returns the distance between `point` and a door, in meters. If an ignored area covers the middle of the door,
+    /// for example of a revolving door, returns the distance between `point` and this area.
     pub(crate) fn distance_to_door(&self, point: Point, door: usize) -> f64 {
         let between = self.doors[door].between;
         let area =
@@ -99,7 +100,7 @@ impl Site {
         distance_to_segment(point, between).min(from_area)
     }
 
-    /// Returns whether a leaf may reach `point`, considering the doors that have leaves.
+    /// Returns whether the leaf of a door may reach `point`. `has_leaves` has for each door whether it has leaves.
     pub(crate) fn at_door(&self, point: Point, has_leaves: &[bool]) -> DoorProximity {
         let mut found = DoorProximity::Clear;
         for (Door { between: [a, b], .. }, _) in self.doors.iter().zip(has_leaves).filter(|(_, has)| **has) {
@@ -128,7 +129,7 @@ impl Site {
         self.rooms.iter().position(|room| contains(&room.polygon, point))
     }
 
-    /// Returns the door nearest to `point` for which `is_candidate` returns true.
+    /// Returns the door that is nearest to `point`. Only doors for which `is_candidate` returns true count.
     pub(crate) fn nearest_door(&self, point: Point, is_candidate: impl Fn(&usize) -> bool) -> Option<usize> {
         let off = |&door: &usize| distance_to_segment(point, self.doors[door].between);
         (0..self.doors.len()).filter(is_candidate).min_by(|a, b| off(a).total_cmp(&off(b)))
@@ -151,7 +152,7 @@ impl Site {
 }
 
 impl Door {
-    /// Returns the rooms on both sides.
+    /// Returns the rooms on both sides of the door.
     pub(crate) fn rooms(&self) -> [Option<usize>; 2] {
         [self.from, self.to]
     }
@@ -164,16 +165,16 @@ impl Sensor {
         self.name.split_once('.').map_or("", |(hub, _)| hub)
     }
 
-    /// Returns the direction in the map of the sensor's beam at `angle` in radians, as a unit vector.
+    /// Returns the direction of the sensor's beam at `angle` (in radians), as a unit vector in the map.
     pub fn direction(&self, angle: f64) -> Point {
         let (sin, cos) = (self.yaw_rad + if self.is_upside_down { -angle } else { angle }).sin_cos();
         [cos, sin]
     }
 }
 
-/// Maximum length of the name of a room or door in bytes, as in an event.
+/// Maximum length of the name of a room or door, in bytes. An event has room for this length.
 pub(crate) const MAX_NAME_LEN: usize = 24;
-/// Name of the other side of a door that leads outside.
+/// Name for the outside, to which a door may lead.
 pub(crate) const OUTSIDE_NAME: &str = "outside";
 /// Maximum width of a door's leaf in meters.
 const MAX_LEAF_WIDTH_M: f64 = 1.3;
@@ -250,7 +251,7 @@ struct GapEntry {
 }
 
 impl Site {
-    /// Parses the site that `text` describes. Errors use `name` for the file.
+    /// Parses the site that `text` describes. `name` is the name of the file in errors.
     ///
     /// # Errors
     ///
@@ -304,22 +305,23 @@ impl SourceText<'_> {
     }
 }
 
-/// Returns a question that suggests the name in `known` most similar to `word`.
+/// Returns a question to the user that suggests a name: the one in `known` that is most similar to `word`.
 fn nearest(word: &str, known: &[&str]) -> String {
     let near = |a: &str| strsim::jaro_winkler(a, word);
     let best = known.iter().max_by(|a, b| near(a).total_cmp(&near(b)));
     best.map_or(String::new(), |best| format!("did you mean `{best}`? "))
 }
 
-/// Maximum overlap of rooms in meters. It is allowed because they are measured by hand.
+/// Maximum overlap of rooms in meters. It is allowed because rooms are measured by hand.
 const MAX_OVERLAP_M: f64 = 0.05;
-/// Maximum distance of the middle of a door from the walls of its rooms, in meters, because walls are thick.
+/// Maximum distance between the middle of a door and the walls of its rooms, in meters. It allows for the thickness of
+/// walls.
 const MAX_DOOR_OFFSET_M: f64 = 0.5;
-/// Minimum area of a room and of an ignored area in square meters, each with the number of digits in errors. The second
-/// is small because a curtain is thin.
+/// Minimum area of a room, and minimum area of an ignored area, in square meters. Each has the number of decimals in
+/// errors. An ignored area may be small, because a curtain is thin.
 const MIN_ROOM_M2: (f64, usize) = (0.25, 2);
 const MIN_IGNORED_M2: (f64, usize) = (0.02, 3);
-/// Maximum coordinate in meters. Larger ones are probably in millimeters.
+/// Maximum coordinate in meters. A larger number is probably in millimeters.
 const MAX_COORDINATE_M: f64 = 1_000.0;
 
 fn plan(source: &SourceText<'_>, file: &File) -> Result<Site, Failure> {
@@ -411,7 +413,7 @@ fn sensor(source: &SourceText<'_>, entry: &SensorEntry) -> Result<Sensor, Failur
     })
 }
 
-/// Checks the area `what`: at least three corners, sides that do not cross, and a minimum area.
+/// Checks that the area `what` has at least three corners, that its sides do not cross, and that it has a minimum size.
 fn checked_area(
     source: &SourceText<'_>,
     what: &str,

@@ -1,5 +1,5 @@
-//! Tracker of people from scans in the order of their stamps: association of legs with tracks, start and end of tracks,
-//! and people who go through doors or out of the sensors' view.
+//! Tracks people in scans, which arrive in the order of their stamps. Associates legs with tracks, starts and ends
+//! tracks, and detects people who go through doors or out of the sensors' view.
 
 use scanhub_schema::{Foreground, Scan};
 
@@ -12,24 +12,24 @@ use super::sensor_view::{DoorProximity, Leg, SensorView, Visibility};
 use super::site::{Door, Gap, Site};
 use super::{Event, Kind, MisplacedSensor, Snapshot, Track};
 
-/// Maximum number of people at the same time.
+/// Maximum number of people who are tracked at the same time.
 pub(crate) const MAX_PEOPLE: usize = 64;
 /// Interval between snapshots in ns.
 pub const SNAPSHOT_INTERVAL_NS: u64 = 40_000_000;
 
-/// Gain of a leg that is exactly at its expected position. It is also the limit of a leg's squared distance divided by
-/// the variance.
+/// Gain of a leg that is exactly at its expected position. It is also the maximum of a leg's squared distance from that
+/// position, divided by the variance.
 const GATE: f64 = 11.0;
 /// Value of [`GATE`] for a tentative person, who has a lower priority.
 const GATE_TENTATIVE: f64 = 9.0;
-/// Maximum distance of a leg from its person, in meters.
+/// Maximum distance between a person and a leg of the person, in meters.
 const MAX_LEG_DISTANCE_M: f64 = 0.8;
 /// Maximum distance between the legs of a person, in meters.
 const MAX_STEP_WIDTH_M: f64 = 0.9;
-/// Minimum distance of a new track from the legs of every track that is not away, in meters.
+/// Minimum distance between a new track and the legs of all tracks that are not away, in meters.
 const MIN_TRACK_DISTANCE_M: f64 = 0.3;
-/// Time in seconds after which a person is deleted because sensors see through their position: a confirmed one, and a
-/// tentative one.
+/// Time for which sensors must see through a person's position before the person is deleted, in seconds. The first
+/// constant is for a confirmed person, and the second for a tentative one.
 const DELETE_AFTER_S: f64 = 0.7;
 const DELETE_TENTATIVE_AFTER_S: f64 = 0.25;
 /// Time without a detection after which a tentative person is deleted, in ns.
@@ -40,40 +40,49 @@ const MAX_HIDDEN_NS: u64 = 120_000_000_000;
 const MAX_PERIOD_S: f64 = 0.2;
 /// Maximum time between two scans that count as simultaneous, in ns.
 const SAME_TIME_NS: u64 = 45_000_000;
-/// Distance below which two people are merged if they never show two pairs of legs, in meters.
+/// Minimum distance between two people, in meters. Two people who are closer are merged, unless two pairs of legs were
+/// seen.
 const MERGE_DISTANCE_M: f64 = 0.45;
-/// Time for which a confirmed person who has entered an ignored area may be associated with the legs in it, in ns.
+/// Maximum time after a confirmed person enters an ignored area in which legs in this area are associated with the
+/// person, in ns.
 const IGNORED_GRACE_NS: u64 = 5_000_000_000;
 
-/// Time without a detection after which a confirmed person is not associated with a leg that may be a part of a door's
-/// leaf, in ns.
+/// Maximum time since a confirmed person was last detected, in ns. After this time, a leg that may be a part of a
+/// door's leaf is not associated with the person.
 const LEAF_SILENCE_NS: u64 = 300_000_000;
-/// Maximum distance from a door at which a person who comes out of it is first seen, in meters.
+/// Maximum distance between a door and a person who was away, came through this door, and is first seen again in a room
+/// without sensors, in meters.
 const MAX_BEFORE_DOOR_M: f64 = 3.5;
-/// Value of [`MAX_BEFORE_DOOR_M`] in a room with sensors, in which people are seen as soon as they have come through.
+/// Maximum distance as [`MAX_BEFORE_DOOR_M`], for a person who is first seen again in a room with sensors. Sensors in
+/// the room see people as soon as they have come through the door.
 const MAX_INSIDE_DOOR_M: f64 = 1.2;
-/// Minimum distance beyond a door of a person who has gone through it, in meters.
+/// Minimum distance between a person and a door behind the person, in meters. At this distance, the person has gone
+/// through the door.
 const MIN_BEHIND_DOOR_M: f64 = 0.12;
-/// Distance below which a person who never shows two legs counts as a part of a confirmed person, in meters.
+/// Minimum distance between a confirmed person and another person who rarely shows two legs, in meters. If the other
+/// person is closer, it counts as a part of the confirmed person.
 const PART_DISTANCE_M: f64 = 0.5;
-/// Maximum distance from a door at which a person who has come through it is first seen, in meters.
+/// Maximum distance between a door that leads out of the sensors' view and the first position of a new person who has
+/// come through it, in meters.
 const MAX_AT_DOOR_M: f64 = 0.7;
-/// Value of [`MAX_AT_DOOR_M`] for a door with leaves, if the person walks away from it at least at the following speed,
-/// in m/s.
+/// Maximum distance as [`MAX_AT_DOOR_M`], for a door with leaves and a person who walks away from it. The next constant
+/// is the minimum speed of this person, in m/s.
 const MAX_BEFORE_LEAVES_M: f64 = 1.6;
 const MIN_LEAVING_SPEED_M_S: f64 = 0.2;
-/// Distance below which a new person may be a leg of a confirmed one, in meters.
+/// Minimum distance between a new person and a confirmed one, in meters. If it is smaller, the new person may be a leg
+/// of the confirmed one.
 const MIN_ALONE_M: f64 = 0.9;
-/// Maximum squared distance, divided by the variance, at which a new person is identified with a hidden one. It covers
-/// 98.9 % of the normal distribution in the plane.
+/// Maximum squared distance, divided by the variance, between a hidden person and a new person who may be the same. It
+/// covers 98.9 % of the normal distribution in the plane.
 const HIDDEN_GATE: f64 = 9.0;
-/// Time out of sight in a room without sensors after which a person is away, in ns.
+/// Maximum time for which a person in a room without sensors may be out of sight, in ns. After this time, the person is
+/// away.
 const AWAY_AFTER_NS: u64 = 250_000_000;
 
-/// Number of scans in a row that must show a door closed before it counts as a door with leaves.
+/// Number of scans in a row that must show a closed door before it counts as a door with leaves.
 const MIN_CLOSED_SCANS: u32 = 20;
 
-/// Tracks of people, with the views of all sensors.
+/// Tracks of people, with the last scans of all sensors.
 pub(crate) struct Tracker {
     pub(crate) site: Site,
     watched: Vec<bool>,
@@ -85,14 +94,14 @@ pub(crate) struct Tracker {
     edges: Vec<Edge>,
     pairs: Vec<(usize, usize)>,
     scan_ns: Vec<u64>,
-    /// Whether each door has leaves, because it was seen closed.
+    /// For each door, whether it has leaves. A door that was seen closed has leaves.
     has_leaves: Vec<bool>,
-    /// For each sensor and door, the number of scans in a row that showed the door closed.
+    /// For each sensor and door, the number of scans in a row that showed the closed door.
     closed: Vec<Vec<u32>>,
     poses: PoseVotes,
     misplaced: Vec<MisplacedSensor>,
-    /// For each sensor, two sums over the legs of walking people: offset times velocity, and squared speed. Their ratio
-    /// is the mean time in seconds by which legs are ahead of their expected positions.
+    /// For each sensor, two sums over the legs of walking people: offset times velocity, and squared speed. The first
+    /// sum divided by the second is the mean time in seconds by which legs are ahead of their expected positions.
     pub(crate) lateness: Vec<(f64, f64)>,
 }
 
@@ -151,7 +160,7 @@ impl Tracker {
         }
     }
 
-    /// Predicts the states of all people at `at_ns`. A person who is not seen is stopped in front of a wall.
+    /// Predicts the states of all people at `at_ns`. If a person is not seen, a wall stops the person.
     fn predict(&mut self, at_ns: u64) {
         for person in self.people.iter_mut().filter(|person| !matches!(person.phase, TrackPhase::Away { .. }))
         {
@@ -181,7 +190,7 @@ impl Tracker {
                 TrackPhase::Tentative => GATE_TENTATIVE,
                 TrackPhase::Known => GATE,
             };
-            // Legs in the learned background keep a standing person, but do not confirm one.
+            // Legs in the learned background keep the track of a standing person, but do not confirm a person.
             let (position, stands) = (person.filter.position(), person.is_known() && person.speed() < 0.5);
             let passes = person.is_known() && at_ns.saturating_sub(person.last_free_ns) < IGNORED_GRACE_NS;
             let is_lost = person.is_known() && at_ns.saturating_sub(person.last_seen_ns) > LEAF_SILENCE_NS;
@@ -253,7 +262,8 @@ impl Tracker {
         }
     }
 
-    /// Updates the people without a leg in `pairs`. Either they are hidden, or the sensor sees through their positions.
+    /// Updates the people who have no leg in `pairs`. These people are hidden, or the sensor sees through their
+    /// positions.
     fn handle_missed_detections(&mut self, sensor: usize, since_s: f64, pairs: &[(usize, usize)]) {
         let view = &self.sensor_views[sensor];
         for (number, person) in self.people.iter_mut().enumerate() {
@@ -267,7 +277,7 @@ impl Tracker {
                 match view.visibility(position) {
                     Visibility::Free => 1.0,
                     Visibility::Occupied => {
-                        // An object that has become background still stands there.
+                        // A person who has become background still stands at the position.
                         if person.is_known() && person.speed() < 0.4 {
                             person.absent_s = (person.absent_s - COARSE_WEIGHT * since_s).max(0.0);
                         }
@@ -350,7 +360,7 @@ impl Tracker {
             };
             match (i + 1..self.people.len()).find(|&j| is_same(&self.people[j])) {
                 Some(other) => {
-                    // Keep the person who was confirmed first, with the filter of the one who was seen last.
+                    // Keep the person who was confirmed first, with the filter of the person who was seen last.
                     let (keep, drop) = if self.people[other].is_known() && !self.people[i].is_known() {
                         (other, i)
                     } else {
@@ -370,8 +380,8 @@ impl Tracker {
         }
     }
 
-    /// Deletes people whose position sensors have seen through for long enough, who have been out of sight for too
-    /// long, who went outside, or who have stayed in an ignored area.
+    /// Deletes people who have been out of sight for too long, who went outside, or who have stayed in an ignored area.
+    /// Also deletes people if sensors have seen through their positions for long enough.
     fn delete_lost_tracks(&mut self, at_ns: u64) {
         let mut number = 0;
         while number < self.people.len() {
@@ -445,7 +455,7 @@ impl Tracker {
         picture.misplaced.append(&mut self.misplaced);
     }
 
-    /// Detects doors that have leaves, because only these are ever closed.
+    /// Detects doors with leaves. Only these doors can be closed.
     fn detect_leaves(&mut self, sensor: usize) {
         let doors = self.site.doors.iter().zip(&mut self.has_leaves).zip(&mut self.closed[sensor]);
         for ((door, has_leaves), closed) in doors.filter(|((_, has_leaves), _)| !**has_leaves) {
@@ -475,7 +485,7 @@ impl Tracker {
         }
     }
 
-    /// Returns the hidden person in the same room who is most likely to have been at `position` at `then_ns`.
+    /// Returns the hidden person who was most likely at `position` at the time `then_ns`, in the room of `position`.
     fn hidden_near(&self, position: Point, then_ns: u64) -> Option<usize> {
         let room = self.site.room_at(position);
         let off2 = |(number, person): (usize, &Person)| {
@@ -489,7 +499,7 @@ impl Tracker {
         near.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, number)| number)
     }
 
-    /// Returns whether a person is a leg of another person who is seen.
+    /// Returns whether a person is only a leg of another person, whom a sensor sees.
     fn is_part_of_another(&self, number: usize) -> bool {
         let one = &self.people[number];
         let near = |other: &Person| {
@@ -532,9 +542,10 @@ impl Tracker {
         }
     }
 
-    /// Returns whether a new person has come through a door that leads out of the sensors' view. They must be first
-    /// seen near the door. Near a door with leaves, people are not confirmed, so they may be first seen farther away.
-    /// In this case, they have come through it if they walk away from it and are not a leg of a confirmed person.
+    /// Returns whether a new person has come through a door that leads out of the sensors' view. The person must be
+    /// first seen near the door. Near a door with leaves, people are not confirmed, so the person may be first seen
+    /// farther away. In this case, the person has come through the door if they walk away from it and are not a leg of
+    /// a confirmed person.
     fn has_passed_door(&self, number: usize, door: usize) -> bool {
         let person = &self.people[number];
         let off_m = self.site.distance_to_door(person.first_position, door);
@@ -550,14 +561,14 @@ impl Tracker {
         off_m < MAX_BEFORE_LEAVES_M && walks_away && is_alone
     }
 
-    /// Confirms a new person, or identifies them with one who was away or hidden.
+    /// Confirms a new person, or finds the person who was away or hidden and is this person.
     fn confirm(&mut self, number: usize, at_ns: u64) {
         let new = &self.people[number];
         let (first_position, first_seen_ns) = (new.first_position, new.first_seen_ns);
         let off = |door: usize| distance_to_segment(first_position, self.site.doors[door].between);
         let is_inside = self.site.room_at(first_position).is_some_and(|room| self.watched[room]);
         let before_door_m = if is_inside { MAX_INSIDE_DOOR_M } else { MAX_BEFORE_DOOR_M };
-        // Candidates are all people who are away, each with the door from which they would have come.
+        // Candidates are all people who are away. Each candidate has the door through which they would have come.
         let arrival = |(old, person): (usize, &Person)| {
             let TrackPhase::Away { door: entry, .. } = person.phase else { return None };
             let exit = self.site.nearest_door(first_position, |door| {
@@ -566,7 +577,7 @@ impl Tracker {
                 (leads || self.site.gaps.iter().any(is_gap)) && off(*door) < before_door_m
             })?;
             let after_s = (first_seen_ns as f64 - person.at_ns as f64) * 1e-9;
-            // Exclude a person who was still seen when the new one appeared.
+            // Exclude a person who was still seen when the new person appeared.
             let distance_m = distance(first_position, person.filter.position());
             if after_s < -0.75 || after_s < -0.25 && distance_m > 0.7 {
                 return None;

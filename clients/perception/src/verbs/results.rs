@@ -16,12 +16,13 @@ use serde::Serialize;
 
 /// Topics under which the results are published.
 pub(super) struct Topics<A: Payload + ?Sized, B: Payload + ?Sized> {
-    // Fields are dropped in this order: the topics first, and then the publisher that wakes their subscribers.
+    // Fields are dropped in this order: first the topics, and then the publisher that wakes the subscribers of the
+    // topics.
     pub(super) publications: (Publication<A>, Publication<B>),
     pub(super) sensor: SensorPublisher,
 }
 
-/// Lines and topics of a run.
+/// Output of a run: lines and topics.
 pub(super) struct Results<'a, A: Payload + ?Sized, B: Payload + ?Sized> {
     /// Name in all lines.
     pub(super) name: &'a str,
@@ -30,7 +31,7 @@ pub(super) struct Results<'a, A: Payload + ?Sized, B: Payload + ?Sized> {
     pub(super) header: Header,
     /// `None` until [`publish`](Self::publish) has created them.
     pub(super) topics: Option<Topics<A, B>>,
-    /// Number of samples of the subscribed topics that were published but not received.
+    /// Number of samples of the subscribed topics that were published, but that this run did not receive.
     pub(super) missed: u64,
     out: Output<'a>,
     notes: Output<'a>,
@@ -80,8 +81,7 @@ impl<'a, A: Payload + ?Sized, B: Payload + ?Sized> Results<'a, A, B> {
             .map_or(0, |topics| topics.publications.0.failed() + topics.publications.1.failed())
     }
 
-    /// Copies the flags of a scan's `header`, because results of simulated or replayed scans are simulated or replayed
-    /// too.
+    /// Copies the flags of a scan's `header`, because the results of a simulated or replayed scan need the same flags.
     pub(super) fn take_flags(&mut self, header: &Header) {
         self.header.flags = header.flags & (Flags::SIMULATED | Flags::REPLAYED);
     }

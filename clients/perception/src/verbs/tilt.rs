@@ -163,7 +163,7 @@ impl TiltArgs {
 
 /// Name in the lines of a run that does not publish.
 const DEFAULT_NAME: &str = "tilted";
-/// Minimum duration of a problem with the angles before it is reported, in ns. A shorter one is only counted.
+/// Minimum duration of a problem with the angles that is reported, in ns. A shorter problem is only counted.
 const MIN_PROBLEM_NS: u64 = 300_000_000;
 
 struct TiltRun<'a> {
@@ -200,7 +200,7 @@ impl TiltRun<'_> {
         Ok(())
     }
 
-    /// Publishes once the number of beams is known, which determines the maximum length of samples.
+    /// Creates the topics once the number of beams is known. This number determines the maximum length of samples.
     fn publish(&mut self) -> Result<(), ExitReason> {
         let results = &mut self.writer.results;
         if let (Some(_), Some(beams), None) = (&self.args.name, self.beams, &results.topics) {
@@ -266,8 +266,8 @@ struct ProblemFilter {
 }
 
 impl ProblemFilter {
-    /// Updates the filter with the problem at the time of a scan. Returns a problem, or its end, if it must be reported
-    /// now.
+    /// Updates the filter with the problem `now` of a scan with the stamp `stamp_ns`. Returns a problem, or the end of
+    /// a problem, if it must be reported now.
     fn changed(&mut self, stamp_ns: u64, now: Option<DropReason>) -> Option<Option<DropReason>> {
         if now != self.now || self.since_ns == 0 {
             (self.now, self.since_ns) = (now, stamp_ns);
@@ -302,8 +302,8 @@ impl SweepWriter<'_> {
         }
     }
 
-    /// Stores the obstacles of a sweep, and publishes the sweep if the topics exist. Returns the header of the
-    /// obstacles.
+    /// Stores the obstacles of a sweep. Publishes the points and the obstacles if the topics exist. Returns the header
+    /// of the obstacles.
     fn publish(&mut self, sweep: &Sweep<'_>) -> Header {
         let flags = if sweep.is_complete { Obstacles::COMPLETE } else { 0 }
             | if sweep.is_unreliable { Obstacles::UNRELIABLE } else { 0 };
@@ -346,7 +346,8 @@ impl SweepWriter<'_> {
             let times = || points.iter().map(|point| point.stamp_ns);
             let (from_ns, until_ns) = (times().min().unwrap_or(0), times().max().unwrap_or(0));
             let header = header_of(cloud.next_number(), from_ns, until_ns);
-            // Ignore errors. Subscribers detect a missing sample by its number, and poll if they cannot be woken.
+            // Ignore errors. Subscribers detect a missing sample by the gap in the sequence numbers, and poll if they
+            // cannot be woken.
             let _ = cloud.send_len_with(&header, Cloud::len(points.len()), |sample| {
                 for (slot, point) in sample.begin(head).iter_mut().zip(points) {
                     *slot = CloudPoint {
@@ -363,7 +364,8 @@ impl SweepWriter<'_> {
         header
     }
 
-    /// Reports a problem with the angles or its end. If `mount` is given, it reports a new delay of their stamps.
+    /// Reports a problem with the angles, or the end of a problem. If `mount` is given, reports a new delay of the
+    /// angles' stamps.
     fn write_angles(
         &mut self,
         problem: Option<DropReason>,
@@ -375,7 +377,7 @@ impl SweepWriter<'_> {
     }
 }
 
-/// Returns the points of each scan in chunks of at most `most`. Within a scan, beam indexes increase.
+/// Returns the points of each scan in chunks of at most `most` points. Within a scan, beam indexes increase.
 fn scans(points: &[Point], most: usize) -> impl Iterator<Item = &[Point]> {
     points.chunk_by(|one, next| one.beam < next.beam).flat_map(move |scan| scan.chunks(most.max(1)))
 }
@@ -475,7 +477,7 @@ const CHECKED_SWEEPS: u32 = 6;
 const MAX_HEIGHT_ERROR_M: f64 = 0.02;
 /// Maximum error of level and roll, in degrees.
 const MAX_LEVEL_ERROR_DEG: f64 = 0.3;
-/// Maximum lean of a wall that the level does not explain, in degrees.
+/// Maximum lean of a wall in degrees, without the part that the error of the level angle explains.
 const MAX_LEAN_DEG: f64 = 0.5;
 
 /// Result of one item of a check.

@@ -121,7 +121,7 @@ struct TrackRun<'a> {
     args: &'a TrackArgs,
     locations: &'a [Domain],
     tracker: PeopleTracker,
-    /// Scans and foregrounds of each sensor of the site, which are joined by `seq`.
+    /// Scans and foregrounds of each sensor of the site. A scan and a foreground with the same `seq` are joined.
     joins: Vec<Join<StampedScan, Box<Foreground>>>,
     late: LateReports,
     /// Whether the run has subscribed to a topic of a sensor.
@@ -157,7 +157,7 @@ impl TrackRun<'_> {
         Ok(())
     }
 
-    /// Reports late scans, and publishes once a domain exists.
+    /// Reports late scans, and creates the topics once a domain exists.
     fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         for (sensor, count) in self.late.due(now, self.tracker.late()) {
             self.writer.report_late(sensor, count, self.args.delay)?;
@@ -208,14 +208,14 @@ impl TrackRun<'_> {
 /// Writer and publisher of snapshots.
 struct SnapshotWriter<'a> {
     site: Site,
-    /// Indexes of the doors whose counts are printed. If empty, all tracks and events are printed.
+    /// Indexes of the doors whose counts are printed. If there are none, all tracks and events are printed.
     counted: Vec<usize>,
-    /// Number of people who went through each door: forth, which is from `from` to `to`, and back.
+    /// For each door, the number of people who went from `from` to `to`, and the number of people who went back.
     passages: Vec<[u64; 2]>,
     appeared: u64,
     /// Tracks of the last snapshot.
     tracks: Box<Tracks>,
-    /// Number of published samples of `tracks` and of `events`.
+    /// Number of published samples of topic `tracks`, and of topic `events`.
     samples: [u64; 2],
     results: Results<'a, Tracks, Event>,
 }
@@ -279,7 +279,8 @@ impl SnapshotWriter<'_> {
         *snapshots += 1;
         *events += numbered.len() as u64;
         if let Some(Topics { publications, sensor }) = &mut results.topics {
-            // Ignore errors. Subscribers detect a missing sample by its number, and poll if they cannot be woken.
+            // Ignore errors. Subscribers detect a missing sample by the gap in the sequence numbers, and poll if they
+            // cannot be woken.
             for (header, event) in &numbered {
                 let _ = publications.1.send_with(header, |sample| *sample = *event);
             }
@@ -352,7 +353,7 @@ enum TrackJson<'a> {
     },
 }
 
-/// Number of people who went through a door: forth, which is from `from` to `to`, and back.
+/// Number of people who went through a door from `from` to `to`, and number of people who went back.
 #[derive(Clone, Copy, Serialize)]
 struct PassageCounts<'a> {
     door: &'a str,
@@ -411,7 +412,7 @@ fn milliseconds<S: Serializer>(value: &Duration, serializer: S) -> Result<S::Ok,
 /// Minimum time between two reports of late scans. The first report is sent at once.
 const LATE_REPORT_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Limit on how often late scans are reported.
+/// Decides when late scans are reported again, so that reports are rare.
 struct LateReports {
     /// Number of reported late scans of each sensor.
     reported: Vec<u64>,
@@ -424,8 +425,8 @@ impl LateReports {
         LateReports { reported: vec![0; sensors], next: None }
     }
 
-    /// Returns the index of each sensor with late scans and their number since the last report, if a report is due.
-    /// `late` has the numbers since the start.
+    /// If a report is due, returns each sensor with late scans: its index, and the number of its late scans since the
+    /// last report. `late` has the numbers since the start.
     fn due(&mut self, now: Instant, late: &[u64]) -> Vec<(usize, u64)> {
         if late == self.reported || self.next.is_some_and(|next| now < next) {
             return Vec::new();
@@ -434,7 +435,7 @@ impl LateReports {
         self.unreported(late)
     }
 
-    /// Returns the late scans since the last report even if no report is due, for the end of a run.
+    /// Returns the late scans since the last report, even if no report is due. Used at the end of a run.
     fn unreported(&mut self, late: &[u64]) -> Vec<(usize, u64)> {
         let since = late.iter().zip(&self.reported).map(|(late, reported)| late - reported).enumerate();
         let since = since.filter(|&(_, count)| count > 0).collect();
