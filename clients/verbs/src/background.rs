@@ -27,7 +27,7 @@ use crate::text;
 pub struct BackgroundArgs {
     /// The sensor
     pub sensor: String,
-    /// Request about its model.
+    /// Request about the background model of the sensor.
     #[command(subcommand)]
     pub order: ModelRequest,
 }
@@ -68,8 +68,8 @@ pub enum ModelRequest {
 }
 
 impl BackgroundArgs {
-    /// Sends the request to the hub and writes a line to stdout. Reads the model to load before it installs signal
-    /// handlers, because a flag would not interrupt a read from a terminal.
+    /// Sends the request to the hub and writes a line to stdout. A model to load is read before the signal handlers are
+    /// installed. A handler only sets a flag, which would not interrupt a read from a terminal.
     ///
     /// # Errors
     ///
@@ -134,7 +134,7 @@ impl BackgroundArgs {
     }
 }
 
-/// Model to print, with the time at which the hub saved it for its next run.
+/// Model to print, and the time at which the hub saved it for the hub's next run.
 #[derive(Serialize)]
 struct StoredModel<M> {
     #[serde(flatten)]
@@ -143,7 +143,7 @@ struct StoredModel<M> {
     kept_wall_ns: Option<u64>,
 }
 
-/// Returns the time since 1970.
+/// Returns the wall clock time since 1970.
 fn wall() -> Duration {
     SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default()
 }
@@ -155,8 +155,8 @@ fn shown(sensor: &str, shown: Option<ResponseModel>) -> Result<ResponseModel, Fa
     })
 }
 
-/// Writes `model` to `file`, and reports that to `printed`. Replaces an existing file if `force` is set. If `file` is
-/// standard output, the model goes to `printed`.
+/// Writes `model` to `file`, and writes a line about that to `printed`. Replaces an existing file if `force` is set. If
+/// `file` is standard output, the model goes to `printed`.
 fn save(
     file: &Path,
     force: bool,
@@ -213,8 +213,8 @@ struct SavedJson<'a> {
     count: u16,
 }
 
-/// Reads the model for `sensor` from `file`; `-` stands for `input`. The model must be saved from this sensor, unless
-/// `any_sensor` is set.
+/// Reads the model for `sensor` from `file`; `-` stands for `input`. Unless `any_sensor` is set, the model must be one
+/// of this sensor.
 ///
 /// # Errors
 ///
@@ -250,6 +250,5 @@ pub fn saved_model(
 
 /// Name that stands for stdin or stdout.
 const STANDARD_STREAM: &str = "-";
-/// Maximum length of a model file in bytes. A model of 401 beams is far shorter, even if it is formatted with
-/// indentation.
+/// Maximum length of a model file in bytes. A model of 401 beams is far shorter, even with indentation.
 const MAX_FILE_LEN: u64 = 1 << 20;

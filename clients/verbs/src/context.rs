@@ -1,4 +1,4 @@
-//! Parts of the process that a verb uses: its output, the selected domain, and signals.
+//! Parts of the process that a verb uses: the output, the selected domain, and signals.
 
 use std::fs::File;
 use std::io::IsTerminal;
@@ -66,7 +66,8 @@ impl DomainOptions {
         Domain::of_hub(&self.name, self.root.as_deref(), &Environment::of_process())
     }
 
-    /// Returns the domain in which a program publishes: the running one, or otherwise the one of a hub that starts now.
+    /// Returns the domain in which a program publishes: the domain of the running hub, or otherwise the domain in which
+    /// a new hub would publish.
     ///
     /// # Errors
     ///
@@ -76,19 +77,19 @@ impl DomainOptions {
     }
 }
 
-/// Signals that a verb handles. Each function installs a handler that sets the returned flag, so the signals no longer
-/// end the process. It returns an error if a handler cannot be installed.
+/// Signals that a verb handles. Each function installs a handler that sets the returned flag. The signals then no
+/// longer end the process. A function returns an error if a handler cannot be installed.
 pub trait Signals {
     /// Returns a flag for SIGINT and SIGTERM.
     fn stop(&self) -> Result<Arc<AtomicBool>, Failure>;
-    /// Returns a flag for all signals that request a process to end, including the one of a closed terminal. For verbs
-    /// that must always restore or finish something.
+    /// Returns a flag for all signals that request a process to end, including the signal that a closed terminal sends.
+    /// Used by verbs that must always restore a terminal or finish a file.
     fn any_stop(&self) -> Result<Arc<AtomicBool>, Failure>;
     /// Returns a flag for SIGUSR1, which requests a report.
     fn report(&self) -> Result<Arc<AtomicBool>, Failure>;
 }
 
-/// One flag for all signals that end a process, for a program that runs a verb in a thread. A report is never
+/// The same flag for all signals that end a process. Used by a program that runs a verb in a thread. A report is never
 /// requested.
 impl Signals for Arc<AtomicBool> {
     fn stop(&self) -> Result<Arc<AtomicBool>, Failure> {

@@ -52,7 +52,7 @@ pub(crate) fn confirm(output: &mut Output<'_>, json: bool, sensor: &str, verb: V
     })
 }
 
-/// Returns the past form of `verb`.
+/// Returns the past tense of `verb`.
 fn past_form(verb: Verb) -> &'static str {
     match verb {
         Verb::Pause => "paused",

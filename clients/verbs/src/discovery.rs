@@ -1,5 +1,5 @@
-//! Search for the sensors of a hub, in a background thread, because a list takes milliseconds and a datagram only
-//! microseconds.
+//! Lists the sensors of a hub in a background thread. Listing takes milliseconds, and would delay datagrams, which take
+//! only microseconds.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -9,16 +9,16 @@ use std::time::{Duration, Instant, SystemTime};
 use scanhub_schema::{Failure, PublisherKind, Topic};
 use scanhub_shm::Domain;
 
-/// Lists of the sensors of the current hub.
+/// Repeated listing of the current hub's sensors. A list is one complete search for sensors.
 #[derive(Default)]
 pub struct Discovery {
-    /// Time at which the hub appeared, and the number of lists since then.
+    /// Time at which the hub appeared, and the number of lists that were started since then.
     hub: Option<(Instant, usize)>,
-    /// Current list, and the age of the hub when it was started.
+    /// Current list, and the age of the hub at the start of the list.
     task: Option<(BackgroundTask<Answer>, Duration)>,
     /// Whether a list has succeeded or failed since the hub appeared. Later failures are ignored.
     has_reply: bool,
-    /// Time of the last change of the domain's services, for the current list and for the last complete list.
+    /// Time of the last change of the domain's services: before the current list, and before the last complete list.
     task_change: Option<SystemTime>,
     reply_change: Option<SystemTime>,
 }
@@ -29,9 +29,9 @@ type Answer = Result<Vec<(String, Topic)>, Failure>;
 pub struct DiscoveryReply {
     /// Names of the sensors that have topics, sorted.
     pub sensors: Vec<String>,
-    /// Kinds of publisher that have created the topics of a sensor.
+    /// Sensors, and the kind of publisher that has created the topics of each. A sensor may occur more than once.
     publisher_kinds: Vec<(String, PublisherKind)>,
-    /// Age of the hub when the list was started.
+    /// Age of the hub at the start of the list.
     pub age: Duration,
 }
 
@@ -57,8 +57,8 @@ const SERVICES_DIRECTORY: &str = "services";
 /// Time after which all files of a new service are complete.
 const COMPLETE_AFTER: Duration = Duration::from_secs(5);
 
-/// Number of lists after which one is made even without a change. Services that could not be opened, for example
-/// because descriptors ran out, are missing in a list.
+/// Number of lists after which one is made even if the services are unchanged. A list misses services that could not be
+/// opened, for example because descriptors ran out.
 const RELIST_PERIOD: usize = 6;
 
 /// Interval at which the caller polls for the result.
@@ -73,8 +73,8 @@ impl DiscoveryReply {
         DiscoveryReply { sensors, publisher_kinds, age }
     }
 
-    /// Returns whether `sensor` has `topic` now or after all its topics are created. A publisher creates all topics of
-    /// its kind.
+    /// Returns whether `sensor` has `topic`, or will have it when its publisher has created all topics. A publisher
+    /// creates all topics of its kind.
     pub fn may_have(&self, sensor: &str, topic: Topic) -> bool {
         self.publisher_kinds.iter().any(|(name, kind)| name == sensor && *kind == topic.publisher_kind())
     }
@@ -98,7 +98,7 @@ impl Discovery {
 
     /// Starts a list of the sensors of the hub in `domain` if one is due. Returns the result of a list once, when it is
     /// complete. A list is skipped while the services of the domain are unchanged, because it executes a million
-    /// instructions for each service. Without that, it was half of a gateway's CPU time.
+    /// instructions for each service. Before lists were skipped, they took half of a gateway's CPU time.
     ///
     /// # Errors
     ///
@@ -120,7 +120,7 @@ impl Discovery {
         let age = now - *started;
         if age >= due_after(*calls) {
             let changed = last_change(domain);
-            // Callers also use the first lists to report a missing sensor.
+            // Do not skip the first lists, because callers also use them to report a missing sensor.
             let may_skip = *calls > DISCOVERY_TIMES.len() && !calls.is_multiple_of(RELIST_PERIOD);
             if may_skip && changed.is_some() && changed == self.reply_change {
                 *calls += 1;
@@ -148,8 +148,8 @@ fn last_change(domain: &Domain) -> Option<SystemTime> {
     changed.elapsed().is_ok_and(|age| age >= COMPLETE_AFTER).then_some(changed)
 }
 
-/// Slow work in a separate thread, so that a sending thread waits only for samples. The result is discarded if this is
-/// dropped.
+/// Slow work in a separate thread, so that a sending thread waits only for samples. If the task is dropped, its result
+/// is discarded.
 #[derive(Debug)]
 pub struct BackgroundTask<T>(Receiver<T>);
 
@@ -157,7 +157,7 @@ pub struct BackgroundTask<T>(Receiver<T>);
 const STOP_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 impl<T: Send + 'static> BackgroundTask<T> {
-    /// Starts the work. Returns `None` if no thread can be created; the caller tries again later.
+    /// Starts the work. Returns `None` if no thread can be created. The caller then tries again later.
     pub fn begin(work: impl FnOnce() -> T + Send + 'static) -> Option<BackgroundTask<T>> {
         let (done, result) = channel();
         let thread = thread::Builder::new().name("errand".into()).spawn(move || {
@@ -166,7 +166,7 @@ impl<T: Send + 'static> BackgroundTask<T> {
         thread.ok().map(|_| BackgroundTask(result))
     }
 
-    /// Returns the result once the work has ended. Returns it only once.
+    /// Returns the result if the work has ended. Returns it to only one call.
     pub fn result(&self) -> Option<T> {
         self.0.try_recv().ok()
     }

@@ -27,7 +27,7 @@ pub fn parse(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// Maximum duration: a year. It can be added to any time without an overflow.
+/// Maximum duration: one year. It can be added to any time without an overflow.
 const MAX_DURATION: Duration = Duration::from_secs(365 * 24 * 3600);
 
 #[cfg(test)]

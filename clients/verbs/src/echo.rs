@@ -129,7 +129,7 @@ impl Echo<'_> {
         }
     }
 
-    /// Writes a line of values. Writes the column names before the first one, and again when the number of beams
+    /// Writes a line of values. Writes the column names before the first line, and again when the number of beams
     /// changes.
     fn csv(&mut self, columns: ScanColumns, header: &Header, scan: &Scan) -> Result<(), ExitReason> {
         if self.beams != Some(scan.beams()) {

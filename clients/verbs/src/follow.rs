@@ -17,7 +17,7 @@ pub use crate::receive_stats::ReceiveStats;
 use crate::receive_stats::{LineLossCounter, Loss};
 use crate::{json, text};
 
-/// Limits at which a verb ends by itself. They are arguments of every verb that subscribes to topics.
+/// Limits at which a verb ends by itself. Every verb that subscribes to topics has them as arguments.
 #[derive(clap::Args, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RunLimits {
     /// Stop after this number of samples
@@ -32,7 +32,8 @@ pub struct RunLimits {
 }
 
 impl RunLimits {
-    /// Returns whether the run ends by itself. Such a run fails if no hub runs at its start, or if it is interrupted.
+    /// Returns whether the run ends by itself. A bounded run fails if no hub runs at its start, or if a signal stops
+    /// it.
     pub fn is_bounded(&self) -> bool {
         self.count.is_some() || self.run_for.is_some()
     }
@@ -48,16 +49,17 @@ pub enum Event {
     Added(Rc<TopicName>),
     /// The run has subscribed to the topic. It receives samples that are sent from now on.
     Subscribed(Rc<TopicName>),
-    /// A sample, or a stand-in for a silence, which does not count. Drop it before the next call.
+    /// A sample, or the substitute for a sample during a silence, which is not counted. Drop the sample before the next
+    /// call.
     Sample(Rc<TopicName>, Sample, Arrival),
-    /// A problem of these topics, or its end. The list is empty if the run has no topics yet.
+    /// A problem of these topics, or the end of a problem. The list is empty if the run has no topics yet.
     Notice(Vec<Rc<TopicName>>, Notice),
     /// The run cannot subscribe to this topic because memory, descriptors or slots ran out. It will try again
     /// ([`TopicRun::tolerating_shortage`]).
     ResourceExhausted(Rc<TopicName>, Failure),
-    /// A status of a sensor, for a run [`with_lines`](TopicRun::with_lines).
+    /// A status of a sensor. Only a run [`with_lines`](TopicRun::with_lines) returns it.
     Line(String, Box<Status>),
-    /// End of a round over all topics. There are about ten per second even without samples.
+    /// End of a round over all topics. Even without samples, about ten rounds per second end.
     Tick(Instant),
 }
 
@@ -70,10 +72,10 @@ pub struct Arrival {
     pub wall_ns: u64,
 }
 
-/// A problem of a topic, or its end.
+/// A problem of a topic, or the end of a problem.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Notice {
-    /// Number of samples that were published but not received.
+    /// Number of samples that were published, but that this process did not receive.
     Missed(u64),
     /// No sample has arrived for longer than the topic allows.
     Stale,
@@ -107,9 +109,9 @@ impl Notice {
 pub struct TopicRun<'a> {
     session: Session,
     topics: Vec<TopicState>,
-    /// Lines of the sensors, for a run with lines.
+    /// Serial lines of the sensors; `None` unless the run has lines.
     lines: Option<Vec<LineState>>,
-    /// Number of `topics` whose lines were added to `lines`.
+    /// Number of topics in `topics` whose serial lines were added to `lines`.
     topics_with_line: usize,
     /// Topics to which the run subscribes for each sensor of the hub.
     all_sensor_topics: &'a [Topic],
@@ -128,13 +130,13 @@ pub struct TopicRun<'a> {
     started: Instant,
     last_sample: Instant,
     hub_started_at: Option<Instant>,
-    /// Time at which the run first found a hub, not only a listener.
+    /// Time at which the run first found a hub. A listener does not count.
     hub_running_since: Option<Instant>,
     /// Time of the last list of sensors.
     listed_at: Option<Instant>,
     is_waiting_reported: bool,
     received: u64,
-    /// End of the pause without new subscriptions after memory, descriptors or slots ran out.
+    /// End of the pause after memory, descriptors or slots ran out. During the pause, the run creates no subscriptions.
     short_until: Option<Instant>,
 }
 
@@ -154,7 +156,7 @@ enum Step {
 struct Round {
     /// Index of the current topic.
     topic: usize,
-    /// Number of samples received from it in this round.
+    /// Number of samples received from the current topic in this round.
     taken: usize,
     /// Whether this round has subscribed to a topic.
     subscribed: bool,
@@ -174,12 +176,12 @@ struct TopicState {
     name: Rc<TopicName>,
     source: Source,
     stats: ReceiveStats,
-    /// Time on CLOCK_MONOTONIC in ns since which samples are received as they are sent.
+    /// Time on CLOCK_MONOTONIC in ns. Samples that are sent later are received without a wait.
     since_ns: u64,
 }
 
-/// Serial line of a sensor. Its statuses do not count for the limits, and an error in receiving them does not end the
-/// run.
+/// Serial line of a sensor, with the statuses of this sensor. These statuses do not count for the limits of the run. An
+/// error while receiving them does not end the run.
 struct LineState {
     sensor: String,
     /// Reader of the statuses; `None` after an error.
@@ -187,18 +189,20 @@ struct LineState {
     losses: LineLossCounter,
 }
 
-/// Maximum number of samples from one topic before the next topic.
+/// Maximum number of samples that are received from one topic before the next topic.
 const BATCH_SIZE: usize = 32;
-/// Time in which every listener has announced its remote sensors. It announces them once a second.
+/// Maximum time until every listener has announced its remote sensors. A listener announces them once a second.
 const ANNOUNCEMENT_TIMEOUT: Duration = Duration::from_secs(3);
-/// Interval between lists of sensors while a sensor is missing. A list takes milliseconds, during which samples wait.
+/// Interval between lists of sensors while a sensor is missing. A list takes milliseconds, and samples wait during this
+/// time.
 const LIST_INTERVAL: Duration = Duration::from_millis(500);
-/// Pause without new subscriptions after a shortage. An attempt takes as long as receiving a thousand samples.
+/// Time without new subscriptions after memory, descriptors or slots ran out. An attempt to subscribe takes as long as
+/// receiving a thousand samples.
 const SHORTAGE_PAUSE: Duration = Duration::from_secs(1);
 
 impl<'a> TopicRun<'a> {
-    /// Creates a run that subscribes to `names`, and to the topics `of_all` of each sensor, in the first of `locations`
-    /// in which a hub runs. The run ends when `limits` are reached or `stop` is set.
+    /// Creates a run that subscribes to `names`, and to the topics in `of_all` of every sensor. It uses the first of
+    /// `locations` in which a hub runs. The run ends when `limits` are reached or `stop` is set.
     pub fn new(
         names: &[TopicName],
         of_all: &'a [Topic],
@@ -235,7 +239,7 @@ impl<'a> TopicRun<'a> {
         }
     }
 
-    /// Adds subscriptions to the statuses of the sensors. They have counters of the losses on the serial lines.
+    /// Adds subscriptions to the statuses of the sensors. A status has counters of the losses on the serial line.
     pub fn with_lines(self) -> TopicRun<'a> {
         TopicRun { lines: Some(Vec::new()), ..self }
     }
@@ -248,14 +252,14 @@ impl<'a> TopicRun<'a> {
         self
     }
 
-    /// Minimizes the latency: the run waits by `wait`, and receives samples before it checks the hub, which takes
-    /// longer.
+    /// Minimizes the latency: the run uses the method `wait`, and receives samples before it checks the hub. Checking
+    /// the hub takes longer than receiving.
     pub fn receiving_first(self, wait: Wait) -> TopicRun<'a> {
         TopicRun { session: self.session.waiting_by(wait), receives_first: true, ..self }
     }
 
-    /// Continues with [`Event::ResourceExhausted`] if memory, descriptors or slots for a topic run out. Otherwise, such
-    /// a run fails.
+    /// Makes the run return [`Event::ResourceExhausted`] and continue if memory, descriptors or slots for a topic run
+    /// out. Without this call, the run fails.
     pub fn tolerating_shortage(self) -> TopicRun<'a> {
         TopicRun { tolerates_shortage: true, ..self }
     }
@@ -273,8 +277,8 @@ impl<'a> TopicRun<'a> {
         !self.round.more
     }
 
-    /// Waits for the next event, and returns it. Returns `None` after the last one. An [`Event::Tick`] follows at
-    /// `wake_at` in any case.
+    /// Waits for the next event, and returns it. Returns `None` after the last event. At `wake_at`, returns an
+    /// [`Event::Tick`] even if nothing has happened.
     ///
     /// # Errors
     ///
@@ -302,7 +306,7 @@ impl<'a> TopicRun<'a> {
     ///
     /// # Errors
     ///
-    /// The error of `summary`, or otherwise the one in `end`.
+    /// The error of `summary`, or otherwise the error in `end`.
     pub fn finish(
         mut self,
         end: Result<(), ExitReason>,
@@ -362,7 +366,7 @@ impl<'a> TopicRun<'a> {
         Ok(())
     }
 
-    /// Checks whether the hub has started or exited, and for new sensors.
+    /// Checks whether the hub has started or exited, and whether there are new sensors.
     fn check_hub(&mut self) -> Result<(), ExitReason> {
         let change = self.session.check_hub()?;
         if let Some(holder) = change.ended {
@@ -374,7 +378,7 @@ impl<'a> TopicRun<'a> {
                 self.notice(Notice::HubBack, |name| publishes(name, holder));
             }
             self.hub_started_at = Some(Instant::now());
-            // Samples that the new hub sent before now have waited, so their arrival times are too late.
+            // Samples that the new hub sent earlier have waited, so their arrival times are too late.
             let now_ns = clock::now_ns();
             for topic in self.topics.iter_mut().filter(|topic| topic.source.subscribed()) {
                 topic.since_ns = now_ns;
@@ -420,7 +424,7 @@ impl<'a> TopicRun<'a> {
             round.next_topic();
             return Ok(());
         }
-        // Subscribing takes a thousand times as long as receiving, so receive from other topics before the next
+        // Subscribing takes a thousand times as long as receiving. Therefore receive from other topics before the next
         // subscription.
         if !was_subscribed && (round.subscribed || is_short) {
             round.more |= round.subscribed;
@@ -482,7 +486,7 @@ impl<'a> TopicRun<'a> {
                     Ok(None) => break,
                     Ok(Some(status)) => {
                         line.note(status.header().boot, &status.counters);
-                        // Copy the status, because a subscriber can borrow at most four samples of a topic.
+                        // Copy the status, because a subscriber can hold at most four samples of a topic.
                         self.events.push_back(Event::Line(sensor.clone(), Box::new(*status)));
                     }
                     Err(_) => *source = None,
@@ -548,10 +552,11 @@ impl<'a> TopicRun<'a> {
         Ok(())
     }
 
-    /// Fails if the run has a topic or sensor that the hub does not have. A hub that has started has created all its
-    /// topics.
+    /// Fails if the run needs a topic or sensor that the hub does not have. A hub that has finished starting has
+    /// created all its topics.
     fn check_sensors(&mut self) -> Result<(), ExitReason> {
-        // Paused topics are not missing. Skip the list if possible, because it costs more than receiving.
+        // A paused topic is not missing. Skip the list of sensors if possible, because listing takes longer than
+        // receiving.
         let (paused_topics, topics) = (&self.paused_topics, &self.topics);
         let is_missing =
             |topic: &TopicState| !paused_topics.contains(&topic.name.topic) && !topic.source.subscribed();
@@ -570,7 +575,7 @@ impl<'a> TopicRun<'a> {
         if self.session.hub_is_starting() {
             return Ok(());
         }
-        // A hub that starts after a listener still needs time to create its topics.
+        // A hub that has started after a listener may still need time to create its topics.
         let is_hub_running = self.session.hub_is_running();
         self.hub_running_since =
             if is_hub_running { self.hub_running_since.or(Some(Instant::now())) } else { None };
@@ -584,7 +589,7 @@ impl<'a> TopicRun<'a> {
         let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
         sensors.dedup();
         let wants_all = topics.iter().all(|topic| topic.name.is_robot());
-        // Only sensors of the hub count, or remote sensors if there is no hub.
+        // Only sensors of the hub count. Without a hub, only remote sensors count.
         let may_come =
             self.may_start(if is_hub_running { DomainHolder::Hub } else { DomainHolder::Listener });
         if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == is_hub_running) {
@@ -612,8 +617,9 @@ impl<'a> TopicRun<'a> {
         Ok(())
     }
 
-    /// Returns whether a publisher of this kind may still appear: a listener at any time in an unbounded run, and the
-    /// hub after a listener.
+    /// Returns whether sensors of a publisher of the kind `holder` may still appear. Sensors of a listener may appear
+    /// at any time in an unbounded run, and in the first [`ANNOUNCEMENT_TIMEOUT`] of a bounded one. Sensors of the hub
+    /// may appear in an unbounded run until [`STARTUP_GRACE`] after the hub was found.
     fn may_start(&self, holder: DomainHolder) -> bool {
         let unbounded = !self.limits.is_bounded();
         match holder {
@@ -624,7 +630,7 @@ impl<'a> TopicRun<'a> {
         }
     }
 
-    /// Adds `notice` for the topics for which `concerns` returns true.
+    /// Adds `notice` for all topics for which `concerns` returns true.
     fn notice(&mut self, notice: Notice, concerns: impl Fn(&TopicName) -> bool) {
         let names: Vec<_> =
             self.topics.iter().map(|topic| &topic.name).filter(|name| concerns(name)).cloned().collect();

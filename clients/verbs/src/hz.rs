@@ -32,7 +32,8 @@ pub struct HzArgs {
     pub limits: RunLimits,
 }
 
-/// Parses the time span of a line. In a shorter one, no two samples would be far enough apart for a rate.
+/// Parses the time span that a line covers. In a span below the minimum, no two samples would be far enough apart for a
+/// rate.
 fn parse_window(text: &str) -> Result<Duration, String> {
     match duration::parse(text)? {
         window if window >= MIN_WINDOW => Ok(window),
@@ -80,8 +81,8 @@ struct Hz<'a> {
     notes: Output<'a>,
 }
 
-/// A topic, with the time on CLOCK_MONOTONIC in ns since which its samples are received as they are sent. Earlier
-/// samples come from the history, so their arrival times have no rate.
+/// A topic, with a time on CLOCK_MONOTONIC in ns. Samples that are sent later are received without a wait. Earlier
+/// samples come from the history, so their arrival times show no rate.
 struct TopicWindow {
     name: Rc<TopicName>,
     since_ns: u64,
@@ -160,10 +161,10 @@ impl Hz<'_> {
     }
 }
 
-/// Losses on the line of a sensor within the window.
+/// Losses on the line of a sensor in the window.
 struct LineWindow {
     sensor: String,
-    /// Arrival of each status, and the lost scans up to then, the newest last.
+    /// Arrival time of each status, with the number of scans that were lost until then. The newest is last.
     lost: VecDeque<(Instant, Option<u64>)>,
     /// Last status.
     status: Status,
@@ -271,7 +272,7 @@ impl Window {
         Window { length, arrivals: VecDeque::new() }
     }
 
-    /// Adds an arrival at `now`, before which `missed` samples did not arrive.
+    /// Adds an arrival at `now`. Before it, `missed` samples did not arrive.
     fn add(&mut self, now: Instant, missed: u64) {
         self.arrivals.push_back((now, missed));
     }

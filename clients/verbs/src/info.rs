@@ -54,7 +54,7 @@ impl InfoArgs {
     }
 }
 
-/// Returns the sensors to print. Waits for a missing one as long as the hub may still be starting.
+/// Returns the sensors to print. If a sensor is missing, waits for it while the hub may still be starting.
 fn selected_sensors(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure> {
     let deadline = Instant::now() + STARTUP_GRACE;
     loop {
@@ -70,7 +70,7 @@ fn selected_sensors(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>
     }
 }
 
-/// Returns the last status of each of `sensors`; `None` if it does not arrive in time.
+/// Returns the last status of each sensor in `sensors`; `None` if the status does not arrive in time.
 pub(crate) fn statuses(
     domain: &Domain,
     sensors: &[String],
@@ -97,7 +97,7 @@ pub(crate) fn statuses(
     }
 }
 
-/// Maximum wait for a status. A new subscriber gets the last one within 100 ms, unless the machine is busy.
+/// Maximum wait for a status. Unless the machine is busy, a new subscriber receives the last status within 100 ms.
 const STATUS_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Interval between polls. The hub sends the history without waking the subscriber.
@@ -138,8 +138,8 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
     rows
 }
 
-/// Returns the measuring mode of an LMS as a number, or the mode of another scanner by name. Some of those have only
-/// one mode, and then `None` is returned.
+/// Returns the number of an LMS's measuring mode, or the name of another scanner's mode. Returns `None` for a scanner
+/// that has only one mode.
 fn mode(status: &Status) -> Option<String> {
     match status.mode {
         Status::MODE_UNKNOWN if status.family() == Some(Family::Lms) => Some("unknown".into()),

@@ -17,7 +17,7 @@ use crate::output::{ExitReason, Output};
 use crate::receive_stats::ReceiveStats;
 
 pub use results::*;
-// The line of class `background` is equal to a file with a model.
+// The line of class `background` has the same content as a file with a model.
 pub(crate) use scanhub_schema::as_json as background;
 
 /// Keys at the start of every line about a sample.
@@ -51,14 +51,14 @@ impl<'a> SampleKeys<'a> {
         }
     }
 
-    /// Returns the keys of a line about a silence, which belongs to no telegram.
+    /// Returns the keys of a line about a silence. A silence belongs to no telegram.
     fn for_silence(class: &'static str, sensor: &'a str) -> SampleKeys<'a> {
         let (seq, topic_seq, stamp_ns, wall_ns, boot, quality) = (None, None, None, None, None, None);
         SampleKeys { class, sensor, seq, topic_seq, stamp_ns, wall_ns, boot, quality, reasons: Vec::new() }
     }
 }
 
-/// Key at the end of a line about a sample: the flags that are set. It is absent if there are none.
+/// Last key of a line about a sample: the flags that are set. The key is absent if no flag is set.
 #[derive(Serialize)]
 pub struct FlagNames {
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -152,7 +152,7 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         codes: scan,
         intensities: scan.intensities(),
         angles_deg: scan,
-        // A scan without exact angles was measured without a grid, so it has no collisions.
+        // A scan without exact angles has no collisions, because its beams were measured at the angles of the grid.
         collisions: (!has_grid_only(scan)).then_some(scan.collisions),
         incomplete: scan.is_incomplete(),
         flags: FlagNames::of(header),
@@ -239,10 +239,10 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
     }
 }
 
-/// Returns the command, or the setting of link `sensor`, that makes topic `marks` available. Returns `None` if it is
-/// available, or if that is unknown or impossible.
+/// Returns the command that makes topic `marks` available, or the setting of link `sensor` that does. Returns `None` if
+/// `marks` is available, if that is unknown, or if the sensor can never publish marks.
 pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
-    // Name on the machine to which the sensor is connected.
+    // Name of the sensor on the machine to which it is connected.
     let name = sensor.rsplit('.').next().unwrap_or(sensor);
     if status.family()?.has_reflector_levels() {
         let mode = status.missing_reflector_mode()?;
@@ -252,7 +252,7 @@ pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
     }
 }
 
-/// Writes lines of class `notice`: one for each of `names`, or one without a name if there are none.
+/// Writes lines of class `notice`: one for each name in `names`, or one without a name if `names` is empty.
 pub(crate) fn notices(
     output: &mut Output<'_>,
     names: &[Rc<TopicName>],
@@ -323,7 +323,7 @@ pub(crate) fn control<'a>(sensor: &'a str, verb: Verb) -> impl Serialize + 'a {
     TelegramJson { class: "control", sensor, verb: verb.name(), outcome: "taken" }
 }
 
-/// Returns the line of class `error`, which a program writes when a verb has failed, without the line feed.
+/// Returns the line of class `error`, without a line feed. A program writes it when a verb has failed.
 pub fn error(failure: &Failure) -> String {
     #[derive(Serialize)]
     struct TelegramJson<'a> {

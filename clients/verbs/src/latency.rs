@@ -1,5 +1,5 @@
 //! `scanhub latency`: measures the age of samples on arrival, split into spans. Other programs get the same results if
-//! they use the client library and wait in the same way.
+//! they use the client library with the same method of waiting.
 
 mod spans;
 
@@ -71,8 +71,8 @@ const LINE_INTERVAL: Duration = Duration::from_secs(1);
 
 impl LatencyArgs {
     /// Writes the conditions, a line for each topic once a second, and the result of each topic at the end. Each line
-    /// covers the run up to then. Without `--json`, conditions and notices go to stderr. On a terminal, the result
-    /// includes bars.
+    /// covers the time since the start of the run. Without `--json`, conditions and notices go to stderr. On a
+    /// terminal, the result includes bars.
     ///
     /// # Errors
     ///
@@ -160,7 +160,7 @@ impl Latency<'_> {
                 Event::Sample(name, sample, arrival) => self.sample(&name, &sample, arrival),
                 Event::Notice(names, notice) => {
                     if notice == Notice::HubBack {
-                        // Samples that the new hub sent before now have waited for this process.
+                        // Samples that the new hub sent earlier have waited for this process.
                         let now_ns = clock::now_ns();
                         self.topics.iter_mut().for_each(|(_, spans)| spans.begin(now_ns));
                     }
@@ -211,7 +211,7 @@ impl Latency<'_> {
     }
 }
 
-/// Returns the line of class `latency`. A span without a known time is null. The keys are a contract: they may be
+/// Returns the line of class `latency`. A span whose time is unknown is null. The keys are a contract: they may be
 /// added, but never changed.
 fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
     #[derive(Serialize)]
@@ -248,7 +248,7 @@ fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
     }
 }
 
-/// Writes the ages of a topic up to now in one line.
+/// Writes one line with the ages of a topic since the start of the run.
 fn brief(line: &mut Vec<u8>, name: &TopicName, spans: &Spans) -> io::Result<()> {
     let topic = name.to_string();
     match spans.ages(Span::Age).quantiles() {
@@ -345,7 +345,7 @@ fn us(ns: u64) -> String {
     format!("{:.1}", ns as f64 / 1e3)
 }
 
-/// Formats an edge between bars as a whole number of a unit.
+/// Formats the time at an edge between two bars, as a whole number with a unit.
 fn time(ns: u64) -> String {
     match ns {
         0..1_000_000 => format!("{} us", ns / 1_000),
@@ -360,7 +360,7 @@ fn time(ns: u64) -> String {
 #[serde(tag = "class", rename = "conditions")]
 struct Conditions {
     wait: &'static str,
-    /// Whether the thread has SCHED_FIFO with the lowest priority, which precedes all threads without real-time
+    /// Whether the thread has SCHED_FIFO with the lowest priority. It then runs before all threads without real-time
     /// priority.
     realtime: bool,
     memory_locked: bool,
@@ -372,8 +372,9 @@ struct Conditions {
 }
 
 impl Conditions {
-    /// Requests real-time priority for the calling thread and locks the memory of its process, if `is_realtime` is set
-    /// and as far as permitted, so that other programs do not add latency. Both remain in effect.
+    /// If `is_realtime` is set, requests real-time priority for the calling thread and locks the memory of its process,
+    /// so that other programs do not add latency. Requests that the system refuses are reported in the result. Priority
+    /// and lock are never undone.
     fn take(wait: Wait, is_realtime: bool) -> Conditions {
         let processors = thread::available_parallelism().map_or(1, usize::from);
         let normal = Conditions {
@@ -393,7 +394,7 @@ impl Conditions {
 
     fn with_realtime(self, wait: Wait, processors: usize) -> Conditions {
         let priority = may_spin(wait, processors).and_then(|()| take_priority());
-        // Do not lock later mappings: beyond the limit, mapping the topics would fail.
+        // Do not lock later mappings. If they exceeded the limit, the topics could not be mapped.
         let locked = mlockall(MlockAllFlags::CURRENT).map_err(|error| {
             format!("memory is not locked: {}; `ulimit -l unlimited` permits it", io::Error::from(error))
         });
@@ -418,8 +419,8 @@ impl Conditions {
     }
 }
 
-/// Returns an error if priority for a thread that never sleeps would stop the hub, because there are too few
-/// processors.
+/// Returns an error if there are too few processors for a thread with priority that never sleeps. It would stop the
+/// hub.
 fn may_spin(wait: Wait, processors: usize) -> Result<(), String> {
     if wait == Wait::Spin && processors < MIN_PROCESSORS {
         return Err(format!(
@@ -444,7 +445,7 @@ fn take_priority() -> Result<(), String> {
     })
 }
 
-/// Measures the duration of one read of the clock in ns. It is the minimum of several runs, so interruptions do not
+/// Measures the duration of one read of the clock in ns. Returns the minimum of several runs, so interruptions do not
 /// count.
 fn clock_read_ns() -> f64 {
     const RUNS: usize = 8;

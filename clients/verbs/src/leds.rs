@@ -1,6 +1,6 @@
 //! `scanhub leds`: shows the zone verdict and the mark count of a sensor as lights, in the terminal and on LEDs of the
-//! machine. The lights never show a better state than the known one: the red light is on at the start, at the end, and
-//! while the hub is silent.
+//! machine. The lights never show a better state than the program knows: the red light is on at the start, at the end,
+//! and while the hub is silent.
 
 mod device;
 
@@ -55,8 +55,8 @@ green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector m
 
 impl LedsArgs {
     /// Shows the lights on stdout and on the LEDs until the limits are reached or a signal ends the run. Notices go to
-    /// stderr without `--json`. The red light is on after the run, however it ends. If an LED fails during the run,
-    /// that is reported, and the verb tries it again while the others continue.
+    /// stderr without `--json`. The red light is on after the run, however it ends. If an LED fails during the run, the
+    /// verb reports that and tries the LED again later. The other LEDs continue.
     ///
     /// # Errors
     ///
@@ -95,8 +95,7 @@ impl LedsArgs {
         verb_result(end.and(panel.show_unwatched()))
     }
 
-    /// Returns light and name of each `--led`. A name may occur only once, because an LED for two lights would be
-    /// ambiguous.
+    /// Returns light and name of each `--led`. A name may occur only once, because an LED cannot show two lights.
     fn selected_leds(&self) -> Result<Vec<(Light, &str)>, Failure> {
         let mut selected: Vec<(Light, &str)> = Vec::new();
         for led in &self.leds {
@@ -127,13 +126,13 @@ const LED_FORM: &str = "green=NAME, yellow=NAME, red=NAME or mark=NAME, with a N
 /// Form of the lights on stdout.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum LightDisplay {
-    /// Lines of text, one for each change.
+    /// Text: one line for each change.
     Lines,
-    /// JSON lines, one for each change.
+    /// JSON: one line for each change.
     Json,
     /// One line, which is redrawn.
     Terminal {
-        /// Whether lights that are on have their color.
+        /// Whether a light that is on is shown in its color.
         colors: bool,
     },
 }
@@ -146,7 +145,7 @@ struct LightPanel<'a> {
     verdict: WorstVerdictHold,
     /// Staleness of the mark count, independent of the zones.
     marks: StalenessTimer,
-    /// Name of each sensor whose line loses data, with a text about the loss.
+    /// Each sensor whose line loses data: its name, and a text about the loss.
     losses: Vec<(String, String)>,
     devices: Vec<(Light, String, Device)>,
     out: Output<'a>,
@@ -172,7 +171,7 @@ impl LightPanel<'_> {
         self.show(LightStates { verdict, marks, worst }, false)
     }
 
-    /// Shows `states` if they differ from the shown ones or `always` is set.
+    /// Shows `states` if they differ from the states that are shown, or if `always` is set.
     fn show(&mut self, states: LightStates, always: bool) -> Result<(), ExitReason> {
         if self.states == states && !always {
             return Ok(());
@@ -229,8 +228,8 @@ impl LightPanel<'_> {
         }
     }
 
-    /// Returns a possible reason for the verdict: a loss on the line of the sensor that determines it, or otherwise of
-    /// another sensor.
+    /// Returns a possible reason for the verdict: a loss on the line of the sensor that determines the verdict, or
+    /// otherwise a loss on another sensor's line.
     fn reason(&self) -> Option<String> {
         let sensor_name = self.states.worst.as_deref();
         let of_worst = self.losses.iter().find(|(sensor, _)| Some(sensor.as_str()) == sensor_name);
@@ -246,7 +245,7 @@ impl LightPanel<'_> {
         }
     }
 
-    /// Turns the red light on, because the sensor is no longer watched.
+    /// Turns the red light on, because this program no longer receives the verdict.
     fn show_unwatched(&mut self) -> Result<(), ExitReason> {
         self.show(LightStates::UNKNOWN, false)?;
         // Switch again, because an LED may have failed before.
@@ -280,7 +279,7 @@ impl LightPanel<'_> {
                 self.verdict.take((update.robot.verdict(), worst), now);
             }
             Sample::Marks(sample) => {
-                // A mark count becomes stale like a known verdict.
+                // A mark count becomes stale after the same time as a known verdict.
                 let fresh = self.marks.update(sample.header(), Verdict::Clear, clock::now());
                 marks = (fresh && sample.is_available()).then(|| sample.marks().len());
             }
@@ -289,7 +288,7 @@ impl LightPanel<'_> {
         self.show_known(marks, now)
     }
 
-    /// Redraws when a line starts or stops losing data, but not when the amount changes.
+    /// Redraws when the line of `sensor` starts or stops losing data, but not when the amount of lost data changes.
     fn line(&mut self, sensor: &str, status: &Status) -> Result<(), ExitReason> {
         let known = self.losses.iter().position(|(name, _)| name == sensor);
         let loss = status.line_loss();
@@ -304,7 +303,7 @@ impl LightPanel<'_> {
     }
 
     fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), ExitReason> {
-        // Missed samples do not matter, because the lights show only the newest one.
+        // Missed samples do not matter, because the lights show only the newest sample.
         if matches!(notice, Notice::Missed(_)) {
             return Ok(());
         }
@@ -319,7 +318,8 @@ impl LightPanel<'_> {
         }
     }
 
-    /// Turns off stale marks, shows a better verdict that has lasted long enough, and tries failed LEDs again.
+    /// Turns the mark light off if the mark count is stale. Shows a better verdict that has lasted long enough. Tries
+    /// failed LEDs again.
     fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         let marks = if self.marks.silence(clock::now()) { None } else { self.states.marks };
         self.show_known(marks, now)?;
@@ -393,7 +393,7 @@ enum Light {
 }
 
 impl Light {
-    /// All lights, in the order of all output.
+    /// All lights, in the order in which all output shows them.
     const ALL: [Light; 4] = [Light::Green, Light::Yellow, Light::Red, Light::Mark];
 
     /// Returns the light's name in all output and on the command line.
@@ -420,16 +420,16 @@ impl Light {
 /// Known state of a sensor, which determines the lights.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct LightStates {
-    /// Verdict of the zones.
+    /// Verdict of the sensor's zones, or the combined verdict of the robot.
     verdict: Verdict,
-    /// Number of marks in the last scan; `None` if it is unknown.
+    /// Number of reflector marks in the last scan; `None` if it is unknown.
     marks: Option<usize>,
-    /// Sensor that determines the verdict, if there are several.
+    /// Sensor with the worst verdict, which determines a combined verdict; `None` for the verdict of one sensor.
     worst: Option<String>,
 }
 
 impl LightStates {
-    /// State without a watched sensor: the red light is on.
+    /// State in which nothing is known of the sensor: the red light is on.
     const UNKNOWN: LightStates = LightStates { verdict: Verdict::Unknown, marks: None, worst: None };
 
     /// Returns whether `light` is on. For the unknown verdict, the red light is on.
@@ -469,20 +469,20 @@ impl LightStates {
     }
 }
 
-/// A verdict, and the sensor that determines it if there are several.
+/// A verdict. A combined verdict has the name of the sensor that determines it.
 type SensorVerdict = (Verdict, Option<String>);
 
-/// Worst verdict of the last `hold`, so that the lights do not flicker. A worse verdict is shown at once, and a better
-/// one after it has lasted for `hold`.
+/// Worst verdict during the last `hold`, so that the lights do not flicker. A worse verdict is shown at once. A better
+/// verdict is shown after it has lasted for `hold`.
 struct WorstVerdictHold {
     hold: Duration,
     current: SensorVerdict,
-    /// Earlier verdicts that were worse, each with the time at which it last ended.
+    /// Earlier verdicts that were worse than the current one, each with the time at which it last ended.
     previous: Vec<(SensorVerdict, Instant)>,
 }
 
 impl WorstVerdictHold {
-    /// Creates a hold in which a verdict counts until `hold` after its end. The first verdict is unknown.
+    /// Creates a hold. A verdict counts until the time `hold` after its end. The first verdict is unknown.
     fn new(hold: Duration) -> WorstVerdictHold {
         WorstVerdictHold { hold, current: (Verdict::Unknown, None), previous: Vec::new() }
     }
@@ -509,7 +509,7 @@ impl WorstVerdictHold {
         )
     }
 
-    /// Returns the next time at which the shown verdict can change without a new one.
+    /// Returns the next time at which the shown verdict changes even if no new verdict arrives.
     fn changes_at(&self) -> Option<Instant> {
         self.previous.iter().filter_map(|(_, until)| until.checked_add(self.hold)).min()
     }

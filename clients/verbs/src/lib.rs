@@ -1,6 +1,6 @@
-//! Verbs that print and record the topics of a hub. Each verb is one file with its arguments, its run and its output.
-//! [`follow`] is the subscription loop that they share. Verbs use `scanhub_client`, and never the hub's crates. Their
-//! `run` takes a [`Context`](context::Context) with options, output and signals of the process.
+//! Verbs that print and record the topics of a hub. Each verb is one file with its arguments, its function `run` and
+//! its output. The verbs share the subscription loop in [`follow`]. They use `scanhub_client`, and never the hub's
+//! crates. `run` takes a [`Context`](context::Context) with options, output and signals of the process.
 
 pub mod background;
 pub mod context;

@@ -28,8 +28,8 @@ impl ListArgs {
     /// Writes the topics of every sensor of the hub to stdout, with rate, subscribers, payload type and revision. As
     /// text, the problems of sensors follow.
     ///
-    /// With `--domains`, writes every live domain instead: those below `--root`, or all. Hubs that this user cannot
-    /// reach follow, each with a command that reaches it.
+    /// With `--domains`, writes every live domain instead, or only the domains below `--root` if it is given. The hubs
+    /// that this user cannot reach follow, each with a command that reaches it.
     ///
     /// # Errors
     ///
@@ -62,13 +62,13 @@ fn topics(json: bool, locations: &[Domain], out: &mut dyn Write, stop: &AtomicBo
             .iter_mut()
             .filter(|line| line.sensor == sensor && line.topic.spec().publish_rate == PublishRate::Scan)
         {
-            // Except for an LMS, a telegram is not a scan. `hz` measures the rate of such telegrams.
+            // A telegram is a scan only for an LMS. For other scanners, `hz` measures the rate of telegrams.
             let is_of_scans =
                 |status: &&Status| line.topic != Topic::Telegram || status.family() == Some(Family::Lms);
             line.hz = status.as_ref().filter(is_of_scans).and_then(Status::rate_hz);
         }
         if let Some(status) = status.filter(|status| !status.last_error().is_empty()) {
-            // A port that is in use or forbidden is not absent, and the message states the reason.
+            // A port that is in use or forbidden is not absent. The message states the reason.
             let state = match status.state() {
                 Some(State::Absent) => String::new(),
                 state => format!("{}: ", state.map_or("unknown", State::name)),
@@ -89,8 +89,8 @@ fn topics(json: bool, locations: &[Domain], out: &mut dyn Write, stop: &AtomicBo
     )
 }
 
-/// Writes every live domain below `bases`, and those of `hubs` in other directories. Hubs that this user cannot reach
-/// follow.
+/// Writes every live domain below `bases`, and the domains of `hubs` in other directories. The hubs that this user
+/// cannot reach follow.
 fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Write) -> Result<(), Failure> {
     #[derive(Serialize)]
     struct DomainJson {
@@ -114,7 +114,7 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
             let Some(domain) = entry.file_name().to_str().and_then(|name| Domain::at(name, base).ok()) else {
                 continue;
             };
-            // A domain of another user is not listed here.
+            // Do not list a domain of another user here.
             if let Ok(Some(pid)) = publisher_pid(domain.root()) {
                 let root = domain.root().to_owned();
                 lines.push(DomainJson { class: "domain", domain: domain.name().to_owned(), root, pid });
@@ -176,9 +176,9 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
     }))
 }
 
-/// JSON line of class `topic`. The rate is the hub's own measurement of the scans. It is null if the hub does not
-/// report one, and for topics that are not published once per scan. Marks and foreground are published only while they
-/// have a subscriber.
+/// JSON line of class `topic`. The rate is the scan rate that the hub measures. It is null if the hub reports no rate,
+/// and for topics that are not published once per scan. Marks and foreground are published only while they have a
+/// subscriber.
 #[derive(Serialize)]
 struct TopicJson {
     class: &'static str,

@@ -1,5 +1,5 @@
-//! Names of topics on the command line: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`, and the failures for names that do
-//! not exist.
+//! Parses names of topics on the command line: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`. Creates the failures for names
+//! that do not exist.
 
 use std::fmt;
 
@@ -53,8 +53,8 @@ impl fmt::Display for TopicName {
     }
 }
 
-/// Returns the index of a program that publishes as `name` next to a hub. It is at least 128; links of a hub have lower
-/// indexes.
+/// Returns an index for a program that publishes as `name` next to a hub. The index is at least 128, because the links
+/// of a hub have lower indexes.
 pub fn position(name: &str) -> u8 {
     const FIRST_INDEX: u8 = 128;
     let sum = name.bytes().fold(0u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(byte.into()));
@@ -71,7 +71,8 @@ fn topics() -> String {
     format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
 }
 
-/// Returns a hint with the topic that `word` resembles, in case it is misspelled. The hint is empty if no topic does.
+/// Returns a hint with the topic that is most similar to `word`, because `word` may be misspelled. The hint is empty if
+/// no topic is similar.
 fn nearest(sensor: &str, word: &str) -> String {
     let topic = most_similar(word, Topic::ALL.into_iter().map(Topic::name));
     topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
@@ -83,7 +84,8 @@ fn most_similar<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<
     known.max_by(|a, b| near(a).total_cmp(&near(b))).filter(|known| near(known) > MIN_SIMILARITY)
 }
 
-/// Minimum similarity of a misspelled word. 1 means equal, and 0 that nothing agrees.
+/// Minimum similarity of a misspelled word to the right one. 1 means that the words are equal, and 0 that they have
+/// nothing in common.
 const MIN_SIMILARITY: f64 = 0.8;
 
 /// Returns the failure for a topic that the sensor of `name` will never have, because it has other `topics`.
@@ -173,7 +175,7 @@ impl Selection {
         let mut of_all = Vec::new();
         for text in texts {
             let pattern = TopicPattern::parse(text)?;
-            // The publisher of a named sensor is unknown until its topics exist, so `SENSOR/*` selects the topics of a
+            // The kind of a sensor's publisher is unknown until its topics exist, so `SENSOR/*` selects the topics of a
             // link.
             let may_have =
                 |topic: Topic| pattern.sensor.is_none() || topic.publisher_kind() == PublisherKind::Link;

@@ -1,5 +1,5 @@
-//! Lines on stdout and stderr. Each line is written with one call, so a killed verb leaves no partial line. A verb ends
-//! without an error if the reader of its output closes it.
+//! Writes lines to stdout and stderr. Each line is written with one call, so a killed verb leaves no partial line. A
+//! verb ends without an error if the reader of its output closes it.
 
 use std::io::{self, ErrorKind, Write};
 use std::os::fd::AsFd;
@@ -94,7 +94,7 @@ impl<'a> Output<'a> {
     ///
     /// # Errors
     ///
-    /// Returns [`ExitReason`] if they cannot be written.
+    /// Returns [`ExitReason`] if the bytes cannot be written.
     pub fn raw(&mut self, bytes: &[u8]) -> Result<(), ExitReason> {
         self.out.write_all(bytes)?;
         Ok(self.out.flush()?)
@@ -107,14 +107,14 @@ impl<'a> Output<'a> {
     }
 }
 
-/// Replaces each byte of a control character in UTF-8 `text` by `?`: C0, DEL and C1 (ECMA-48). A line feed becomes a
-/// space.
+/// Replaces each byte of the control characters in UTF-8 `text` by `?`. These are C0, DEL and C1 (ECMA-48). A line feed
+/// becomes a space.
 fn escape_controls(text: &mut [u8]) {
     let mut before = 0;
     for at in 0..text.len() {
         let byte = text[at];
         if byte == b'\n' {
-            // A message and its remedy are printed on one line.
+            // A line feed separates a message from its remedy, and both are printed on one line.
             text[at] = b' ';
         } else if byte < 0x20 || byte == 0x7f {
             text[at] = b'?';
@@ -154,7 +154,7 @@ pub fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), ExitRe
     Ok(())
 }
 
-/// Returns whether colors may be used: `NO_COLOR` is unset or empty (<https://no-color.org>).
+/// Returns whether colors may be used. They may if `NO_COLOR` is unset or empty (<https://no-color.org>).
 pub fn colors() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
@@ -166,8 +166,9 @@ pub fn columns(out: impl AsFd) -> Option<usize> {
     Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }
 
-/// Joins `parts` with two spaces in at most `columns` columns. If they do not fit, whole parts are dropped, the lowest
-/// rank first, because a truncated number would look like another number. The last part stays, even if it is too long.
+/// Joins `parts` with two spaces in at most `columns` columns. If the parts do not fit, drops whole parts, the lowest
+/// rank first, because a truncated number would look like another number. Keeps the last remaining part even if it is
+/// too long.
 #[cfg(feature = "record")]
 pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
     let length =
@@ -180,8 +181,8 @@ pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
     parts.join("  ")
 }
 
-/// Writer that drops a line instead of waiting for a slow reader, so that the output does not delay the samples. It
-/// writes each piece completely or not at all.
+/// Writer that drops a line instead of waiting for a slow reader, so that the output does not delay the samples. Each
+/// write is complete, or writes nothing.
 pub struct LossyWriter<'a, W> {
     to: &'a mut W,
     /// Whether the verb is ending. The writer may then wait for the reader, up to `wait_budget`, because no samples are
@@ -191,17 +192,18 @@ pub struct LossyWriter<'a, W> {
     wait_budget: Duration,
 }
 
-/// Maximum time for which a reader may delay the end, over all lines. It is enough for every reader that still reads.
+/// Maximum time for which a reader may delay the end of the verb, in total for all lines. It is enough for every reader
+/// that still reads.
 const MAX_READER_DELAY: Duration = Duration::from_secs(1);
 
 impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
-    /// Creates a writer to `to`, which waits for its reader only after `stop` is set.
+    /// Creates a writer to `to`. It waits for the reader only after `stop` is set.
     pub fn new(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
         LossyWriter { to, stop, wait_budget: MAX_READER_DELAY }
     }
 
-    /// Returns whether a piece can be written without waiting. The system reports a pipe as writable if a page is free,
-    /// which is more than a line needs (pipe(7), PIPE_BUF). The result is also true if the write will return an error.
+    /// Returns whether a line can be written without waiting. The system reports a pipe as writable if a page is free.
+    /// A line needs less than that (pipe(7), PIPE_BUF). The result is also true if the write will return an error.
     fn has_room(&mut self) -> bool {
         let budget = if self.stop.load(Ordering::Relaxed) { self.wait_budget } else { Duration::ZERO };
         let started = Instant::now();

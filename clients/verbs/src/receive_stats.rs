@@ -1,4 +1,5 @@
-//! Counters of received and missed samples of a topic, its staleness, and the losses on its sensor's line.
+//! Counts the received and missed samples of a topic. Detects a stale topic, and computes the losses on the sensor's
+//! line.
 
 use std::time::{Duration, Instant};
 
@@ -10,11 +11,12 @@ pub struct ReceiveStats {
     topic: Topic,
     /// Number of received samples.
     pub(crate) received: u64,
-    /// Number of samples that were published during the run but not received, from gaps in their sequence numbers.
+    /// Number of samples that were published during the run, but not received. It is computed from gaps in the sequence
+    /// numbers.
     pub(crate) missed: u64,
-    /// Number of samples that were received as they were sent, and arrival of the first one.
+    /// Number of samples that were received without a wait, and arrival time of the first one.
     live: Option<(u64, Instant)>,
-    /// Losses on the sensor's line during the run, if the run receives its statuses.
+    /// Losses on the sensor's line during the run. They are known if the run receives the statuses of the sensor.
     pub(crate) loss: Loss,
     first: Option<Instant>,
     last: Option<Instant>,
@@ -38,8 +40,8 @@ impl ReceiveStats {
         }
     }
 
-    /// Counts a sample after `missed` missed ones. Scans are `period_us` apart. A sample that `is_of_before` was sent
-    /// before the run subscribed, so its arrival is not used for the rate.
+    /// Counts a sample, and `missed` missed samples before it. `period_us` is the period of the scans. If
+    /// `is_of_before` is set, the sample was sent before the run subscribed, so its arrival is not used for the rate.
     pub(crate) fn count(&mut self, now: Instant, missed: u64, period_us: u32, is_of_before: bool) {
         self.received += 1;
         if !is_of_before {
@@ -60,8 +62,8 @@ impl ReceiveStats {
         }
     }
 
-    /// Returns the rate in samples per second, from the first sample that was received as it was sent to the last one.
-    /// Returns `None` if these are less than [`scanhub_schema::MIN_RATE_SPAN`] apart.
+    /// Returns the rate in samples per second, computed from the first sample that was received without a wait and the
+    /// last sample. Returns `None` if they are less than [`scanhub_schema::MIN_RATE_SPAN`] apart.
     pub(crate) fn hz(&self) -> Option<f64> {
         let ((live, first), last) = (self.live?, self.last?);
         scanhub_schema::rate_hz(live - 1, last - first)
@@ -77,25 +79,26 @@ impl ReceiveStats {
         true
     }
 
-    /// Returns the time without a sample after which the topic is stale. A sample that is published every second may be
-    /// two seconds late, and ten scans may be missing.
+    /// Returns the time without a sample after which the topic is stale. A sample of a topic that is published every
+    /// second may be two seconds late. For other topics, ten scans may be missing.
     fn deadline(&self) -> Duration {
         match self.topic.spec().publish_rate {
             PublishRate::Second => Duration::from_secs(3),
-            // It is published only after a change.
+            // The topic is published only after a change.
             PublishRate::Change => Duration::MAX,
             PublishRate::Scan => (self.period * 10).max(Duration::from_secs(1)),
         }
     }
 }
 
-/// Losses on a sensor's line during one run, from the counters in its statuses. The counters start at 0 when the hub
-/// restarts.
+/// Losses on a sensor's line during one run of a verb, computed from the counters in the sensor's statuses. The
+/// counters start at 0 when the hub restarts.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct LineLossCounter {
-    /// The hub's `boot`, its counters in the first status that this run received, and those in the last one.
+    /// Current run of the hub: its `boot`, the counters in its first status that was received, and the counters in its
+    /// last status.
     current_run: Option<(u64, Counters, Counters)>,
-    /// Sums of earlier runs of the hub.
+    /// Sums of the losses during earlier runs of the hub.
     previous_runs: Sums,
 }
 
@@ -104,7 +107,7 @@ pub(crate) struct LineLossCounter {
 pub(crate) struct Loss {
     /// Share of the bytes that were damaged, 0 to 1.
     pub(crate) damaged: Option<f64>,
-    /// Number of scans that the scanner must have sent, but that did not arrive at the hub.
+    /// Number of scans that must have been sent by the scanner, but did not arrive at the hub.
     pub(crate) lost_on_line: Option<u64>,
 }
 
@@ -123,14 +126,14 @@ impl LineLossCounter {
             Some((life, _, last)) if *life == boot => *last = *counters,
             Some(_) => {
                 self.previous_runs = self.sums();
-                // The hub was started during this run, so all its counts belong to the run.
+                // The hub was started during the run of the verb, so all its counts belong to this run.
                 self.current_run = Some((boot, Counters::default(), *counters));
             }
             None => self.current_run = Some((boot, *counters, *counters)),
         }
     }
 
-    /// Returns the losses since the first status of this run.
+    /// Returns the losses since the first status that was added.
     pub(crate) fn loss(&self) -> Loss {
         let Sums { read, damaged, lost, is_known } = self.sums();
         let damaged = (read > 0).then(|| (damaged as f64 / read as f64).min(1.0));

@@ -110,14 +110,15 @@ const POLL_INTERVAL: Duration = Duration::from_millis(50);
 const REPAIR: &str = "the data in the file can be read; `scanhub convert` adds an index";
 
 impl RecordArgs {
-    /// Returns whether the recording goes to stdout, which then carries nothing else.
+    /// Returns whether the recording goes to stdout. Nothing else is then written to stdout.
     pub fn is_to_stdout(&self) -> bool {
         self.output.as_deref() == Some(Path::new("-"))
     }
 
-    /// Records until the limits are reached or a signal arrives, and then finishes the file. Another signal during that
-    /// ends the run at once. Progress goes to stdout, or to stderr if the recording goes to stdout. Notices go to
-    /// stderr without `--json`. Lines are dropped if their reader is slow, so that they do not delay the recording.
+    /// Records until the limits are reached or a signal arrives, and then finishes the file. Another signal while the
+    /// file is being finished ends the run at once. Progress goes to stdout, or to stderr if the recording goes to
+    /// stdout. Notices go to stderr without `--json`. If the reader of the lines is slow, lines are dropped, so that
+    /// they do not delay the recording.
     ///
     /// # Errors
     ///
@@ -126,7 +127,7 @@ impl RecordArgs {
     ///   short, both are [`Kind::ResourceExhausted`].
     /// - The errors of [`echo`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        // Whichever signal ends the run, the file is finished.
+        // Any signal that ends the run must finish the file.
         let (locations, stop) = (context.domain.locations()?, context.signals.any_stop()?);
         let stderr = self.is_to_stdout().then(|| context.notes.try_clone()).transpose();
         let mut stderr = stderr.map_err(no_stderr)?;
@@ -151,7 +152,7 @@ impl RecordArgs {
             following.finish(end, |name, stats| recorder.summary(name, stats))
         });
 
-        // The recording is kept if the hub exited or the reader of the lines closed them.
+        // Keep the recording even if the hub exited or the reader of the lines closed them.
         let is_kept = recorder.pushed > 0 || !matches!(end, Err(ExitReason::Failure(_)));
         let finished = recorder.finish(is_kept, &stop);
         if !is_kept && !self.is_to_stdout() {
@@ -197,7 +198,7 @@ impl RecordArgs {
         Ok(Files::new(path, is_split, self.force, keep, &wall_ns.to_string()))
     }
 
-    /// Returns stdout as a file, if a recording may be written there.
+    /// Returns stdout as a file, if a recording may be written to stdout.
     fn stdout(&self) -> Result<File, Failure> {
         if self.split.is_some() {
             return Err(Failure::new(Kind::Usage, "stdout cannot be split", "leave --split out"));
@@ -211,8 +212,9 @@ impl RecordArgs {
     }
 }
 
-/// Returns the topics in `texts`, as topics of named sensors and topics of all sensors. Without `texts`, these are the
-/// default topics, or all if `everything`. With `ros2`, they are scans, and statuses for the poses of the sensors.
+/// Returns the topics in `texts`, as topics of named sensors and topics of all sensors. Without `texts`, returns the
+/// default topics, or all topics if `everything` is set. With `ros2`, returns scans, and statuses for the poses of the
+/// sensors.
 ///
 /// # Errors
 ///
@@ -279,7 +281,7 @@ struct Recorder<'a> {
     queue: Arc<Queue>,
     writer_thread: JoinHandle<io::Result<()>>,
     progress: Arc<WriterProgress>,
-    /// Topics of the recording, by their track numbers in the queue.
+    /// Topics of the recording. The index of a topic is its track number in the queue.
     tracks: Vec<TopicName>,
     /// Number of samples that were added to the queue.
     pushed: u64,
@@ -288,7 +290,7 @@ struct Recorder<'a> {
     gap: Option<Gap>,
     tick_at: Instant,
     report: Report<'a>,
-    /// Set at the end of the run, when it may wait for the readers of its lines.
+    /// Set at the end of the run. The run may then wait for the readers of its lines.
     is_over: &'a AtomicBool,
 }
 
@@ -428,16 +430,16 @@ impl<'a> Recorder<'a> {
     }
 }
 
-/// Distinguishes a second request to stop from further signals of the first one. A shell that loses its terminal sends
-/// another SIGHUP than the terminal, and both may arrive after SIGINT. They arrive within a second, but a busy machine
-/// may not run this process for that time. Therefore polls are counted instead of time.
+/// Distinguishes a second request to stop from further signals of the first request. If a terminal closes, the terminal
+/// and the shell each send a SIGHUP, and both may arrive after SIGINT. All signals of one request arrive within a
+/// second. But a busy machine may not run this process during this second. Therefore polls are counted instead of time.
 #[derive(Default)]
 struct SecondStop {
     polls: u32,
 }
 
 impl SecondStop {
-    /// Number of polls during which signals belong to the first request.
+    /// Number of polls after the first signal during which further signals belong to the first request.
     const POLLS_PER_REQUEST: u32 = 20;
 
     /// Counts a poll. Returns whether a signal since the last poll is a second request to stop.
@@ -447,7 +449,7 @@ impl SecondStop {
     }
 }
 
-/// Returns the kind of failure for a write error. It is temporary if the disk or a quota is full.
+/// Returns the kind of failure for a write error. The kind is a temporary one if the disk or a quota is full.
 fn kind(error: &io::Error) -> Kind {
     match error.kind() {
         ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => {
@@ -483,7 +485,8 @@ fn no_stderr(error: io::Error) -> Failure {
     Failure::new(Kind::Failed, format!("no stderr: {error}"), "")
 }
 
-/// Returns the failure for a reader that has closed stdout. The reader has an incomplete recording.
+/// Returns the failure for a reader that has closed stdout after `samples` samples. The reader has an incomplete
+/// recording.
 fn reader_closed(samples: u64) -> Failure {
     let what = format!("the reader of the recording has exited: it has at most {samples} samples");
     let hint = "see why the program or the connection behind the pipe ended; `scanhub convert` writes a copy with an index";

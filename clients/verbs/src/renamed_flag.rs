@@ -1,9 +1,9 @@
-//! Hint at the new name of a flag in the error for its old name.
+//! Adds the new name of a flag to the error for its old name.
 
 use clap::error::{ContextKind, ContextValue};
 use scanhub_schema::renamed;
 
-/// Returns `error`. If it is about a flag that was renamed, a tip with the new name is added.
+/// Returns `error`. If `error` is about a flag that was renamed, adds a tip with the new name.
 pub fn with_new_name(mut error: clap::Error) -> clap::Error {
     let new = match error.get(ContextKind::InvalidArg) {
         Some(ContextValue::String(flag)) => renamed(flag),

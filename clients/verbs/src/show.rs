@@ -1,7 +1,8 @@
-//! JSON lines and text lines for the payloads of all topics, received through shared memory or from a network.
+//! Formats the payloads of all topics as JSON lines and lines of text. A payload may come from shared memory or from a
+//! network.
 //!
-//! The code is generated from the table of topics: modules `json` and `text` have a function for each topic, with the
-//! topic's name.
+//! The code is generated from the table of topics. Modules `json` and `text` have a function with the name of each
+//! topic.
 
 use std::io;
 
@@ -41,10 +42,10 @@ macro_rules! shown {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         $(shown! { $payload, $name })*
     };
-    // Zones are implemented below, because they become an update first.
+    // Zones have their own implementation below, because they are converted to an update first.
     (Zones, $name:ident) => {};
     (Event, $name:ident) => { shown! { @impl Event, event(header) } };
-    // Classes without the sequence numbers and stamps of the sample.
+    // The lines of these classes do not have the sequence numbers and stamps of the sample.
     (Background, $name:ident) => { shown! { @impl Background, $name() } };
     (Status, $name:ident) => { shown! { @impl Status, $name() } };
     ($payload:tt, $name:ident) => {
@@ -66,7 +67,7 @@ macro_rules! shown {
 
 scanhub_schema::for_each_topic!(shown);
 
-/// Prints the zones as received. The caller must have checked their age.
+/// Prints the zones as they were received. The caller must have checked their age.
 impl Show for Zones {
     fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), ExitReason> {
         to.take(json::zones(sensor, &zones_update(self, header)))

@@ -1,5 +1,5 @@
-//! The classes of `--json` as text for users: one line per sample, the most important values first. The text is not a
-//! contract.
+//! Formats the classes of `--json` as text for users. Each sample is one line, with the most important values first.
+//! The text is not a contract.
 
 use std::f64::consts::TAU;
 use std::fmt;
@@ -256,7 +256,7 @@ pub(crate) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
     Ok(())
 }
 
-/// Returns the text in place of the nearest range if no beam has one.
+/// Returns the text that replaces the nearest range if no beam has a range.
 fn without_nearest(verdict: Verdict) -> &'static str {
     if verdict == Verdict::Unknown { "nearest not known" } else { "nothing near" }
 }

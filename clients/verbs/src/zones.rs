@@ -1,5 +1,6 @@
 //! `scanhub zones SENSOR mask`: learns which readings of a sensor are its own robot, and prints a configuration with
-//! which the hub ignores them. Module `body_mask` computes them. The configuration of the hub is not changed.
+//! which the hub ignores them. Module `body_mask` computes these readings. The verb does not change the configuration
+//! of the hub.
 
 mod body_mask;
 
@@ -48,8 +49,8 @@ enum ZonesCommand {
 }
 
 impl ZonesArgs {
-    /// Observes the sensor for a while, and then writes its mask to stdout as TOML for the hub, with warnings on
-    /// stderr. If stderr is a terminal, it shows the progress.
+    /// Observes the sensor for a while, and then writes the mask of the sensor to stdout, as TOML for the hub. Warnings
+    /// go to stderr. If stderr is a terminal, it also shows the progress.
     ///
     /// # Errors
     ///
@@ -118,11 +119,11 @@ struct Observation<'a> {
     within_mm: Option<f64>,
     /// Number of zones samples with at least one zone.
     verdicts: u32,
-    /// Number of those samples in which the largest zone is violated.
+    /// Number of these samples in which the largest zone is violated.
     violated: u32,
     body: Option<Body>,
     notes: &'a mut File,
-    /// Whether the progress line is shown; always `None` if `notes` is not a terminal.
+    /// Whether the progress line is shown; `None` if `notes` is not a terminal.
     is_shown: Option<bool>,
     /// Number of seconds whose progress was shown.
     shown_seconds: u64,
@@ -242,13 +243,13 @@ struct MaskReport<'a> {
 }
 
 impl MaskReport<'_> {
-    /// Returns the points that the user should check before using the mask.
+    /// Returns the warnings: what the user must check before using the mask.
     fn warnings(&self) -> Vec<String> {
         let within = meters(self.within_mm as u32);
         let mut warnings = Vec::new();
         if self.mask.sectors.is_empty() {
             let so = if self.is_violated {
-                // The hub adds zones.margin to its circles, but does not publish it.
+                // The hub adds zones.margin to its zones, but does not publish the margin.
                 "but the largest zone is violated all the time. If by the robot, use a larger --within RADIUS: \
                  at least the zone's radius plus zones.margin"
             } else {
@@ -277,7 +278,7 @@ impl MaskReport<'_> {
         self.mask.sectors.iter().map(|sector| sector.beams).sum()
     }
 
-    /// Returns the configuration section of the link that masks the body.
+    /// Returns the section of the link's configuration that masks the body.
     fn toml(&self) -> String {
         let MaskReport { sensor, run_for, scans, mask, .. } = self;
         let mut text = format!(
@@ -348,11 +349,14 @@ fn degrees(mdeg: i32) -> String {
     format!("{:?}", f64::from(mdeg) / 1000.0)
 }
 
-/// Minimum number of scans, five per slice. With fewer, the body cannot be distinguished from noise.
+/// Minimum number of scans of an observation: five per slice. With fewer scans, the body cannot be distinguished from
+/// noise.
 const MIN_SCANS: u32 = 50;
-/// Minimum share of zones samples with a violated zone, so that single scans without a reading do not matter.
+/// Minimum share of zones samples with a violated zone for a warning. It is below 1, so that single scans without a
+/// reading do not matter.
 const MIN_VIOLATED_SHARE: f64 = 0.9;
 /// Maximum radius of a zone in meters.
 const MAX_DISTANCE_M: f64 = 65.0;
-/// Divisor of the number of beams: if the mask hides more than a third of the view, it probably includes the room.
+/// Divisor of the number of beams. If the mask hides more than this part of the view (one third), it probably includes
+/// the room.
 const HIDDEN_VIEW_DIVISOR: usize = 3;

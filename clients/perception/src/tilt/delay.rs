@@ -16,7 +16,7 @@ pub(crate) const MAX_DELAY_S: f64 = 0.15;
 const MIN_SLOPE_M: f64 = 3.0;
 /// Maximum relative difference between neighboring slopes on one surface.
 const MAX_SLOPE_DIFFERENCE: f64 = 0.3;
-/// Maximum angle between two points on one surface, in radians.
+/// Maximum angle between neighboring samples on one plane, in radians.
 const MAX_GAP_RAD: f64 = 0.06;
 
 /// A beam of a sweep.

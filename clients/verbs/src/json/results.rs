@@ -1,5 +1,5 @@
 //! Classes of results that the hub and its clients compute from scans: marks, lines, motion, zones, foreground, people,
-//! tilt and obstacles. They are a contract like those of the parent module.
+//! tilt and obstacles. As in the parent module, keys may be added but never changed.
 
 use scanhub_client::{Robot, ZonesUpdate};
 use scanhub_schema::{
@@ -170,8 +170,8 @@ pub(crate) fn zones<'a>(sensor: &'a str, update: &'a ZonesUpdate) -> impl Serial
     }
 }
 
-/// Returns the line of class `zones` of the robot: the combined verdict after `update`, the last zones of one of its
-/// sensors.
+/// Returns the line of class `zones` of the robot, with the combined verdict after `update`. `update` has the last
+/// zones of one sensor of the robot.
 pub(crate) fn robot<'a>(robot: &'a Robot, update: &ZonesUpdate) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct MarksJson<'a> {

@@ -1,4 +1,4 @@
-//! Spans of the age of a sample, as far as its stamps allow, with a histogram of each span.
+//! Splits the age of a sample into spans, as far as its stamps allow. Each span has a histogram.
 
 use hdrhistogram::Histogram;
 use scanhub_schema::{Flags, Header};
@@ -11,7 +11,7 @@ use crate::follow::Arrival;
 pub(super) enum Span {
     /// From the first byte of the telegram to its last byte: the time on the line.
     Line,
-    /// From the first byte on another machine to the arrival on this machine, by the wall clocks of both.
+    /// From the first byte on another machine to the arrival on this machine, by the wall clocks of both machines.
     Network,
     /// From the last byte until the hub sent the sample.
     Hub,
@@ -24,7 +24,7 @@ pub(super) enum Span {
 }
 
 impl Span {
-    /// All spans in the order of their times.
+    /// All spans in the order in which they occur.
     pub(super) const ALL: [Span; 6] =
         [Span::Line, Span::Network, Span::Hub, Span::Wake, Span::Age, Span::Total];
 
@@ -43,15 +43,15 @@ impl Span {
 
 /// Spans of all samples of one topic.
 pub(super) struct Spans {
-    /// Time on CLOCK_MONOTONIC in ns since which samples are received as they are sent.
+    /// Time on CLOCK_MONOTONIC in ns. Samples that are sent later are received without a wait.
     since_ns: u64,
     /// Number of all samples.
     pub(super) received: u64,
     /// Number of samples that were sent before this process waited for them: those in the history, and the first ones
     /// of a new hub.
     pub(super) before: u64,
-    /// Number of samples whose stamp is ahead of this machine's clock, for example because another machine's wall clock
-    /// is.
+    /// Number of samples whose stamp is ahead of this machine's clock, for example because the wall clock of another
+    /// machine is ahead.
     pub(super) in_future: u64,
     /// Bits of [`Flags`] that at least one sample had.
     pub(super) flags: u8,
@@ -64,7 +64,7 @@ impl Spans {
         Spans { since_ns: u64::MAX, received: 0, before: 0, in_future: 0, flags: 0, ages }
     }
 
-    /// Excludes samples that were sent before `now_ns` on CLOCK_MONOTONIC from the measurement.
+    /// Excludes samples from the measurement that were sent before the time `now_ns` on CLOCK_MONOTONIC.
     pub(super) fn begin(&mut self, now_ns: u64) {
         self.since_ns = now_ns;
     }
@@ -87,7 +87,7 @@ impl Spans {
         };
         self.record(Span::Age, age_ns);
         if let Some(hub_ns) = header.hub_time_ns() {
-            // The header has a value that is rounded up.
+            // The value in the header is rounded up.
             let hub_ns = hub_ns.min(age_ns);
             self.record(Span::Hub, hub_ns);
             self.record(Span::Wake, age_ns - hub_ns);
@@ -115,10 +115,11 @@ impl Spans {
 }
 
 /// Maximum difference in ns between the stamps of a sample that a listener publishes itself when it receives nothing.
-/// It reads both clocks of this machine one after the other. Transmission over a network takes longer.
+/// The listener reads the two clocks of this machine one after the other. Transmission over a network takes longer.
 const OWN_SAMPLE_NS: u64 = 10_000;
 
-/// Returns whether both stamps come from a telegram. They are equal in a sample that was published without a telegram.
+/// Returns whether both stamps come from a telegram. In a sample that was published without a telegram, the stamps are
+/// equal.
 fn is_from_telegram(header: &Header) -> bool {
     header.flags & Flags::STAMP_ESTIMATED == 0 && header.stamp_first_ns < header.stamp_last_ns
 }
@@ -130,7 +131,7 @@ pub(super) struct Ages {
     max_ns: u64,
 }
 
-/// Quantiles of times. Minimum and maximum are exact, and the others are at most 0.1 % too high.
+/// Quantiles of times. Minimum and maximum are exact. The other quantiles are at most 0.1 % too high.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub(super) struct Quantiles {
     pub(super) count: u64,
@@ -180,7 +181,8 @@ impl Ages {
         })
     }
 
-    /// Returns the bins from the minimum to the maximum, whose edges are 0 and those of [`BIN_EDGES`].
+    /// Returns the bins from the minimum to the maximum. Their edges are 0 and the values of [`BIN_EDGES`] in each
+    /// power of ten.
     pub(super) fn bins(&self) -> Vec<HistogramBin> {
         let mut bins: Vec<HistogramBin> = Vec::new();
         let mut edges = edges();
@@ -315,7 +317,7 @@ mod tests {
         spans.take(&remote(8_999_000 * US), arrival_time);
         let parts = known_spans(&spans);
         assert_eq!(parts, [("network", 1_000, 1), ("age", 50, 1), ("total", 1_050, 1)]);
-        // Its wall clock is ahead, but the time on this machine is known.
+        // The wall clock of the other machine is ahead, but the time on this machine is known.
         spans.take(&remote(9_001_000 * US), arrival_time);
         assert_eq!((spans.in_future, known_spans(&spans)[1]), (1, ("age", 50, 2)));
         assert_eq!((known_spans(&spans)[0].2, known_spans(&spans)[2].2), (1, 1));

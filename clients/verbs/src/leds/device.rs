@@ -1,5 +1,6 @@
-//! An LED of the machine, which Linux provides as a directory of files (Documentation/leds/leds-class.rst). It is
-//! written only when its state changes, and used again after it was unavailable. Time is an argument.
+//! An LED of the machine, which Linux provides as a directory of files (Documentation/leds/leds-class.rst). The files
+//! are written only when the state of the LED changes. An LED that was unavailable is used again when it returns. Time
+//! is an argument.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -31,8 +32,8 @@ pub(super) enum DeviceEvent {
 }
 
 impl Device {
-    /// Opens the LED `name` in `root`, and switches it off. Also returns the trigger that controlled the LED until now,
-    /// if there was one.
+    /// Opens the LED `name` in `root`, and switches it off. Also returns the kernel's trigger that controlled the LED
+    /// until now, if there was one.
     ///
     /// # Errors
     ///
@@ -59,12 +60,13 @@ impl Device {
         Ok((device, trigger))
     }
 
-    /// Switches the LED if it does not show `on` already. Returns an event if it starts failing or has recovered.
+    /// Switches the LED on if `on` is set, and otherwise off. Does nothing if the LED has this state already. Returns
+    /// an event if the LED has failed or recovered.
     pub(super) fn show(&mut self, on: bool, now: Instant) -> Option<DeviceEvent> {
         if self.is_on == Some(on) || self.retry_at.is_some_and(|at| now < at) {
             return None;
         }
-        // An LED that was unplugged may have its state after power-on.
+        // An LED that was unplugged may be in the state that it has after power-on.
         let taken = if self.retry_at.is_some() { self.take() } else { Ok(()) };
         match taken.and_then(|()| self.switch(on)) {
             Ok(()) => self.retry_at.take().map(|_| DeviceEvent::Recovered),
@@ -76,10 +78,11 @@ impl Device {
         }
     }
 
-    /// Ends the trigger, which would otherwise continue to control the LED, and switches the LED off.
+    /// Switches the LED off, and ends its trigger. The trigger would otherwise continue to control the LED.
     fn take(&mut self) -> io::Result<()> {
         if self.trigger().is_some() {
-            // This may be forbidden even if switching is allowed. Switching the LED off also ends a trigger.
+            // Ignore an error: this write may be forbidden even if switching is allowed. Switching the LED off also
+            // ends a trigger.
             let _ = write(&self.directory.join(TRIGGER), b"none\n");
         }
         self.switch(false)
@@ -147,7 +150,7 @@ mod tests {
     use super::*;
     use tempfile::TempDir;
 
-    /// Directory in place of the kernel's LED directory.
+    /// Directory that the tests use as the kernel's LED directory.
     struct Root(TempDir);
 
     impl Root {
@@ -178,7 +181,7 @@ mod tests {
         let (mut red, trigger) = Device::open(root.0.path(), "red").unwrap();
         assert_eq!((trigger, root.brightness("red").as_str()), (None, "0\n"));
         assert_eq!((red.show(true, now), root.brightness("red").as_str()), (None, "255\n"));
-        // The LED was not written, because it keeps what another program has set.
+        // The device did not write the LED again, so the value that another program has set stays.
         fs::write(root.0.path().join("red").join(BRIGHTNESS), "3\n").unwrap();
         assert_eq!((red.show(true, now), root.brightness("red").as_str()), (None, "3\n"));
         assert_eq!((red.show(false, now), root.brightness("red").as_str()), (None, "0\n"));

@@ -25,13 +25,14 @@ pub(super) struct DiskWriter {
     options: FileOptions,
     file: RecordingFile,
     tracks: Vec<TopicName>,
-    /// Last status of each status track, for the start of the next file.
+    /// Last status of each track with statuses. The next file starts with these statuses.
     statuses: Vec<Option<RepeatedStatus>>,
-    /// Entries that are being written. They stay here until the disk has stored them.
+    /// Entries that are being written. The batch keeps them until they are written.
     batch: Batch,
-    /// Length of the earlier files in bytes.
+    /// Length of all earlier files of this run, in bytes.
     bytes: u64,
-    /// Whether a sample was written. Until then, no older file is removed, so that a run without a hub costs no file.
+    /// Whether a sample was written. Until then, no older file is removed, because a run without a hub must not replace
+    /// older recordings.
     has_samples: bool,
     failure: Option<WriteFailure>,
     check_at: Instant,
@@ -54,7 +55,7 @@ pub(super) enum Destination {
 }
 
 impl DiskWriter {
-    /// Starts the first file or the stream. An error at the start ends the run.
+    /// Starts the first file or the stream. An error in this function ends the run.
     pub(super) fn begin(
         queue: Arc<Queue>,
         destination: Destination,
@@ -109,7 +110,8 @@ impl DiskWriter {
         self.file.path().map_or_else(|| "stdout".into(), PathBuf::from)
     }
 
-    /// Writes until the queue has ended and is completely written. The error is the reason why the file has no end.
+    /// Writes until the queue has ended and all its entries are written. An error is the reason why the file has no
+    /// end.
     pub(super) fn run(mut self) -> io::Result<()> {
         let mut due = Instant::now();
         loop {
@@ -176,10 +178,10 @@ impl DiskWriter {
     }
 
     /// Returns whether the next file is due. A file without samples is never full, because the next file could replace
-    /// a kept one.
+    /// a kept file.
     fn is_full(&self, now: Instant) -> bool {
         let is_split = match self.split {
-            // End the file before it is too long, unless its index takes half of it.
+            // End the file before it is too long, unless the index takes half of the file.
             Some(Split::Bytes(max_len)) => {
                 self.file.started.is_some()
                     && self.file.written >= max_len / 2
@@ -210,13 +212,13 @@ impl DiskWriter {
         Ok(())
     }
 
-    /// Returns whether the current file cannot be continued, even after the disk recovers.
+    /// Returns whether the current file cannot be continued even if the disk works again.
     fn is_lost(&self) -> bool {
         let is_too_large = self.failure.as_ref().is_some_and(|failure| failure.is_too_large);
         self.files.is_some() && (self.file.check().is_err() || (is_too_large && self.file.written > 0))
     }
 
-    /// Starts the next file, and adds the batch that is not written yet.
+    /// Starts the next file, and adds the batch that was not written to the last file.
     fn renew(&mut self) -> io::Result<()> {
         let Some(files) = &mut self.files else { return Ok(()) };
         let (path, file) = files.next()?;
@@ -227,7 +229,7 @@ impl DiskWriter {
         recording_file.add(&self.tracks, &self.batch)?;
         self.subtract_removed();
         self.bytes += self.file.written;
-        // Replacing the file closes the old one, which releases its lock. It can be removed only then.
+        // This assignment closes the old file, which releases the lock on it. A file can be removed only after that.
         self.file = recording_file;
         self.prune();
         self.progress.stats().events.push(WriterEvent::File(path));
@@ -263,7 +265,7 @@ impl DiskWriter {
         }
     }
 
-    /// Stores the last statuses of the batch, for the next file.
+    /// Stores the last status of each sensor in the batch, for the start of the next file.
     fn store_statuses(&mut self) {
         let now = Instant::now();
         for (track, header, payload) in self.batch.samples() {
@@ -282,7 +284,7 @@ impl DiskWriter {
         if self.failure.is_none() {
             self.progress.stats().events.push(WriterEvent::WriteFailed(self.path(), error.to_string()));
         }
-        // If another file may help, try again at once.
+        // If the next file may be writable, try again at once.
         let is_first = self.failure.is_none();
         let since = self.failure.as_ref().map_or(now, |failure| failure.since);
         self.failure = Some(WriteFailure { since, retry_at: now, is_too_large });
@@ -309,7 +311,7 @@ fn numbered(description: &BTreeMap<String, String>, files: Option<&Files>) -> BT
     description
 }
 
-/// Maximum memory for the index of a file, in bytes. Finishing the file takes twice as much in addition.
+/// Maximum memory for the index of a file, in bytes. Finishing the file takes twice this size in addition.
 const MAX_INDEX_LEN: usize = 128 << 20;
 /// Interval between attempts after the disk has failed.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);

@@ -59,12 +59,12 @@ const UNITS: [(&str, u64); 8] = [
     ("GiB", 1 << 30),
     ("TiB", 1 << 40),
 ];
-/// Minimum size of a file in bytes. The descriptions of the topics may take half of it.
+/// Minimum value of `--split` in bytes. The descriptions of the topics may take half of a file with this size.
 const MIN_SPLIT_BYTES: u64 = 128 << 10;
 const MAX_SPLIT_BYTES: u64 = 1 << 50;
 const MIN_SPLIT_TIME: Duration = Duration::from_secs(1);
 
-/// Names of the files of a run, with those that it has created.
+/// Files of a run: the rule for their names, and the files that the run has created.
 pub(super) struct Files {
     path: PathBuf,
     is_split: bool,
@@ -83,10 +83,10 @@ pub(super) struct Files {
 }
 
 impl Files {
-    /// Describes the files of a run, and creates none of them. There is one file `path`, or with `is_split`, several
-    /// with numbers after its stem. An existing file is an error, unless `overwrites` is set; a split run then
-    /// continues after the existing numbers. The last `keep` files are kept. All files of the run must contain `run`
-    /// within their first [`HEAD_LEN`] bytes.
+    /// Describes the files of a run, without creating any. The run has one file `path`. With `is_split`, it has several
+    /// files, with numbers after the stem of `path`. An existing file is an error, unless `overwrites` is set. With
+    /// `overwrites`, a split run continues after the existing numbers. The last `keep` files are kept. All files of the
+    /// run must contain `run` within their first [`HEAD_LEN`] bytes.
     pub(super) fn new(
         path: &Path,
         is_split: bool,
@@ -118,7 +118,7 @@ impl Files {
         self.make(last + 1, self.overwrites && !self.is_split)
     }
 
-    /// Creates the next file, and returns its path. Names that another run has taken are skipped.
+    /// Creates the next file, and returns its path. Skips names that another run has taken.
     pub(super) fn next(&mut self) -> io::Result<(PathBuf, File)> {
         let mut number = self.number + 1;
         loop {
@@ -134,8 +134,8 @@ impl Files {
         self.surplus().min(self.older.len())
     }
 
-    /// Removes the oldest files, those of earlier runs first, until at most `keep` remain. A file that cannot be
-    /// removed no longer counts.
+    /// Removes the oldest files, first the files of earlier runs, until at most `keep` files remain. A file that cannot
+    /// be removed no longer counts.
     pub(super) fn prune(&mut self) {
         for _ in 0..self.surplus() {
             // Another file may have this name by now.
@@ -148,14 +148,14 @@ impl Files {
                 let finished = lock_finished(&path);
                 (path, finished)
             };
-            // The file stays locked until its name has been removed.
+            // Keep the file locked until its name has been removed.
             if removable.as_ref().is_some_and(|file| is_at(file, &path)) {
                 let _ = fs::remove_file(path);
             }
         }
     }
 
-    /// Returns by how many the files exceed the limit. The current file is always kept.
+    /// Returns the number of files that exceed `keep`. The current file is always kept.
     fn surplus(&self) -> usize {
         let keep = self.keep.map_or(usize::MAX, |keep| keep.max(1));
         (self.older.len() + self.created.len()).saturating_sub(keep)
@@ -207,27 +207,28 @@ impl Files {
     }
 }
 
-/// Opens and locks the file at `path` if it is a recording that no recorder writes. No recorder can lock it until it is
-/// closed. Returns `None` if the file system has no locks, because recorders then cannot be detected.
+/// Opens and locks the file at `path` if it is a recording that no recorder writes. No recorder can lock the file until
+/// the returned file is closed. Returns `None` if the file system has no locks, because recorders then cannot be
+/// detected.
 fn lock_finished(path: &Path) -> Option<File> {
     let (file, head, is_taken) = head(path).ok()?;
     (head.starts_with(MAGIC) && is_taken == Some(false)).then_some(file)
 }
 
-/// Opens and locks the file at `path` if `run` has created it and no other recorder writes it. No recorder can lock it
-/// until it is closed.
+/// Opens and locks the file at `path` if `run` has created it and no other recorder writes it. No recorder can lock the
+/// file until the returned file is closed.
 fn lock_of_run(path: &Path, run: &str) -> Option<File> {
     let (file, head, is_taken) = head(path).ok()?;
     (String::from_utf8_lossy(&head).contains(run) && is_taken != Some(true)).then_some(file)
 }
 
-/// Opens the regular file at `path`. Returns it with its first [`HEAD_LEN`] bytes, and whether another process has
-/// locked it, or `None` if the file system has no locks. If no other process has, this process holds the lock until it
-/// closes the file.
+/// Opens the regular file at `path`. Returns the file, its first [`HEAD_LEN`] bytes, and whether another process has
+/// locked it (`None` if the file system has no locks). If no other process has locked the file, this process holds the
+/// lock until it closes the file.
 ///
 /// # Errors
 ///
-/// The file cannot be read, or is not a regular file. A link to a regular file is also an error.
+/// Returns an error if the file cannot be read, or is not a regular file. A link to a regular file is also an error.
 fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
     // Without NONBLOCK, opening a pipe would wait for its writer.
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
@@ -235,7 +236,7 @@ fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
     if !file.metadata()?.is_file() {
         return Err(ErrorKind::InvalidInput.into());
     }
-    // Lock before reading, because another recorder could otherwise start to write in between.
+    // Lock before reading. Otherwise, another recorder could start to write between the two steps.
     let is_taken = is_taken(&file);
     let mut head = Vec::new();
     (&file).take(HEAD_LEN).read_to_end(&mut head)?;
@@ -247,7 +248,7 @@ fn open(path: &Path, overwrites: bool) -> io::Result<File> {
     let target = Target::open(path).map_err(|failure| io::Error::other(failure.message))?;
     let mut file = target.create(overwrites)?;
     take_lock(&file)?;
-    // Another run may remove the file as an old one between the open and the lock.
+    // Another run may remove the file as an old file between the open and the lock.
     for _ in 0..MAX_ATTEMPTS {
         if is_at(&file, path) {
             break;
@@ -312,7 +313,7 @@ const FILE_WORD: usize = 5;
 
 /// Number of bytes at the start of a recording that contain the description of the run, which is its first record.
 const HEAD_LEN: u64 = 4096;
-/// Kinds of errors that mean that another run has taken a name.
+/// Kinds of errors that are returned if another run has taken a name.
 const NAME_TAKEN_ERRORS: [ErrorKind; 2] = [ErrorKind::AlreadyExists, ErrorKind::ResourceBusy];
 
 /// Removes the file that was created at `path`, unless it is a device or a link.
@@ -405,7 +406,7 @@ mod tests {
         for number in [2, 3, 9, 10, 11] {
             fs::write(at(&format!("walk-{number:04}.mcap")), recording("run 1")).unwrap();
         }
-        // None of these is a finished recording of an earlier run.
+        // None of the following files is a finished recording of an earlier run.
         fs::write(at("target.mcap"), recording("run 1")).unwrap();
         std::os::unix::fs::symlink(at("target.mcap"), at("walk-0001.mcap")).unwrap();
         fs::write(at("walk-0004.mcap"), "my notes").unwrap();

@@ -22,10 +22,10 @@ struct QueueState {
     is_over: bool,
 }
 
-/// Entries in the order of their arrival. Its memory is reused.
+/// Entries in the order of their arrival. The memory of a batch is reused.
 pub(super) struct Batch {
     pub(super) entries: Vec<Entry>,
-    /// Payloads of the samples in the same order, packed as for transmission over a network.
+    /// Payloads of the samples in the order of the entries, packed as for transmission over a network.
     pub(super) bytes: Vec<u8>,
 }
 
@@ -35,7 +35,7 @@ pub(super) enum Entry {
     Track(TopicName),
     /// A sample of a track. Its payload is the next `len` bytes.
     Sample { track: usize, header: Header, len: usize },
-    /// A gap at this position.
+    /// A gap at this position of the recording.
     Gap(Gap),
 }
 
@@ -57,7 +57,7 @@ impl Queue {
         }
     }
 
-    /// Adds an entry even if the queue is full. Such entries are rare.
+    /// Adds an entry that is not a sample, even if the queue is full. These entries are rare.
     pub(super) fn note(&self, entry: Entry) {
         self.lock().batch.entries.push(entry);
     }
@@ -95,13 +95,13 @@ impl Queue {
         entries.len() < MAX_ENTRIES / 2 && bytes.len() < MAX_BYTES / 2
     }
 
-    /// Ends the queue. No entry is added after that.
+    /// Ends the queue. No entry may be added afterward.
     pub(super) fn end(&self) {
         self.lock().is_over = true;
         self.ended.notify_all();
     }
 
-    /// Waits until `until` or the end of the queue. Returns whether it has ended.
+    /// Waits until `until` or the end of the queue. Returns whether the queue has ended.
     pub(super) fn wait(&self, until: Instant) -> bool {
         let left = until.saturating_duration_since(Instant::now());
         let waiting = self.ended.wait_timeout_while(self.lock(), left, |waiting| !waiting.is_over);
@@ -165,11 +165,11 @@ pub(super) struct RecordStats {
 pub(super) enum WriterEvent {
     /// The recording continues in this file.
     File(PathBuf),
-    /// The file cannot be written, for this reason.
+    /// The file at this path cannot be written, for this reason.
     WriteFailed(PathBuf, String),
-    /// The file can be written again, after this time.
+    /// The file at this path can be written again. The failure lasted for this time.
     WriteResumed(PathBuf, Duration),
-    /// The file was removed or truncated, which lost this number of samples.
+    /// The file at this path was removed or truncated. It had this number of samples, which are lost.
     Removed(PathBuf, u64),
     /// The reader of stdout has closed it.
     ReaderClosed,
@@ -193,7 +193,8 @@ impl WriterProgress {
 /// rate.
 const MAX_BYTES: usize = 8 << 20;
 const MAX_ENTRIES: usize = 1 << 15;
-/// Interval at which the queue is written and a chunk is closed. A kill loses at most the samples of this time.
+/// Interval at which the queue is written and a chunk is closed. If the process is killed, at most the samples of this
+/// interval are lost.
 pub(super) const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 
 #[cfg(test)]

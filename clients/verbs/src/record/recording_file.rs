@@ -1,5 +1,5 @@
-//! A file of a recording. Each chunk is built in memory and then written. After an error it is written again, so the
-//! file always has a whole number of chunks.
+//! A file of a recording. Each chunk is built in memory and then written. If the write fails, the chunk is removed from
+//! the file and written again, so the file always has only complete chunks.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -22,7 +22,7 @@ pub(super) struct RecordingFile {
     writer: Option<Writer<PendingBytes>>,
     pending: PendingBytes,
     output: RecordingOutput,
-    /// Number of pending bytes that a stream has accepted. They cannot be withdrawn.
+    /// Number of pending bytes that a stream has accepted. These bytes cannot be withdrawn.
     taken: usize,
     /// Number of written bytes.
     pub(super) written: u64,
@@ -30,13 +30,13 @@ pub(super) struct RecordingFile {
     pub(super) samples: u64,
     /// Arrival of the first sample that is not a repeated status.
     pub(super) started: Option<Instant>,
-    /// Approximate memory of the index in bytes.
+    /// Approximate size of the index in memory, in bytes.
     pub(super) index: usize,
     /// Approximate length of the index at the end of the file, in bytes.
     end_len: u64,
     /// Length of the last write, in bytes.
     last: u64,
-    /// Whether a sync has failed, so that data may be missing on the disk.
+    /// Whether a sync of the file has failed. Data may then be missing on the disk.
     pub(super) is_doubtful: bool,
     /// `boot` IDs of the hubs that the file describes.
     boots: Vec<u64>,
@@ -137,8 +137,8 @@ impl RecordingFile {
         })
     }
 
-    /// Repeats the last status of each track, so that the file can be played without the earlier files. Statuses of
-    /// sensors that have been silent while others sent are dropped.
+    /// Repeats the last status of each track, so that the file can be played without the earlier files. Drops a status
+    /// that is older than the newest one by more than [`STATUS_LIFETIME`].
     pub(super) fn repeat(
         &mut self,
         tracks: &[TopicName],
@@ -192,7 +192,7 @@ impl RecordingFile {
         self.writer.is_none()
     }
 
-    /// Writes the pending bytes. After an error, the file ends with the last whole chunk, and the next call tries
+    /// Writes the pending bytes. After an error, the file ends with the last complete chunk, and the next call tries
     /// again.
     pub(super) fn write(&mut self) -> io::Result<()> {
         let mut pending = self.pending.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -222,8 +222,8 @@ impl RecordingFile {
         Ok(())
     }
 
-    /// Returns the approximate length of the file after one more chunk and its end, in bytes. The estimate for the
-    /// chunk is 1.5 times the length of the last one.
+    /// Returns the approximate length in bytes that the file will have with one more chunk and the index at its end.
+    /// The chunk is estimated as 1.5 times the length of the last write.
     pub(super) fn next_len(&self) -> u64 {
         self.written + self.last * 3 / 2 + self.end_len
     }
@@ -235,7 +235,7 @@ impl RecordingFile {
             RecordingOutput::File(file, _) => match file.sync_data() {
                 // Some devices do not support a sync.
                 Err(error) if error.kind() == ErrorKind::InvalidInput => Ok(()),
-                // Linux reports the error only once, so the next sync would succeed.
+                // Store the error, because Linux reports it only once, and the next sync would succeed.
                 synced => synced.inspect_err(|_| self.is_doubtful = true),
             },
         }
@@ -249,7 +249,7 @@ impl RecordingFile {
         }
     }
 
-    /// Checks that the file still has its name and its full length.
+    /// Checks that the file still exists under its name, with its full length.
     ///
     /// # Errors
     ///
@@ -325,18 +325,18 @@ fn nothing_after_index() -> io::Error {
     io::Error::other("nothing follows the index")
 }
 
-/// Maximum age of a repeated status, compared with the newest one. Each sensor sends a status once a second.
+/// Maximum time between a repeated status and the newest status. Each sensor sends a status once a second.
 const STATUS_LIFETIME: Duration = Duration::from_secs(60);
-/// Length of the index in memory, in bytes: for a chunk, and for each channel in a chunk.
+/// Size of the index in memory, in bytes: for each chunk, and for each channel in a chunk.
 const CHUNK_INDEX_LEN: usize = 200;
 const CHANNEL_INDEX_LEN: usize = 24;
-/// Length of the index in the file, in bytes: for a chunk, each channel in a chunk, a track, and a topic. The index
-/// describes the topic's type again.
+/// Length of the index in the file, in bytes: for each chunk, each channel in a chunk, each track, and each topic. The
+/// index contains the description of a topic's type again.
 const CHUNK_END_LEN: u64 = 70;
 const CHANNEL_END_LEN: u64 = 10;
 const TRACK_END_LEN: u64 = 100;
 const TOPIC_END_LEN: u64 = 100 + scanhub_schema::file::LAYOUT.len() as u64;
-/// Name of the metadata record before the first sample of a hub's run.
+/// Name of the metadata record that is written before the first sample of a hub's run.
 const HUB_RECORD_NAME: &str = "scanhub.life";
 /// Name of the metadata record about dropped samples.
 const GAP_RECORD_NAME: &str = "scanhub.gap";
@@ -357,7 +357,7 @@ mod tests {
         part.pending.write_all(&[7; 300_000]).unwrap();
         let made = part.pending.0.lock().unwrap().clone();
         let mut read = Vec::new();
-        // A pipe takes fewer bytes, and then none until they are read.
+        // A pipe takes only some of the bytes, and then none until the reader has read them.
         while let Err(error) = part.write() {
             assert_eq!((error.kind(), part.written), (ErrorKind::WouldBlock, 0));
             let mut some = [0; 50_000];

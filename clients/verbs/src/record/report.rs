@@ -18,9 +18,9 @@ use crate::{json, text};
 /// Format of the reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ReportForm {
-    /// Lines of text at the start, at the end, and for events.
+    /// Lines of text at the start, at the end, and for each event.
     Lines,
-    /// JSON lines for the same, and once a second.
+    /// JSON lines at the start, at the end, for each event, and once a second.
     Json,
     /// Lines of text, and a progress line that is redrawn.
     Terminal,
@@ -42,14 +42,14 @@ pub(super) struct Report<'a> {
     form: ReportForm,
     out: Output<'a>,
     notes: Output<'a>,
-    /// Terminal of the progress line, from which its width is read.
+    /// Terminal that shows the progress line. The number of its columns is read from here.
     terminal: Option<OwnedFd>,
     started: Instant,
     next: Instant,
     files: Vec<PathBuf>,
     /// Number of bytes in the last report of progress.
     bytes: u64,
-    /// Number of samples that were published but not received.
+    /// Number of samples that were published, but that this program did not receive.
     missed: u64,
     /// Number of samples in files that were removed or truncated.
     removed: u64,
@@ -84,8 +84,8 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Writes the first line: the file at `path`, and the number of files of earlier runs that are removed once it has
-    /// samples.
+    /// Writes the first line. It has the `path` of the file, and the number `older` of files of earlier runs that are
+    /// removed once the new file has samples.
     pub(super) fn begin(&mut self, path: &Path, older: usize) -> Result<(), ExitReason> {
         self.files.push(path.to_owned());
         if self.form == ReportForm::Json {
@@ -208,7 +208,7 @@ impl<'a> Report<'a> {
                 self.out.json(&progress)
             }
             ReportForm::Terminal => {
-                // A wrapped line could not be redrawn, so let the terminal cut a line that is still too long.
+                // If the line is still too long, let the terminal cut it, because a wrapped line could not be redrawn.
                 let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
                 let status = fitting(self.status(written, dropped), columns);
                 let line = [CLEAR_LINE, b"\x1b[?7l", status.as_bytes(), b"\x1b[?7h"].concat();

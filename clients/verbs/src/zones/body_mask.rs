@@ -1,8 +1,8 @@
-//! Computes which readings of a sensor are the robot's own body, as sectors with a range. The body consists of the
-//! objects that stay within a circle around the robot's center during the whole observation.
+//! Computes which readings of a sensor are the robot's own body. The result is sectors with a range. The body consists
+//! of the objects that stay within a circle around the robot's center during the whole observation.
 //!
-//! The observation is divided into time slices. An object is body if a beam meets it in all slices at about the same
-//! range. It is not body if a beam meets it in only some slices.
+//! The observation is divided into time slices. If a beam meets an object in all slices at about the same range, the
+//! object is body. If a beam meets it only in some slices, it is not body.
 
 use scanhub_schema::{Pose, Scan, in_degrees, in_sector_mdeg};
 
@@ -12,25 +12,27 @@ pub(crate) const SLICE_COUNT: usize = 10;
 const MAX_SECTORS: usize = 64;
 /// Maximum range of a sector that a hub accepts, in mm.
 const MAX_RANGE_MM: u32 = 65_000;
-/// Margin beyond the farthest reading of the body in mm, in which readings still count as body. It is five standard
-/// deviations of 7 mm, the maximum in recordings of stationary sensors, plus the 15 mm by which two devices differ.
+/// Margin beyond the farthest reading of the body, in mm. Readings in this margin still count as body. It is five times
+/// the standard deviation of 7 mm, plus 15 mm. 7 mm is the maximum in recordings of stationary sensors, and 15 mm is
+/// the difference between two devices.
 const MARGIN_MM: u32 = 50;
-/// Margin in mm for a beam that the body hides completely. It can be large, because such a beam has nothing else to
-/// hide. One reading in a hundred is off by 60 mm, which would cause a stop every few seconds. The margin is four
-/// standard deviations of that.
+/// Margin in mm for a beam that meets only the body. It can be large, because the beam sees nothing else that the mask
+/// could hide. One reading in a hundred is off by 60 mm. With a smaller margin, these readings would cause a stop every
+/// few seconds. The margin is four times these 60 mm, as a standard deviation.
 const HIDDEN_MARGIN_MM: u32 = 250;
-/// Minimum share of body readings in a beam that the body hides completely.
+/// Minimum share of body readings in the scans of a beam for which the beam counts as meeting only the body.
 const FULL_SHARE: f64 = 0.9;
 
 /// Share of a slice's scans in which a beam must meet an object, so that a single wrong reading has no effect.
 const MIN_HIT_SHARE: f64 = 0.05;
-/// Divisor of the number of slices that may differ from the others, because a person may walk past the body.
+/// Divisor of the number of slices. This part of the slices may differ from the others, because a person may walk past
+/// the body.
 const PASSING_DIVISOR: usize = 5;
-/// Maximum difference between the nearest readings of a body in different slices, in mm. It is caused by noise and
-/// vibration of the robot. A person moves more.
+/// Maximum difference between the nearest readings of the body in different slices, in mm. Noise and vibration of the
+/// robot cause this difference. A person moves more.
 const MAX_STEADY_DIFFERENCE_MM: u32 = 100;
-/// Distance from an edge of the body, in degrees, within which a beam may measure any range between the body and the
-/// object behind it. It is half a light spot of 12 mm at 0.4 m.
+/// Maximum angle between a beam and an edge of the body at which the beam may measure any range between the body and
+/// the object behind it, in degrees. It is half of a light spot of 12 mm at 0.4 m.
 const EDGE_DEG: f64 = 1.0;
 /// Maximum difference between the ranges of neighboring beams in a sector, in mm. A sector hides at most this much more
 /// than necessary.
@@ -38,25 +40,25 @@ const MAX_SECTOR_DIFFERENCE_MM: u32 = 50;
 /// Maximum number of beams without motion between two beams with motion in the same sector.
 const MAX_GAP_BEAMS: usize = 3;
 
-/// Observation of a sensor, from which the mask is computed.
+/// Observation of a sensor. The mask is computed from it.
 pub(crate) struct Body {
     pose: Pose,
     within_mm: f64,
-    /// Shape of the first scan. All other scans must have the same.
+    /// Shape of the first scan. All other scans must have the same shape.
     shape: Option<Shape>,
     /// Number of scans in each slice.
     scans: [u32; SLICE_COUNT],
     beams: Vec<Beam>,
 }
 
-/// Count, first angle, step and unit of a scan.
+/// Number of beams, first angle, angle between two beams, and unit of a scan.
 type Shape = (u16, f64, f64, u32);
 
 struct Beam {
     /// Unit vector of the beam in the robot's frame.
     direction: (f64, f64),
     angle_mdeg: i32,
-    /// Range in mm at which the beam leaves the circle, plus the margin; 0 if it is never inside the circle.
+    /// Range in mm at which the beam leaves the circle, plus the margin; 0 if the beam is never inside the circle.
     circle_mm: u32,
     /// Number of scans with a reading.
     valid: u32,
@@ -76,9 +78,9 @@ struct Slice {
 pub(crate) struct Mask {
     /// Sectors in which readings below `range_mm` are the body, in the order of the beams. At most [`MAX_SECTORS`].
     pub(crate) sectors: Vec<Sector>,
-    /// Sectors of objects that moved, appeared or disappeared, with their shortest range.
+    /// Sectors of objects that moved, appeared or disappeared, with the shortest range of each object.
     pub(crate) moving: Vec<Sector>,
-    /// Number of beams of a scan.
+    /// Number of beams in a scan.
     pub(crate) of_beams: usize,
 }
 
@@ -102,7 +104,7 @@ impl Body {
         Body { pose, within_mm, shape: None, scans: [0; SLICE_COUNT], beams: Vec::new() }
     }
 
-    /// Adds `scan`, which belongs to `slice`. Returns false if its shape differs from that of earlier scans.
+    /// Adds `scan`, which belongs to `slice`. Returns false if it has another shape than earlier scans.
     pub(crate) fn add(&mut self, slice: usize, scan: &Scan) -> bool {
         let shape = (scan.count, scan.first_angle, scan.step, scan.unit_um);
         if *self.shape.get_or_insert(shape) != shape {
@@ -164,7 +166,8 @@ impl Body {
         let direction = self.pose.direction(angle);
         let angle_mdeg = in_sector_mdeg(angle);
         let (x_mm, y_mm) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
-        // The greater root of |sensor + range * direction| = circle. Without a root it is NaN, which becomes 0.
+        // The greater root of |sensor + range * direction| = circle. If there is no root, the result is NaN, which
+        // becomes 0.
         let along = x_mm * direction.0 + y_mm * direction.1;
         let across = self.within_mm.powi(2) - (x_mm.powi(2) + y_mm.powi(2) - along.powi(2));
         let leaves = (across.sqrt() - along).ceil() as u32;
@@ -188,9 +191,10 @@ impl Body {
     }
 }
 
-/// Ranges of a beam in the slices in which it met an object often enough, each list in ascending order.
+/// Ranges of a beam in the slices in which the beam met an object often enough. The list of each slice is in ascending
+/// order.
 struct FrequentHits {
-    /// Whether the body hides everything behind it.
+    /// Whether the beam meets only the body.
     is_full: bool,
     circle_mm: u32,
     nearest_mm: Vec<u32>,
@@ -248,9 +252,9 @@ impl FrequentHits {
 
 /// Returns the range in mm below which readings of `beam` are the body; 0 if none are.
 ///
-/// Within `edge` beams of an edge of the body, every reading in the circle may be body. Light spots are wider than
-/// beams, and robots vibrate, so a range there may lie anywhere between the body and a farther object. The strip that
-/// this hides is too narrow for a leg.
+/// Within `edge` beams of an edge of the body, every reading in the circle may be body. Light spots are wider than the
+/// angle between beams, and robots vibrate, so a range near an edge may lie anywhere between the body and a farther
+/// object. The strip that is hidden near an edge is too narrow for a leg.
 fn range_mm(hits: &[FrequentHits], is_body: &[bool], beam: usize, edge: usize, slices: usize) -> u32 {
     let near = |distance: usize| {
         let (first, last) =
@@ -317,7 +321,8 @@ fn runs(values_mm: &[u32], gap: usize, alike_mm: u32) -> Vec<Run> {
     runs
 }
 
-/// Joins neighboring runs until the hub accepts their number. Those that add the smallest hidden area are joined first.
+/// Joins neighboring runs until the hub accepts their number. First joins the runs whose union adds the smallest hidden
+/// area.
 fn join(mut runs: Vec<Run>) -> Vec<Run> {
     while runs.len() > MAX_SECTORS {
         let more = |at: &usize| {
@@ -340,8 +345,8 @@ mod tests {
     const WALL_MM: u16 = 5000;
     const SCANS: usize = 40;
 
-    /// Returns the mask of a sensor at the robot's center. `range_mm` gets the beam, the slice, and the scan within the
-    /// slice.
+    /// Returns the mask of a sensor at the robot's center. `range_mm` takes the beam, the slice, and the scan within
+    /// the slice, and returns the range.
     fn mask(range_mm: impl Fn(usize, usize, usize) -> Option<u16>) -> Mask {
         learn(Pose::default(), 1000.0, range_mm)
     }
@@ -366,13 +371,13 @@ mod tests {
         Sector { from_mdeg: angle_mdeg(first), to_mdeg: angle_mdeg(last), beams: last - first + 1, range_mm }
     }
 
-    /// Returns the angle of a beam: steps of half a degree, and beam 180 points ahead.
+    /// Returns the angle of a beam. Beams are half a degree apart, and beam 180 points ahead.
     fn angle_mdeg(beam: usize) -> i32 {
         beam as i32 * 500 - 90_000
     }
 
     /// Returns the sectors of a body from beam `first` to `last`, up to `range_mm`, in a circle of one meter. On each
-    /// side, the edge consists of two of its beams and the next one.
+    /// side, the edge consists of two beams of the body and the next beam.
     fn body_sectors(first: usize, last: usize, range_mm: u32) -> Vec<Sector> {
         let edge = |from: usize| sector(from, from + 2, 1050);
         vec![edge(first - 1), sector(first + 2, last - 2, range_mm), edge(last - 1)]
@@ -403,7 +408,7 @@ mod tests {
 
     #[test]
     fn moving_object_is_reported_and_is_not_body() {
-        // A person walks past a post in six slices, ten beams farther in each.
+        // A person walks past a post in six slices. In each slice, the person is ten beams farther.
         let found = mask(|beam, slice, scan| match beam {
             60..=67 => Some(400 + noise(beam, slice, scan)),
             _ if (2..8).contains(&slice) && (100 + 10 * slice..115 + 10 * slice).contains(&beam) => Some(700),
