@@ -22,8 +22,8 @@ pub struct Value {
     pub key: String,
     /// Value in the unit of the configuration. Null if it is not set and has no default.
     pub value: Json,
-    /// Place where the value is set: `FILE:LINE:COLUMN` or a flag. Otherwise `default`, possibly with the setting from
-    /// which the default follows.
+    /// Place where the value is set: `FILE:LINE:COLUMN` or a flag. It is `default` if the value is not set, possibly
+    /// with the setting that determines the default.
     pub origin: String,
 }
 
@@ -78,8 +78,8 @@ fn of_link(merged: &MergedConfig<'_>, link: &Link, merged_link: &MergedLink<'_>)
     values.into_iter().map(value).collect()
 }
 
-/// Returns the keys of a link, and the keys of each section under its name. Each key has its default value as TOML, or
-/// `-` if it has none.
+/// Returns the keys of a link, and the keys of each section under the name of the section. Each key has its default
+/// value as TOML, or `-` if it has no default.
 pub fn keys() -> Vec<(&'static str, Vec<(Key, String)>)> {
     let (link, limits, gateway) = (LinkKeys::default(), LimitsKeys::default(), Gateway::default());
     let keys_of = |section: &dyn Section, values: Vec<(&str, Json)>| {

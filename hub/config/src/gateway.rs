@@ -1,6 +1,6 @@
 //! Sections that do not belong to a link. Section `limits` applies to the topics of all links. Section `gateway` is for
-//! `scanhub gateway`, which can read the hub's configuration. Its topics, addresses and durations are text here, and
-//! the gateway parses them.
+//! `scanhub gateway`, which can read the hub's configuration. The topics, addresses and durations of section `gateway`
+//! are text here, and the gateway parses them.
 
 use std::path::PathBuf;
 

@@ -110,7 +110,7 @@ impl Link {
     ///
     /// # Errors
     ///
-    /// Returns the expected beams and unit as text if the model has others.
+    /// Returns the expected number of beams and the expected unit as text if the model has another number or unit.
     pub fn check_background(&self, model: &Background) -> Result<(), String> {
         let heads = self.scan_heads();
         let count = heads[0].count;
@@ -247,17 +247,17 @@ pub mod resource_estimate {
             .unwrap_or_default()
     }
 
-    /// Returns the number of descriptors for `links` links and one subscriber of each. Those that are open from the
-    /// start are not included.
+    /// Returns the number of descriptors for `links` links and one subscriber of each. Descriptors that are open from
+    /// the start are not included.
     pub fn descriptors(links: usize) -> u64 {
         BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS
     }
 
-    /// Descriptors that do not belong to a link. 16 of them stay open, and the others are open while topics are
-    /// created.
+    /// Number of descriptors that do not belong to a link. 16 of them stay open, and the others are open only while
+    /// topics are created.
     const BASE_DESCRIPTORS: u64 = 24;
-    /// Descriptors of a link. Each of its services needs four. The services are the topics and the event service. The
-    /// other descriptors are for the port, the lock of the name, and one subscriber.
+    /// Number of descriptors that a link needs. Each of its services needs four. The services are the topics and the
+    /// event service. The other descriptors are for the port, the lock of the name, and one subscriber.
     const LINK_DESCRIPTORS: u64 = 4 * (Topic::OF_LINKS.len() as u64 + 1) + 7;
     /// Bytes of shared memory for the control service, for everything else that does not belong to a link, and for the
     /// first subscribers.

@@ -1,5 +1,5 @@
 //! Merging of all sources of a configuration into the values in effect. The last source takes precedence. Each source
-//! must be valid by itself, so that an error states the place in it.
+//! must be valid by itself, so that an error can state the place in that source.
 
 use std::ops::Range;
 use std::path::Path;
@@ -38,7 +38,7 @@ pub(crate) struct Document {
 }
 
 impl Document {
-    /// Checks the values, which were read from `table`, except those of the gateway.
+    /// Checks all values except those of section `gateway`. The values were read from `table`.
     fn check(&self, table: &DeTable<'_>, sources: &SourceMap) -> Result<(), Failure> {
         let Document { link: _, zones, marks, lines, motion, background, early, limits, gateway: _ } = self;
         let sections: [(_, &dyn Section); _] = [
@@ -71,7 +71,7 @@ fn check_section(
 /// All sources, merged.
 pub(crate) struct MergedConfig<'a> {
     sources: &'a SourceMap,
-    /// Values that apply to all links, and those of the limits and the gateway.
+    /// Values that apply to all links, and the values of the sections `limits` and `gateway`.
     pub(crate) general: DeTable<'a>,
     /// Links in the order in which they were added.
     pub(crate) links: Vec<MergedLink<'a>>,
@@ -122,8 +122,8 @@ impl<'a> MergedConfig<'a> {
         Ok(merged)
     }
 
-    /// Adds one source, whose values take precedence over earlier ones. `flags` are the names of the links from
-    /// `--link` so far.
+    /// Adds one source. Its values take precedence over the values of earlier sources. `flags` has the names of the
+    /// links from earlier flags `--link`.
     fn add_source(
         &mut self,
         kind: SourceKind,
@@ -281,7 +281,7 @@ impl MergedLink<'_> {
     }
 }
 
-/// Merges the values of `over` into `under`. A value replaces the earlier one of the same key.
+/// Merges the values of `over` into `under`. A value of `over` replaces the value of the same key in `under`.
 fn overlay<'a>(under: &mut DeTable<'a>, over: DeTable<'a>) {
     for (key, value) in over {
         let span = value.span();
@@ -331,12 +331,13 @@ impl Gateway {
     }
 }
 
-/// Returns a failure if two links have the same port, even if it has two names at this moment.
+/// Returns a failure if two links have the same port. Two names that resolve to one port at this moment count as the
+/// same port.
 fn check_ports(links: &[Link]) -> Result<(), Failure> {
     let is_same = |a: &PortSpec, b: &PortSpec| match (a, b) {
         (PortSpec::File { .. }, _) => false,
         (PortSpec::Tty(a), PortSpec::Tty(b)) => is_same_line(a, b),
-        // Do not resolve names of servers in order to read a configuration.
+        // Reading a configuration must not resolve names of servers.
         _ => a == b,
     };
     for (at, link) in links.iter().enumerate() {

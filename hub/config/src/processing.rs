@@ -428,10 +428,10 @@ impl BackgroundKeys {
     }
 }
 
-/// Checks the keys that a link sets itself. `own` are its values without those for all links.
+/// Checks the keys that a link sets itself. `own` has the values of the link, without the values for all links.
 ///
-/// Returns [`Kind::Configuration`] if it sets a key that a scanner of `family` does not have. A key for all links
-/// applies only to families that have it.
+/// Returns [`Kind::Configuration`] if the link sets a key that a scanner of `family` does not have. A key for all links
+/// applies only to families that have the key.
 pub(crate) fn check_family(own: &DeTable<'_>, sources: &SourceMap, family: Family) -> Result<(), Failure> {
     let name = family.name();
     for key in FAMILY_KEYS.into_iter().filter(|key| !has_key(Some(family), key)) {

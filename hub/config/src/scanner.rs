@@ -80,8 +80,8 @@ impl Scanner {
         if self.is_auto() { all.max().unwrap_or(self.rate()) } else { self.rate() }
     }
 
-    /// Returns the highest baud rate that the scanner can have at `port`. The rate of a serial server is set there, so
-    /// it may differ from the configured one.
+    /// Returns the highest baud rate that the scanner can have at `port`. The rate of a serial server is set on the
+    /// server, so it may differ from the configured rate.
     pub fn max_rate_at(&self, port: &PortSpec) -> u32 {
         if matches!(port, PortSpec::Tty(_)) { self.rate() } else { self.max_rate() }
     }

@@ -1,4 +1,4 @@
-//! Sources of a configuration: files and flags, and the place of each value in them. An error can therefore state the
+//! Sources of a configuration: files and flags. Each value has its place in its source, so that an error can state the
 //! file, line and column, or the flag. `load.rs` merges the sources.
 
 use std::ops::Range;
@@ -22,7 +22,7 @@ pub struct Sources {
 }
 
 impl Sources {
-    /// Returns those of the system's configuration files that exist: `/etc/scanhub/scanhub.toml`, and then
+    /// Returns the existing configuration files of the system: `/etc/scanhub/scanhub.toml`, and then
     /// `/etc/scanhub/conf.d/*.toml` in the order of their names.
     pub fn system() -> Vec<PathBuf> {
         let base = Path::new("/etc/scanhub");
@@ -59,8 +59,8 @@ impl Sources {
         Ok(())
     }
 
-    /// Returns the flags. Each one has its TOML, or `None` if it is not valid, and the problem and the remedy for that
-    /// case.
+    /// Returns each flag with its TOML, or with `None` if the flag is not valid, and with the problem and the remedy to
+    /// report for an invalid flag.
     fn flags(&self) -> impl Iterator<Item = (SourceKind, String, Option<String>, &str, &str)> {
         let links = self.links.iter().map(|flag| {
             let remedy = "write --link NAME=PORT, for example front=/dev/ttyUSB0";
@@ -164,7 +164,7 @@ impl SourceMap {
     }
 
     /// Returns the failure for an error of the TOML parser. The parsed text starts at position `begin`. For an unknown
-    /// key or word, the remedy suggests the most similar known one.
+    /// key or word, the remedy suggests the most similar known key or word.
     fn explain(&self, error: &toml::de::Error, begin: usize) -> Failure {
         let span = error.span().unwrap_or_default();
         let span = span.start + begin..span.end + begin;

@@ -110,8 +110,8 @@ impl EncodeRequest for CurrentRequest {
     fn encode(&self, address: u8) -> EncodedTelegram {
         let request = match self {
             CurrentRequest::Request(request) => *request,
-            // Never used, because no configuration is longer than a write may be. A request for the configuration does
-            // no harm.
+            // This request is never used, because every configuration fits into a write. A request for the
+            // configuration would do no harm.
             CurrentRequest::WriteConfiguration(_) | CurrentRequest::WritePowerOn(_) => Request::Configuration,
         };
         let write = self.write().and_then(|write| write.encode(address));
@@ -134,8 +134,9 @@ impl EncodeRequest for CurrentRequest {
         }
     }
 
-    /// Returns the maximum time for the acknowledgment. A scanner that writes, or changes its mode, may have sent it
-    /// after a scan that it broke off, where it was not recognized. The time is therefore the same as for the reply.
+    /// Returns the maximum time for the acknowledgment. A scanner that writes or changes its mode may abort a scan and
+    /// acknowledge then. An acknowledgment after an aborted scan may not be recognized. The maximum time is therefore
+    /// the same as for the reply.
     fn acknowledge_timeout(&self) -> Nanos {
         match self {
             CurrentRequest::Request(request) if request.command() == command::MODE => MODE_TIMEOUT,
@@ -158,7 +159,7 @@ impl Change {
         change
     }
 
-    /// Sets that the line belongs to a serial server, which may collect a reply before it sends it.
+    /// Sets that the line belongs to a serial server. A serial server may collect a reply before it forwards the reply.
     pub fn with_server(mut self) -> Self {
         self.channel.is_behind_server = true;
         self

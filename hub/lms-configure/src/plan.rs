@@ -87,7 +87,7 @@ impl Plan {
 }
 
 /// Consent to a plan, from a person who has seen and confirmed it. Code with a consent can write a scanner's EEPROM.
-/// Create one only where a person is asked, and nowhere else.
+/// Create a consent only in code that asks a person, and nowhere else.
 #[derive(Debug)]
 pub struct Consent(Plan);
 

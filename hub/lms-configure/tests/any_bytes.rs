@@ -11,13 +11,13 @@ fn telegram(address: u8, command: u8, data: &[u8]) -> EncodedTelegram {
     Writer::new(address, command).slice(data).finish()
 }
 
-/// Commands, among which those with a meaning are more frequent.
+/// Commands. Commands with a meaning are more frequent than others.
 fn commands() -> impl Strategy<Value = u8> {
     let known: Vec<u8> = (0x10..=0x7C).chain(0x90..=0xFC).collect();
     prop_oneof![proptest::sample::select(known), any::<u8>()]
 }
 
-/// Data whose counts are so small that they are valid now and then.
+/// Data with small counts, so that some counts are valid.
 fn data() -> impl Strategy<Value = Vec<u8>> {
     prop_oneof![
         proptest::collection::vec(any::<u8>(), 0..800),

@@ -1,8 +1,8 @@
 //! Access to a port: whether its owner, group and mode permit this process to open it, and which other process has it
 //! open.
 //!
-//! Names of users and groups are read from files, so those of a directory service are not found. Each search for
-//! processes reads about all of them. It should therefore run once after an error, not repeatedly.
+//! Names of users and groups are read from files, so names of a directory service are not found. Each search for
+//! processes reads the data of every process, so it should run once after an error, not repeatedly.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -150,8 +150,8 @@ fn lock_owners<'a>(locks: &'a str, key: &'a str) -> impl Iterator<Item = u32> + 
     })
 }
 
-/// Returns the program that may have changed the settings of `path`, as part of a message. It is a program that tries
-/// every port, or another process that has the port open.
+/// Returns, as part of a message, the program that may have changed the settings of the port `path`: a program that
+/// opens every serial port, or another process that has this port open.
 pub fn altering_program(path: &Path) -> Option<String> {
     let running = |name: &str| pids().any(|pid| name_of(pid) == name);
     let known = PORT_PROGRAMS.iter().find(|(name, _)| running(name));
@@ -173,8 +173,8 @@ pub(super) fn is_opened_here(path: &Path) -> bool {
     path.canonicalize().is_ok_and(|device| targets.any(|target| target == device))
 }
 
-/// Returns the other processes that have each of `devices` open. The paths must be canonical. Reads the descriptors of
-/// all processes once.
+/// Returns, for each of `devices`, the other processes that have it open. The paths must be canonical. Reads the
+/// descriptors of all processes once.
 pub(super) fn holders(devices: &[&Path]) -> Vec<Vec<Holder>> {
     let mut found: Vec<Vec<Holder>> = vec![Vec::new(); devices.len()];
     for pid in pids().filter(|&pid| pid != std::process::id()) {

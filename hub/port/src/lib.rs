@@ -156,7 +156,7 @@ impl Port {
     pub fn adopt(line: OwnedFd, spec: &PortSpec, baud: u32) -> Option<Port> {
         match spec {
             PortSpec::Tty(path) => Tty::adopt(line, path, baud).ok().map(Port::Tty),
-            // Unread bytes in a connection become old, and the server may have closed it.
+            // A connection is not continued: its unread bytes may be old, and the server may have closed it.
             PortSpec::Tcp { .. } | PortSpec::File { .. } => None,
         }
     }
@@ -166,12 +166,13 @@ impl Port {
         matches!(spec, PortSpec::Tty(path) if Tty::is_at(line, path))
     }
 
-    /// Returns whether the line is a pty, so that another program simulates the scanner.
+    /// Returns whether the line is a pty. If so, another program simulates the scanner.
     pub fn is_simulated(&self) -> bool {
         self.tty().is_some_and(Tty::is_simulated)
     }
 
-    /// Starts to open `spec` if this takes time. Returns `None` if [`Port::try_open`] returns at once.
+    /// Starts to open `spec` if opening it may take time. Returns `None` if [`Port::try_open`] returns at once for
+    /// `spec`.
     pub fn connect(spec: &PortSpec) -> Option<Result<PendingConnection, PortError>> {
         match spec {
             PortSpec::Tcp { host, port } => Some(PendingConnection::start(host, *port)),
@@ -259,8 +260,7 @@ impl Port {
         }
     }
 
-    /// Writes `bytes`. If the output buffer is full, the rest is dropped as on a cable, and the session repeats the
-    /// request.
+    /// Writes `bytes`. If the output buffer is full, drops the remaining bytes. The session then repeats the request.
     ///
     /// # Errors
     ///
@@ -294,7 +294,7 @@ impl Port {
     }
 
     /// Restores the settings of this process, at `baud`, and discards the input that arrived with other settings. If
-    /// the driver rejects the rate, the line keeps its rate, and a search tries others.
+    /// the driver rejects the rate, the line keeps its rate, and a search tries other rates.
     ///
     /// # Errors
     ///

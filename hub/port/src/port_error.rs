@@ -13,7 +13,7 @@ use super::access::{Holder, PortPermissions, holder, is_opened_here, lock_owner}
 use super::serial_ports::{PortlessAdapter, SerialPortInfo, serial_ports};
 use crate::PortSpec;
 
-/// Reason why a port cannot be opened. Two errors are equal as long as nothing changes.
+/// Reason why a port cannot be opened. Two attempts that fail for the same reason have equal errors.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PortError {
     /// Nothing exists at this path.
@@ -68,7 +68,7 @@ impl PortError {
                 let (what, remedy) = PortPermissions::of(path).explain(path);
                 Failure::new(Kind::PortPermission, what, remedy)
             }
-            // The owner of the lock certainly uses the port. Another program that has it open may be harmless.
+            // The owner of the lock certainly uses the port. Another program that has the port open may be harmless.
             PortError::Busy => match lock_owner(path).or_else(|| holder(path)) {
                 None if is_opened_here(path) => Failure::new(
                     Kind::PortBusy,

@@ -14,13 +14,13 @@ use crate::access::{Holder, holders};
 /// Serial line of this machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SerialPortInfo {
-    /// Permanent name. It is the name below `/dev/serial/by-id` unless another adapter shares it. Otherwise it is the
-    /// name below `/dev/serial/by-path`, or the device if there is none.
+    /// Permanent name: the name below `/dev/serial/by-id`. If another adapter shares that name, it is the name below
+    /// `/dev/serial/by-path`, or the path of the device file if there is no name below `/dev/serial/by-path`.
     pub name: PathBuf,
     /// Path of the device file.
     pub device: PathBuf,
     /// Name below `/dev/serial/by-id` that this adapter shares with another one, because both have the same serial
-    /// number or none. The name belongs to one of them, and possibly to the other one after a restart.
+    /// number or none. The name belongs to one of the two adapters, and possibly to the other one after a restart.
     pub shared_name: Option<PathBuf>,
     /// Driver, such as `ftdi_sio`.
     pub driver: Option<String>,
@@ -125,8 +125,8 @@ pub fn serial_ports_in(root: &Path) -> Vec<SerialPortInfo> {
     found
 }
 
-/// Returns whether `path` is a terminal, according to the kernel. The file is not opened, because opening other devices
-/// can do harm. Examples are a watchdog, and a pipe whose other end is not open.
+/// Returns whether `path` is a terminal, according to the kernel. The file is not opened, because opening a file that
+/// is not a terminal can do harm. Examples are a watchdog, and a pipe whose other end is not open.
 pub fn is_tty(path: &Path) -> bool {
     check_tty(path).is_ok()
 }
@@ -152,7 +152,7 @@ fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
     match fs::read_link(known.join(format!("{major}:{minor}/subsystem"))) {
         Ok(subsystem) if subsystem.ends_with("tty") => Ok(()),
         Ok(_) => Err(PortError::NotTty),
-        // Ptys are not listed, and without sysfs no device is.
+        // The kernel does not list ptys. Without sysfs, no device is listed.
         Err(error)
             if error.kind() == io::ErrorKind::NotFound && !UNIX98_PTYS.contains(&major) && known.exists() =>
         {
@@ -163,7 +163,7 @@ fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
     }
 }
 
-/// Returns whether two paths name the same line. Different names with the same device number do.
+/// Returns whether two paths name the same line. Two different names with the same device number name the same line.
 pub fn is_same_line(a: &Path, b: &Path) -> bool {
     let number = |path: &Path| {
         let metadata = fs::metadata(path).ok().filter(|metadata| metadata.file_type().is_char_device())?;
