@@ -1,8 +1,9 @@
 //! The result of one beam: its echo, and the noise of the measured range.
 //!
-//! The echo is computed from the rays that the spot of the beam covers. If they hit two surfaces, the scanner reports
-//! one of them, or, if they are not far apart, a value between them. That value follows the share of the light on each
-//! surface, so it hardly changes from scan to scan. `cargo run --release -p scanhub-sim --example edges` measures it.
+//! The echo is computed from the rays that the spot of the beam covers. If the rays hit two surfaces, the scanner
+//! reports one of the surfaces. If the surfaces are not far apart, it may report a value between them instead. That
+//! value follows the share of the light on each surface, so it hardly changes from scan to scan. `cargo run --release
+//! -p scanhub-sim --example edges` measures these values.
 //!
 //! The noise has layers, each with its own switch. Two effects have no switch: ranges are sent in whole units, and a
 //! range beyond the maximum is sent as a code.
@@ -22,13 +23,13 @@ pub struct NoiseModel {
     pub bias_mm: f64,
     /// Standard deviation of a range, in millimeters.
     pub sigma_mm: f64,
-    /// Share of the readings at edges whose standard deviation is [`TAIL_SIGMA_MM`] instead. In a recording of a
-    /// scanner at rest, 316 of 348 beams were never off by 30 mm, and 22 were off in more than one scan of a hundred.
-    /// So the tail belongs to a few beams.
+    /// Share of the readings at edges that have the standard deviation [`TAIL_SIGMA_MM`]. In a recording of a scanner
+    /// at rest, 316 of 348 beams were never off by 30 mm, and 22 beams were off by 30 mm in more than one scan of a
+    /// hundred. Large errors therefore come from few beams.
     pub tail: f64,
-    /// Whether a beam is as wide as a real one. On two surfaces, it then reports one, the other or a value between. If
-    /// they are far apart, it reports one, the other or too weak a signal. Without the layer, a beam is a line without
-    /// width.
+    /// Whether a beam is as wide as a real beam. A wide beam on two surfaces reports the range of either surface, or a
+    /// value between them. If the surfaces are far apart, it reports the range of either surface, or too weak a signal.
+    /// Without this layer, a beam is a line without width.
     pub spot: bool,
     /// Share of the beams that report a code although they could report a range.
     pub errors: f64,
@@ -71,14 +72,15 @@ impl Default for NoiseModel {
     }
 }
 
-/// Random numbers of one beam. They are drawn even if their layer is off, so that it does not change the other layers.
+/// Random numbers of one beam. They are drawn even if their layer is off, so that switching a layer off does not change
+/// the other layers.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct BeamRng {
     /// Deviation of the beam's direction, standard normal.
     pub(crate) mirror: f64,
     /// Selects the surface that the scanner reports if a spot is on two of them, 0 to 1.
     pub(crate) surface: f64,
-    /// Selects whether the scanner reports a value between them instead, 0 to 1.
+    /// Selects whether the scanner reports a value between the two surfaces instead, 0 to 1.
     pub(crate) between: f64,
     /// Selects whether a signal is too weak, 0 to 1.
     pub(crate) weak: f64,
@@ -110,7 +112,8 @@ impl BeamRng {
 }
 
 impl NoiseModel {
-    /// Returns the deviation of a reading in millimeters, without the constant error. It is larger at an `edge`.
+    /// Returns the deviation of a reading in millimeters, without the constant error. The deviation may be larger at an
+    /// `edge`.
     pub(crate) fn deviation_mm(&self, edge: bool, rng: &BeamRng) -> f64 {
         rng.deviation * if edge && rng.tail < self.tail { TAIL_SIGMA_MM } else { self.sigma_mm }
     }
@@ -121,8 +124,8 @@ impl NoiseModel {
         (rng.error < self.errors).then(|| CODES.iter().find(of).map_or(NO_RETURN, |code| code.1))
     }
 
-    /// Returns whether an echo of this `signal` is lost. All are lost below [`MIN_SIGNAL`], and none above twice that.
-    /// If the spot is `torn`, a share of the beams between the two surfaces is lost.
+    /// Returns whether an echo of this `signal` is lost. Every echo below [`MIN_SIGNAL`] is lost, and no echo above
+    /// twice [`MIN_SIGNAL`] is lost. If the spot is `torn`, a share of the beams between the two surfaces is lost.
     pub(crate) fn loses(&self, signal: f64, torn: bool, rng: &BeamRng) -> bool {
         let faint = self.weak && rng.weak > signal / MIN_SIGNAL - 1.0;
         faint || torn && rng.weak < EDGE_LOSS_SHARE
@@ -133,8 +136,8 @@ impl NoiseModel {
         self.dazzle && rng.dazzle < share
     }
 
-    /// Returns the start of revolution number `revolution` of the mirror in a scan that ended at `end_ns` and took
-    /// `revolutions` of them.
+    /// Returns the time at which revolution number `revolution` of the mirror started, in a scan that ended at `end_ns`
+    /// and took `revolutions` revolutions.
     pub(crate) fn revolution_ns(&self, revolution: u64, revolutions: u64, end_ns: Nanos) -> Nanos {
         let before_end = if self.comb { revolutions - revolution } else { 1 };
         end_ns.saturating_sub(before_end * lms::variant::MIRROR_PERIOD)
@@ -195,13 +198,13 @@ impl SpotPart<'_> {
         self.face.is_some_and(|face| face.surface == Surface::Reflector)
     }
 
-    /// Returns the strength of its echo relative to the other parts of the spot.
+    /// Returns the strength of this part's echo relative to the other parts of the spot.
     fn echo(&self) -> f64 {
         self.weight * if self.is_reflector() { REFLECTOR_BRIGHTNESS } else { 1.0 }
     }
 
-    /// Returns the target of a beam that hits only this part. An object that moved away counts as an uncovered surface:
-    /// it is new to the beam, but not nearer than the previous target.
+    /// Returns the target of a beam that hits only this part. An object that moved away counts as an uncovered surface,
+    /// because it is new to the beam but not nearer than the previous target.
     fn kind(&self) -> Kind {
         match self.face.map_or(Kind::Static, |face| face.kind) {
             Kind::Box { since_ns } if self.hit.since_ns >= since_ns => Kind::Static,
@@ -246,8 +249,8 @@ fn heaviest<'a>(parts: impl Iterator<Item = &'a SpotPart<'a>>) -> Option<(Option
     parts.max_by(|a, b| a.echo().total_cmp(&b.echo())).map(|part| (part.face, part.hit.range_mm))
 }
 
-/// Returns the face and the range that the scanner reports for a spot on a `near` and perhaps a `far` face. The nearer
-/// one has `share` of the light.
+/// Returns the face and the range that the scanner reports for a spot on the face `near` and perhaps the face `far`.
+/// `share` of the light falls on `near`.
 fn reported_surface<'a>(
     near: Option<(Option<&'a Face>, f64)>,
     far: Option<(Option<&'a Face>, f64)>,
@@ -336,8 +339,8 @@ fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
     white * square / (range_mm / 1000.0).powi(2)
 }
 
-/// Standard deviation of the readings in the tail, in millimeters. Most of them differ by more than 30 mm, which
-/// algorithms take for a change.
+/// Standard deviation of the readings in the tail, in millimeters. Most readings in the tail differ from the true range
+/// by more than 30 mm, which algorithms take for a change.
 pub const TAIL_SIGMA_MM: f64 = 60.0;
 /// Minimum signal for a range, relative to a white surface at 1 m: 10 % of white at 18 m.
 const MIN_SIGNAL: f64 = 0.0003;
@@ -348,30 +351,31 @@ pub(crate) const NO_RETURN: u16 = 0;
 pub(crate) const DAZZLE: u16 = 1;
 pub(crate) const TOO_WEAK: u16 = 4;
 const OVERFLOW: u16 = 2;
-/// Codes of beams that could have reported a range, with cumulative shares. They come from a recording of a real LMS
-/// 200, of beams that reported a range in at least 16 of 20 scans.
+/// Codes of beams that could have reported a range, with cumulative shares. Codes and shares come from a recording of a
+/// real LMS 200, from the beams that reported a range in at least 16 of 20 scans.
 const CODES: [(f64, u16); 3] = [(0.57, NO_RETURN), (0.94, TOO_WEAK), (1.0, OVERFLOW)];
 /// Diameter of the spot at the window in millimeters, and its growth per millimeter of range.
 const SPOT_DIAMETER_MM: f64 = 10.0;
 const SPOT_GROWTH: f64 = 0.0045;
 /// Standard deviation of a beam's direction, in rays: 0.0025 degrees. The value between two surfaces then has a
-/// standard deviation of about 0.01 of their distance, without the other layers. In recordings of scanners that stand,
-/// it is 0.004 to 0.03 in total.
+/// standard deviation of about 0.01 of the distance between the surfaces, without the other layers. In recordings of
+/// scanners that stand, the total is 0.004 to 0.03 of that distance.
 const MIRROR_SIGMA_RAYS: f64 = 0.04;
-/// Maximum distance of surfaces that count as one, such as the two sides of a corner.
+/// Maximum distance between two surfaces that count as one, in mm. An example is the two sides of a corner.
 const MAX_STEP_MM: f64 = 40.0;
-/// Maximum distance of two surfaces whose echoes the scanner takes for one. It separates the echoes of surfaces that
-/// are farther apart, or loses them. Recordings have hardly any value between for edges deeper than 1.25 m, and hardly
-/// any lost beam for edges below 1 m.
+/// Maximum distance between two surfaces whose echoes the scanner takes for one, in mm. If the surfaces are farther
+/// apart, the scanner separates or loses their echoes. In recordings, hardly any value lies between the two surfaces of
+/// an edge deeper than 1.25 m, and hardly any beam is lost at an edge below 1 m.
 const MAX_MERGE_DISTANCE_MM: f64 = 1_000.0;
-/// Brightness of a reflector relative to other surfaces. In recordings, beams that only touch one report its range.
+/// Brightness of a reflector relative to other surfaces. In recordings, beams that only touch a reflector report its
+/// range.
 const REFLECTOR_BRIGHTNESS: f64 = 100.0;
-/// Minimum share of the light on a surface that is reported.
+/// Minimum share of the light that must fall on a surface for the scanner to report it.
 const MIN_REPORTED_SHARE: f64 = 0.17;
 /// Share of the beams on a faint surface that have an echo.
 const FAINT_RETURN_SHARE: f64 = 0.15;
-/// Share of the readings at an edge that are values between the two surfaces. In recordings of an LMS 200, it was 203
-/// of 205 for beams with at least one such value.
+/// Share of the readings at an edge that are values between the two surfaces. In recordings of an LMS 200, the share
+/// was 203 of 205 for beams with at least one value between two surfaces.
 const MIXED_SHARE: f64 = 0.98;
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 //! The scanner's end of a line: the trait of every simulated scanner, and its transmitter.
 //!
 //! To drive a scanner, call [`Device::poll_transmit`] until it returns `None`, pass the host's bytes, and call again at
-//! [`Device::poll_timeout`]. `Transmission` sends one telegram or single byte at the rate of the line, in the chunks
-//! that the receiver's hardware delivers, and `TxQueue` everything that a rotating scanner sends.
+//! [`Device::poll_timeout`]. `Transmission` sends one telegram or one single byte at the rate of the line, in the
+//! chunks that the receiver's hardware delivers. `TxQueue` sends everything that a rotating scanner sends.
 
 use std::collections::VecDeque;
 
@@ -45,7 +45,8 @@ pub trait Device {
         None
     }
 
-    /// Returns the last request that the scanner dropped because of its gaps. Returns it once.
+    /// Returns the last request that the scanner dropped because of the gaps between its bytes. Each dropped request is
+    /// returned at most once.
     fn take_dropped(&mut self) -> Option<DroppedRequest> {
         None
     }
@@ -59,7 +60,7 @@ pub trait Device {
 /// Bytes that the host's hardware delivers at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Chunk {
-    /// Up to 62 bytes. There are none at the end of a telegram that was aborted between two bursts.
+    /// Up to 62 bytes. The chunk is empty at the end of a telegram that was aborted between two bursts.
     pub bytes: Vec<u8>,
     /// Rate of the line in bits per second.
     pub rate: u32,
@@ -114,13 +115,13 @@ impl ChunkSize {
 #[derive(Debug)]
 pub(crate) struct Transmission<T> {
     bytes: Vec<u8>,
-    /// Number of bytes to send. It is smaller than the total if the transmission was aborted.
+    /// Number of bytes to send. It is smaller than the length of the telegram if the transmission was aborted.
     send_len: usize,
     taken_len: usize,
     start_ns: Nanos,
     rate: u32,
     chunk: usize,
-    /// Value of the sender, for use at the end of the transmission.
+    /// Value that the sender attached, for use at the end of the transmission.
     pub(crate) tag: T,
 }
 
@@ -136,17 +137,18 @@ impl<T> Transmission<T> {
         self.end_of_bytes_ns(self.chunk_end())
     }
 
-    /// Returns the end of the last byte.
+    /// Returns the time at which the last byte ends.
     pub(crate) fn end_ns(&self) -> Nanos {
         self.end_of_bytes_ns(self.send_len)
     }
 
-    /// Returns the start of the first byte.
+    /// Returns the time at which the first byte starts.
     pub(crate) fn start_ns(&self) -> Nanos {
         self.start_ns
     }
 
-    /// Delays the start to `at_ns`, unless it is later already. Call it before the first byte was taken.
+    /// Delays the start to `at_ns`, unless the start is later already. Call this function before the first byte was
+    /// taken.
     pub(crate) fn start_no_earlier(&mut self, at_ns: Nanos) {
         self.start_ns = self.start_ns.max(at_ns);
     }
@@ -190,8 +192,8 @@ impl<T> Transmission<T> {
         (self.bytes, self.tag)
     }
 
-    /// Returns the end of the first `count` (at least 1) bytes. If 508 bytes need less time than a revolution of the
-    /// mirror, the rest waits for the next revolution.
+    /// Returns the time at which the first `count` (at least 1) bytes end. If 508 bytes need less time than a
+    /// revolution of the mirror, the rest waits for the next revolution.
     fn end_of_bytes_ns(&self, count: usize) -> Nanos {
         let rate = self.rate;
         let revolutions = (count - 1) / BYTES_PER_REVOLUTION;
@@ -256,7 +258,7 @@ impl TxQueue {
         self.queue.front().map(Transmission::next_chunk_ns)
     }
 
-    /// Returns the end of the last telegram.
+    /// Returns the time at which the last telegram ends.
     pub(crate) fn free_ns(&self) -> Nanos {
         self.free_ns
     }

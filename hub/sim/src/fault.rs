@@ -4,12 +4,13 @@
 //! [`crate::line_model`] applies the faults between the scanner and the port, except the scanner's own deviations from
 //! the protocol:
 //!
-//! - Damage to bytes. A byte is lost, flipped or doubled, or has random bytes before it. The random numbers of each
-//!   byte are drawn in any case, so that the same seed damages the same bytes in every run, for any size of chunks.
-//! - Damage to telegrams. A telegram is truncated, aborted or sent twice, or its length field is changed. Its random
-//!   numbers are drawn at its start.
-//! - Faults at a time, by the scanner's clock: `Schedule` has points in time, `FaultWindow` spans of time, `Garbage`
-//!   garbage between or inside telegrams, and `Delay` the delays of chunks.
+//! - Damage to bytes. A byte is lost, flipped or doubled, or random bytes arrive before it. The random numbers of every
+//!   byte are drawn, even if they have no effect. The same seed therefore damages the same bytes in every run, for any
+//!   size of chunks.
+//! - Damage to telegrams. A telegram is truncated, aborted or sent twice, or its length field is changed. The random
+//!   numbers of a telegram are drawn at its start.
+//! - Faults at a time, by the scanner's clock: `Schedule` has points in time, and `FaultWindow` has spans of time.
+//!   `Garbage` arrives between or inside telegrams. `Delay` delays chunks.
 
 use std::fmt;
 use std::str::FromStr;
@@ -244,13 +245,13 @@ fn key_names() -> String {
     format!("keys: {}", TABLE.iter().map(|key| key.name).collect::<Vec<_>>().join(", "))
 }
 
-/// Returns random numbers for one `kind` of fault. Each kind has a separate sequence, so that it does not change the
-/// others.
+/// Returns random numbers for one `kind` of fault. Each kind has a separate sequence, so that one kind of fault does
+/// not change the others.
 fn random(seed: u64, kind: u64) -> fastrand::Rng {
     fastrand::Rng::with_seed(seed ^ kind.wrapping_mul(0x9E37_79B9_7F4A_7C15))
 }
 
-/// Loses bytes in bursts, the same ones in every run with the same seed.
+/// Loses bytes in bursts. With the same seed, it loses the same bytes in every run.
 #[derive(Clone, Debug)]
 pub struct Loss {
     /// Probability that a burst begins after a byte that arrived.
@@ -265,7 +266,8 @@ impl Loss {
     /// Creates the losses of `faults` with `seed`.
     pub fn new(faults: Faults, seed: u64) -> Self {
         Loss {
-            // Bursts of mean b and, between them, runs of mean 1/begin: their share is b / (b + 1/begin).
+            // Bursts have the mean length b, and the runs between them have the mean length 1/begin. The share of the
+            // bursts is b / (b + 1/begin).
             begin_share: faults.loss / (faults.burst * (1.0 - faults.loss)),
             continue_share: 1.0 - 1.0 / faults.burst,
             is_in_burst: false,
@@ -294,7 +296,7 @@ impl Loss {
 /// Damage to one byte.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct ByteOutcome {
-    /// Inserted bytes before this one.
+    /// Bytes that are inserted before this byte.
     pub(crate) inserted: Vec<u8>,
     pub(crate) is_lost: bool,
     /// Mask of the flipped bits.
@@ -398,7 +400,7 @@ pub(crate) struct TelegramFaults {
     is_repeated: bool,
     /// Share of the bytes after which the scanner aborts the telegram.
     abort_share: Option<f64>,
-    /// Length of the telegram, as far as the bytes so far determine it.
+    /// Length of the telegram, if the bytes so far determine the length.
     len: usize,
     has_length_field: bool,
 }
@@ -434,11 +436,11 @@ impl TelegramFaults {
         self.has_length_field = len.is_none();
     }
 
-    /// Returns the byte that arrives in place of `byte` at `position`, or `None` if it is lost, and the fault that
-    /// occurred.
+    /// Returns the byte that arrives if the scanner sends `byte` at `position`, and the fault that occurred. The byte
+    /// is `None` if it is lost.
     pub(crate) fn apply(&mut self, position: usize, byte: u8) -> (Option<u8>, Option<Fault>) {
         let [low, high] = self.length_mask.to_le_bytes();
-        // Telegrams of a fixed length have it in the byte after the first one.
+        // A telegram of a fixed length has its length in the byte after the first one.
         let flipped = match (self.has_length_field, position) {
             (true, 2) | (false, 1) => low,
             (true, 3) => high,
@@ -480,9 +482,9 @@ pub(crate) struct Schedule {
 }
 
 impl Schedule {
-    /// Creates a schedule. The first time is `at_s` seconds, and each next time is `every_s` seconds later on average.
-    /// If `every_s` is 0, there is only the first time. If `at_s` is 0, the first time is drawn like the others. If
-    /// both are 0, it is [`DEFAULT_FAULT_TIME_S`].
+    /// Creates a schedule. The first time is `at_s` seconds, and each later time follows `every_s` seconds after the
+    /// time before on average. If `every_s` is 0, there is only the first time. If `at_s` is 0, the first time is drawn
+    /// like the others. If both are 0, it is [`DEFAULT_FAULT_TIME_S`].
     pub(crate) fn new(at_s: f64, every_s: f64, random: fastrand::Rng) -> Schedule {
         let mut schedule = Schedule { every_s, next_ns: 0, random };
         schedule.next_ns = match (at_s > 0.0, every_s > 0.0) {
@@ -626,8 +628,8 @@ impl Garbage {
         }
     }
 
-    /// Returns the time of the next garbage between two telegrams, or inside one if `inside` is set. Returns
-    /// [`Nanos::MAX`] if the next garbage arrives at the other kind of position.
+    /// Returns the time of the next garbage, if it arrives inside a telegram and `inside` is set, or if it arrives
+    /// between two telegrams and `inside` is not set. Otherwise returns [`Nanos::MAX`].
     pub(crate) fn due_ns(&self, inside: bool) -> Nanos {
         if inside == self.is_next_inside { self.schedule.next_ns() } else { Nanos::MAX }
     }
@@ -660,14 +662,14 @@ fn nanos(seconds: f64) -> Nanos {
     (seconds * 1e9) as Nanos
 }
 
-/// Delays of chunks: a line that is stuck for a while, and random delays. The order of the chunks never changes.
+/// Delays of chunks: spans of time in which no chunk arrives, and random delays. The order of the chunks never changes.
 #[derive(Clone, Debug)]
 pub(crate) struct Delay {
     stall: FaultWindow,
     /// Maximum random delay.
     delay_ns: Nanos,
     random: fastrand::Rng,
-    /// Arrival of the last chunk.
+    /// Time at which the last chunk arrives.
     last_ns: Nanos,
 }
 
@@ -681,12 +683,12 @@ impl Delay {
         }
     }
 
-    /// Returns these delays, such that no chunk overtakes those that `other` delays.
+    /// Returns these delays, changed so that no chunk overtakes a chunk that `other` delays.
     pub(crate) fn after(self, other: &Delay) -> Delay {
         Delay { last_ns: other.last_ns, ..self }
     }
 
-    /// Returns the arrival of a chunk whose transmission ends at `now`.
+    /// Returns the time at which a chunk arrives if its transmission ends at `now`.
     pub(crate) fn release_ns(&mut self, now: Nanos) -> Nanos {
         let delay_ns = if self.delay_ns > 0 { self.random.u64(..=self.delay_ns) } else { 0 };
         self.last_ns = self.last_ns.max(self.stall.end_ns(now) + delay_ns);
@@ -694,7 +696,7 @@ impl Delay {
     }
 }
 
-/// Time of a single fault without a configured time, in seconds. A session streams by then.
+/// Time of a single fault without a configured time, in seconds. By this time, the session has started the stream.
 const DEFAULT_FAULT_TIME_S: f64 = 5.0;
 
 #[cfg(test)]

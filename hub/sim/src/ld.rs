@@ -1,6 +1,6 @@
 //! A simulated LDROBOT scanner, without I/O. Its head rotates and measures one point after the other. Each point has
-//! its own time, and a packet has twelve points. The scanner receives nothing. Instead of measuring, it can send
-//! recorded packets.
+//! its own time, and a packet has twelve points. The scanner receives nothing from the host. Instead of measuring, it
+//! can send recorded packets.
 
 use std::path::Path;
 
@@ -32,7 +32,7 @@ pub struct LdSettings {
     pub points_per_second: f64,
     /// Share by which the speed varies. Real scanners stay within 1 %.
     pub speed_variation: f64,
-    /// Time constant of the spin-up after power-on, in seconds; 0 means full speed at once.
+    /// Time constant of the spin-up after power-on, in seconds. With 0, the head has its full speed at once.
     pub spin_up_s: f64,
     /// Time from power-on to the first packet.
     pub boot_ns: Nanos,
@@ -66,7 +66,7 @@ pub struct LdSimulator {
     power_ns: Nanos,
     /// Time from which on the head rotates.
     rotates_from_ns: Nanos,
-    /// Number of packets since the head rotates.
+    /// Number of packets since the head started to rotate.
     sent: u64,
     rotation: Rotation,
     tx_queue: TxQueue,
@@ -79,7 +79,7 @@ enum Source {
     /// The scanner repeats recorded packets.
     Recorded {
         packets: Vec<[u8; PACKET_LEN]>,
-        /// Whether they restart at their end.
+        /// Whether the packets restart after the last one.
         is_looped: bool,
         /// Time since the first packet by the clock of the recorded scanner, in milliseconds.
         elapsed_ms: u64,
@@ -87,7 +87,7 @@ enum Source {
 }
 
 impl LdSimulator {
-    /// Creates the scanner with `settings` in `room`, at time 0. Its head rotates already.
+    /// Creates the scanner with `settings` in `room`, at time 0. Its head already rotates.
     pub fn new(settings: LdSettings, room: Room) -> LdSimulator {
         LdSimulator::of(settings, Source::Room(BeamSampler::new(room)))
     }
@@ -111,14 +111,14 @@ impl LdSimulator {
         self.rotation.set_speed(self.seconds(self.sent * POINTS_PER_PACKET as u64), revolutions_per_second);
     }
 
-    /// Returns the number of packets measured in a room since the head rotates, including the current one. Each has
-    /// twelve points.
+    /// Returns the number of packets that were measured in a room since the head started to rotate, including the
+    /// current packet. Each packet has twelve points.
     pub fn sent(&self) -> u64 {
         self.sent
     }
 
-    /// Returns point number `point` since the head rotates, without noise. It must not be before the last
-    /// [`set_speed`](Self::set_speed). A recording has no true points.
+    /// Returns point number `point` since the head started to rotate, without noise. The point must not be before the
+    /// last [`set_speed`](Self::set_speed). Returns `None` for a recording, which has no true points.
     pub fn truth(&mut self, point: u64) -> TruePoint {
         let (at_ns, clockwise_deg) = self.time_and_angle(point);
         let range_mm = match &mut self.source {
@@ -139,7 +139,7 @@ impl LdSimulator {
         (self.rotates_from_ns + (seconds * 1e9) as Nanos, self.rotation.revolutions(seconds).fract() * 360.0)
     }
 
-    /// Returns the time of point number `point`, in seconds since the head rotates.
+    /// Returns the time of point number `point`, in seconds since the head started to rotate.
     fn seconds(&self, point: u64) -> f64 {
         point as f64 / self.settings.points_per_second
     }
@@ -227,7 +227,7 @@ impl Device for LdSimulator {
         self.restart(now, self.settings.boot_ns, self.settings.spin_up_s)
     }
 
-    /// Restarts the scanner. Its clock restarts at 0, while the inertia of the head keeps it rotating.
+    /// Restarts the scanner. Its clock restarts at 0, and inertia keeps the head rotating.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.restart(now, RESTART_NS, 0.0)
     }

@@ -2,10 +2,10 @@
 //! share this model.
 //!
 //! A [`LineModel`] is driven like a [`Device`]: call [`LineModel::poll_transmit`] until it returns `None`, pass the
-//! host's bytes, and call again at [`LineModel::poll_timeout`]. Another rate of the host's port takes effect after the
-//! line. A [`UartReceiver`] at the wrong rate converts bytes to bits at the rate of the sender, and samples them at its
-//! own rate. An ideal UART that samples a little early agrees with recordings of real ones. Bytes with a wrong stop bit
-//! are delivered, as in Linux.
+//! host's bytes, and call again at [`LineModel::poll_timeout`]. The rate of the host's port takes effect after the
+//! line. If it differs from the rate of the line, a [`UartReceiver`] converts bytes to bits at the rate of the sender,
+//! and samples the bits at its own rate. An ideal UART that samples a little early agrees with recordings of real
+//! UARTs. Bytes with a wrong stop bit are delivered, as in Linux.
 
 use std::collections::VecDeque;
 
@@ -20,7 +20,7 @@ use crate::request_decoder::Arrival;
 /// Bytes that arrive at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Delivery {
-    /// The bytes, including foreign ones between them; empty if all of them were lost.
+    /// The bytes, including foreign bytes between them. Empty if all bytes were lost.
     pub bytes: Vec<u8>,
     /// Rate at which they were sent, in bits per second.
     pub rate: u32,
@@ -49,7 +49,7 @@ pub struct LineModel {
     plugged: bool,
     /// Number of bytes of the current telegram that were sent.
     position: usize,
-    /// The last of the bytes that were sent.
+    /// The last byte that was sent.
     last: u8,
     /// First cause for which a byte of the current telegram did not arrive as sent.
     fault: Option<Fault>,
@@ -198,7 +198,7 @@ impl LineModel {
         !self.is_rs232 || rate < RS422_RATE
     }
 
-    /// Returns whether nothing sent at `rate` arrives at `now`.
+    /// Returns whether every byte that is sent at `rate` is lost at `now`.
     fn is_silent(&mut self, rate: u32, now: Nanos) -> bool {
         self.silence.is_active(now) || !self.carries(rate)
     }
@@ -214,8 +214,8 @@ impl LineModel {
         arrived
     }
 
-    /// Returns the bytes that arrive for `bytes` of a telegram, and the first fault. The telegram has `len` bytes;
-    /// `usize::MAX` means that its length is unknown.
+    /// Returns the bytes that arrive if `bytes` of a telegram are sent, and the first fault. The telegram has `len`
+    /// bytes; `usize::MAX` means that its length is unknown.
     fn damage_telegram(
         &mut self,
         bytes: &[u8],
@@ -256,7 +256,7 @@ impl LineModel {
         (arrived, fault)
     }
 
-    /// Ends the current telegram. Returns a copy if it is sent twice.
+    /// Ends the current telegram. Returns a copy of the telegram if it is sent twice.
     fn end_telegram(&mut self, sent: &SentTelegram, fault: Option<Fault>) -> Option<SentTelegram> {
         self.position = 0;
         if !sent.is_reply {
@@ -287,8 +287,8 @@ impl Delivery {
     }
 }
 
-/// Changes foreign bytes `between` two bytes of a telegram, so that they differ from their neighbors. Otherwise the
-/// bytes of the telegram would still be contiguous, only shifted.
+/// Changes the foreign bytes `between` two bytes of a telegram, so that they differ from their neighbors. A foreign
+/// byte that equals its neighbor would only shift the telegram, whose bytes would still be contiguous.
 fn separated(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
     if let (Some((before, after)), [first, rest @ ..]) = (between, &mut bytes[..]) {
         let last = rest.last_mut();
@@ -308,7 +308,7 @@ fn separated(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
 pub struct UartReceiver {
     /// Number of the sender's bits in one bit of the receiver.
     ratio: f64,
-    /// Levels of the line that were not sampled yet. The first one is bit number `first`.
+    /// Levels of the line that were not sampled yet. The first level is bit number `first`.
     levels: VecDeque<bool>,
     first: u64,
     state: ReceiverState,
@@ -319,8 +319,8 @@ pub struct UartReceiver {
 pub struct BaudMismatch(Option<((u32, u32), UartReceiver)>);
 
 impl BaudMismatch {
-    /// Receives bytes like [`UartReceiver::receive`]. The first of the `rates` is that of the line, and the second that
-    /// of the port, in bits per second.
+    /// Receives bytes like [`UartReceiver::receive`]. `rates` has the rate of the line and the rate of the port, in
+    /// bits per second.
     pub fn receive(&mut self, rates: (u32, u32), bytes: &[u8], idle_after: bool) -> Vec<u8> {
         let known = self.0.take().filter(|(known, _)| *known == rates);
         let (_, receiver) =
@@ -362,7 +362,8 @@ impl UartReceiver {
             self.levels.push_back(true);
         }
         if idle_after {
-            // An idle line of one receiver byte lets the receiver complete the last byte.
+            // The receiver can complete its last byte if the line is idle for the duration of one byte at the
+            // receiver's rate.
             let bits = (11.0 * self.ratio).ceil() as usize + 1;
             self.levels.extend(std::iter::repeat_n(true, bits));
         }
@@ -373,7 +374,8 @@ impl UartReceiver {
         read
     }
 
-    /// Makes one step. Returns `None` if more bits are needed, and `Some(None)` if the step completed no byte.
+    /// Takes one step of the receiver. Returns `None` if more bits are needed, and `Some(None)` if the step completed
+    /// no byte.
     fn next(&mut self) -> Option<Option<u8>> {
         match self.state {
             ReceiverState::Hunting { after, level } => {
@@ -412,8 +414,8 @@ impl UartReceiver {
 const RS422_RATE: u32 = 500_000;
 /// Length of a stream's header in bytes: STX to count word.
 const HEADER_LEN: usize = 7;
-/// Position in a bit at which the receiver samples. 0.40 to 0.48 agree with a recording of a real port at 19200 on a
-/// line at 38400; 0.5 and more do not (reference, section 2).
+/// Position in a bit at which the receiver samples. Positions from 0.40 to 0.48 agree with a recording of a real port
+/// at 19200 on a line at 38400. Positions from 0.5 on do not (reference, section 2).
 const SAMPLE_POSITION: f64 = 0.45;
 
 #[cfg(test)]

@@ -2,10 +2,10 @@
 //! the times of their transmission. It is driven as a [`Device`]; [`ScanSource`] provides its measured values, and
 //! [`crate::line_model`] damages the bytes later.
 //!
-//! It supports every request on the way to a stream, every mode that sends measured values, and the part of the
-//! installation mode that changes the configuration and the permanent rate. It refuses every other well-formed request
-//! with 92h, as a real scanner does with requests that it does not support. It counts the requests that would write its
-//! EEPROM. Automatic code never sends one, and tests check the count.
+//! It supports every request that a host sends before a stream, every mode that sends measured values, and the requests
+//! of the installation mode that change the configuration and the permanent rate. It refuses every other well-formed
+//! request with 92h, as a real scanner refuses a request that it does not support. It counts the requests that would
+//! write its EEPROM. Automatic code never sends a request that writes, and tests check this count.
 
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -32,7 +32,7 @@ use crate::request_decoder::{Arrival, DecodedRequest, DroppedRequest, RequestDec
 pub struct Settings {
     /// Address of the scanner, 0 to 127. It replies to this address and to 0.
     pub address: u8,
-    /// Reply to 3Ah: by convention 21 ASCII characters. An LMS 211 sees only 100 degrees.
+    /// Reply to 3Ah: by convention 21 ASCII characters. If it names an LMS 211, the scanner sees only 100 degrees.
     pub type_name: String,
     /// Rate of the line. After a power cycle, it is [`Settings::permanent_baud`] or 9600.
     pub baud: Baud,
@@ -52,11 +52,12 @@ pub struct Settings {
     pub start: StartState,
     /// Time from power-on to the boot message 90h. A real scanner needs up to 60 s.
     pub boot_ns: Nanos,
-    /// The byte that ends each reply: 10h for a healthy scanner, 11h after some events (Telegram listing 8).
+    /// Byte that ends each reply. It is 10h for a healthy scanner, and 11h after some events (Telegram listing 8).
     pub status: u8,
     /// Pairs of type and number, as in the reply to 32h (Telegram listing, B2h).
     pub errors: Vec<(u8, u8)>,
-    /// Transparency of the front window, in percent of a clean one. Below 75 it is a warning, and below 30 an error.
+    /// Transparency of the front window, in percent of the transparency of a clean window. Below 75, the scanner
+    /// reports a warning, and below 30 an error.
     pub pollution_percent: u16,
     /// Deviations from the listing.
     pub quirks: ProtocolQuirks,
@@ -113,9 +114,9 @@ pub struct ProtocolQuirks {
     pub nak_share: f64,
     /// Share of the replies that the scanner sends twice.
     pub doubled_share: f64,
-    /// Additional delay of an ACK.
+    /// Additional time from a request to its ACK.
     pub late_acknowledge_ns: Nanos,
-    /// Additional delay of a reply. It is sent even if the next request arrives before.
+    /// Additional delay of a reply. The reply is sent even if the next request arrives before it.
     pub late_reply_ns: Nanos,
     /// Additional duration of a change of mode, rate or variant: up to 3 s by the listing. The scanner answers a
     /// request that arrives during the change at once, and then never sends the reply to the change.
@@ -126,7 +127,7 @@ pub struct ProtocolQuirks {
     /// (Telegram listing 6.3.2; its table 7-1 allows measuring).
     pub is_strict: bool,
     /// Whether the scanner drops requests whose bytes arrive less than 55 us apart (Telegram listing 4.3). Most hosts
-    /// ignore that limit.
+    /// do not keep this minimum.
     pub checks_gaps: bool,
     /// Time from each ACK to the reply; 0 selects a random time in the range of real scanners.
     pub reply_delay_ns: Nanos,
@@ -150,7 +151,7 @@ pub struct LmsSimulator {
     queue: VecDeque<Transmission<Tag>>,
     /// Start of the transmission of the next scan; `None` while there is no stream.
     next_scan_ns: Option<Nanos>,
-    /// End of the start-up. Bytes that arrive before are ignored.
+    /// End of the start-up. Bytes that arrive before the end of the start-up are ignored.
     started_ns: Nanos,
     /// Number of telegrams with measured values since power-on.
     scans: u64,
@@ -283,8 +284,8 @@ impl LmsSimulator {
         }
     }
 
-    /// Interrupts all transmissions for a request of the host. The current one ends with the byte in the transmitter,
-    /// and queued ones are dropped. Returns the time at which the line is free.
+    /// Interrupts all transmissions for a request of the host. The current transmission ends with the byte in the
+    /// transmitter, and queued transmissions are dropped. Returns the time from which the line is free.
     fn interrupt(&mut self, now: Nanos) -> Nanos {
         self.next_scan_ns = None;
         let mut is_first = true;
@@ -314,7 +315,8 @@ impl LmsSimulator {
         );
     }
 
-    /// Queues `bytes` from `start_ns` on, before transmissions that start later. Returns the end of the last byte.
+    /// Queues `bytes` for transmission from `start_ns` on, before transmissions that start later. Returns the time at
+    /// which the last byte ends.
     fn send(&mut self, bytes: Vec<u8>, start_ns: Nanos, tag: Tag) -> Nanos {
         let transmission = Transmission::new(bytes, start_ns, self.baud.rate(), self.settings.chunk, tag);
         let end_ns = transmission.end_ns();
@@ -423,7 +425,7 @@ impl LmsSimulator {
                 &reply::variant_reply(address, false, self.variant, status),
                 self.mode_delay_ns(),
             ),
-            // The listing allows a word without a meaning.
+            // The listing allows the scanner to send a word without a meaning here.
             (command::COUNTERS, [0, 0]) => self.counters(),
             _ => self.refusal(),
         }
@@ -466,7 +468,7 @@ impl LmsSimulator {
         delayed_reply(&self.reply(eeprom::CONFIGURATION | REPLY, &outcome), delay_ns)
     }
 
-    /// Returns the status B1h: that of a healthy scanner, with the settings and the errors of this one.
+    /// Returns the status B1h of a healthy scanner, changed to the settings and the errors of this scanner.
     fn status(&self) -> EncodedTelegram {
         let firmware = self.settings.type_name.rsplit(';').next().unwrap_or_default().as_bytes();
         let health = SimulatedStatus {
@@ -606,8 +608,8 @@ impl Device for LmsSimulator {
         broken
     }
 
-    /// Aborts the current transmission, as a request does that the scanner then ignores. A stream continues with a
-    /// complete scan.
+    /// Aborts the current transmission as a request would, but handles no request. A stream continues with a complete
+    /// scan.
     fn abort(&mut self, now: Nanos) {
         if self.queue.front().is_some_and(|front| front.start_ns() <= now) {
             self.interrupt(now);
@@ -697,7 +699,7 @@ const RESET_NS: Nanos = 10 * MILLIS;
 const FATAL_ERROR: u8 = 4;
 /// Counters of a scanner that is some years old: hours (unit 2 h) and power-ons.
 const OPERATING_COUNTERS: [u8; 4] = [0x10, 0x27, 0x2C, 0x01];
-/// Reading of the pollution sensors of a clean window. Only the ratio to it matters.
+/// Value that the pollution sensors report for a clean window. Only the ratio to this value matters.
 const CLEAN_POLLUTION: u16 = 1_000;
 /// Time from ACK to reply if nothing changes. Captured exchanges took 70 to 158 ms at 38400. Request and reply took 10
 /// to 45 ms of this time.
@@ -712,5 +714,6 @@ const UNIT_CHANGE_NS: Nanos = 1_000 * MILLIS;
 const AVAILABILITY: usize = 4;
 const MODE: usize = 5;
 const UNIT: usize = 6;
-/// Measuring modes of the listing (77h block D), and the two that a sensor needs for reflectivity (reference 1.6).
+/// Measuring modes of the listing (77h block D), and the two measuring modes in which a scanner measures reflectivity
+/// (reference 1.6).
 const MODES: [u8; 11] = [0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0D, 0x0E, 0x0F, 0x3F];

@@ -1,5 +1,5 @@
-//! A mount that tilts a scanner: its angle at each time, and the reports of its encoder, which may have faults. Both
-//! are pure functions of time.
+//! A mount that tilts a scanner: its angle at each time, and the reports of its encoder, which may have faults. Angle
+//! and reports are pure functions of time.
 
 use std::cmp::Reverse;
 use std::f64::consts::PI;
@@ -15,7 +15,7 @@ use crate::shape::Point;
 pub struct Mount {
     /// Height of the axis above the floor.
     pub height_mm: f64,
-    /// Position of the scanner relative to the axis at angle 0: ahead, and up.
+    /// Position of the scanner relative to the axis while the angle is 0: distance ahead, and distance up.
     pub arm_mm: (f64, f64),
     /// Angle at the start and at one reversal.
     pub from_deg: f64,
@@ -78,7 +78,7 @@ pub(crate) struct Encoder {
     mount: Mount,
     /// Number of the next report.
     number: u64,
-    /// Reports that were sent and have not arrived, in reverse order of arrival.
+    /// Reports that were sent and have not arrived yet. The report that arrives first is the last one in the list.
     pending: Vec<Report>,
 }
 
@@ -98,7 +98,7 @@ impl Encoder {
         self.pending.pop_if(|report| report.arrival_ns <= now_ns)
     }
 
-    /// Returns the time of the next poll.
+    /// Returns the time at which to poll next.
     pub(crate) fn poll_timeout(&self) -> Nanos {
         let arrives_ns = self.pending.last().map_or(Nanos::MAX, |report| report.arrival_ns);
         arrives_ns.min(self.next_report_ns())
@@ -184,8 +184,8 @@ impl Fault {
     }
 }
 
-/// Speed at which the error of [`FaultKind::Drift`] grows, in degrees per second. It is so slow that each step of the
-/// angle still looks like the mount's motion.
+/// Speed at which the error of [`FaultKind::Drift`] grows, in degrees per second. The error grows so slowly that each
+/// step of the reported angle still looks like motion of the mount.
 const DRIFT_DEG_S: f64 = 2.0;
 
 #[cfg(test)]

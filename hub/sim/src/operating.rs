@@ -24,7 +24,7 @@ pub enum OperatingMode {
     Means(u8),
     /// 27h: the values from one beam to another, counted from 1, B7h.
     Range(u16, u16),
-    /// 28h: means of this number of scans, from one beam to another, BFh.
+    /// 28h: means of this number of scans, for the beams from one to another, BFh.
     MeanRange(u8, u16, u16),
     /// 29h: the values from one beam to another, with the states of the fields, BEh.
     Fields(u16, u16),
@@ -127,8 +127,8 @@ impl OperatingMode {
         }
     }
 
-    /// Returns the time from one telegram of `len` bytes to the next at `rate`: the number of whole scans that the line
-    /// needs (Telegram listing, table 10-17).
+    /// Returns the time from one telegram of `len` bytes to the next at `rate`. It is the duration of the smallest
+    /// number of whole scans in which the line can carry the telegram (Telegram listing, table 10-17).
     pub(crate) fn period(&self, variant: Variant, len: usize, rate: u32) -> Nanos {
         let scan = self.revolutions(variant) * MIRROR_PERIOD;
         scan * line_time(len, rate).div_ceil(scan).max(1)
@@ -185,7 +185,8 @@ impl OperatingMode {
 }
 
 impl MeasuredValues<'_> {
-    /// Returns the telegram B0h of `words`: a whole scan, or a partial one with this offset in quarters of a degree.
+    /// Returns the telegram B0h with `words`: a whole scan, or a partial scan whose beams are this number of quarters
+    /// of a degree after whole degrees.
     fn scan(&self, partial: Option<u8>, words: &[u16]) -> Vec<u8> {
         let frame = ScanFrame { unit: self.unit, partial, indices: self.indices() };
         encode_with(self.address, frame, words, self.status).bytes().to_vec()
@@ -243,7 +244,7 @@ pub enum ScanSource {
     Recorded {
         /// Variant of the recording. The scanner supports no other variant.
         variant: Variant,
-        /// The telegrams, in the order in which they are sent. The stream ends with them.
+        /// The telegrams, in the order in which they are sent. The stream ends after the last one.
         telegrams: Box<dyn Iterator<Item = Vec<u8>> + Send>,
     },
 }

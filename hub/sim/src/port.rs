@@ -101,8 +101,8 @@ impl SimPort {
         }
     }
 
-    /// Returns the descriptor to wait for. There is none for a pty that no host has open, because it would be ready all
-    /// the time.
+    /// Returns the descriptor to wait for. Returns `None` for a pty that no host has open, because its descriptor would
+    /// be ready all the time.
     pub(crate) fn wait_fd(&self, is_open: bool) -> Option<BorrowedFd<'_>> {
         match self {
             SimPort::Pty { pty, .. } => is_open.then(|| pty.wait_fd()),
@@ -191,7 +191,8 @@ impl Server {
         bytes.len() - rest.len()
     }
 
-    /// Returns the descriptor to wait for: that of the connection, or that of the listener while no host is connected.
+    /// Returns the descriptor to wait for. It is the descriptor of the connection, or the descriptor of the listening
+    /// socket while no host is connected.
     pub(crate) fn wait_fd(&self) -> BorrowedFd<'_> {
         match &self.host {
             Some(host) => host.as_fd(),
@@ -214,7 +215,7 @@ pub struct Pty {
     name: PathBuf,
 }
 
-/// Reason for the end of a wait.
+/// Reason why a wait ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum WaitResult {
     /// Time, bytes, or the host's side was closed.
@@ -332,7 +333,8 @@ fn pty_failure(what: &str, name: &Path, errno: Errno) -> Failure {
     Failure::new(Kind::Failed, format!("cannot {what} the pty {}: {errno}", name.display()), "")
 }
 
-/// A symlink from a path that the user names to a pty, whose number is unknown before. It is removed on drop.
+/// A symlink at a path that the user names. Its target is a pty, whose number is unknown before the pty exists. The
+/// symlink is removed on drop.
 #[derive(Debug)]
 pub(crate) struct PtySymlink {
     path: PathBuf,
@@ -340,8 +342,8 @@ pub(crate) struct PtySymlink {
 }
 
 impl PtySymlink {
-    /// Creates a symlink at `path` to `target`. Replaces a symlink without a target, or to a terminal that is younger
-    /// than the symlink, because a killed simulator left it. Anything else at `path` remains.
+    /// Creates a symlink at `path` to `target`. Replaces a symlink that a killed simulator left: its target does not
+    /// exist, or is a terminal that is younger than the symlink. Anything else at `path` remains.
     ///
     /// # Errors
     ///
@@ -385,7 +387,8 @@ impl Drop for PtySymlink {
 }
 
 /// Returns whether a killed simulator left the symlink at `path`. A terminal that is older than the symlink still
-/// belongs to the simulator that created the symlink. A younger terminal only has the same number.
+/// belongs to the simulator that created the symlink. A terminal that is younger only has the same number as the
+/// earlier one.
 fn is_stale(path: &Path) -> bool {
     let (Ok(terminal), Ok(link)) = (fs::metadata(path), fs::symlink_metadata(path)) else { return true };
     let since = |metadata: &Metadata| (metadata.ctime(), metadata.ctime_nsec());

@@ -1,6 +1,7 @@
-//! Decoder of the requests of a host to an LMS. If a host writes several bytes at once, its UART sends them one after
-//! the other, which a pty does not imitate. The decoder therefore handles each byte at the time at which the line would
-//! have carried it. It drops a request with too long a gap. A strict scanner also drops a request with too short gaps.
+//! Decoder of the requests of a host to an LMS. If a host writes several bytes at once, a real UART sends them one
+//! after the other, but a pty delivers them at once. The decoder therefore handles each byte at the time at which a
+//! real line would have carried it. It drops a request if a gap between two bytes is too long. A strict scanner also
+//! drops a request if a gap is too short.
 
 use std::fmt;
 
@@ -53,7 +54,7 @@ impl fmt::Display for DroppedRequest {
 pub(crate) struct DecodedRequest {
     /// The whole request. Its checksum was not checked.
     pub(crate) bytes: Vec<u8>,
-    /// Time at which the line had carried its last byte.
+    /// Time at which the line has carried the last byte of the request.
     pub(crate) at: Nanos,
 }
 
@@ -65,7 +66,7 @@ pub(crate) struct RequestDecoder {
     last: Option<Arrival>,
     /// Whether a gap of the request was too short.
     is_broken: bool,
-    /// Whether the host itself must leave the minimum gap.
+    /// Whether the scanner is strict, so that the host must leave the minimum gap between two bytes.
     pub(crate) is_strict: bool,
     /// Speed of the simulation's time relative to that of the host, which measures the gaps by its own clock.
     speed: f64,
@@ -77,7 +78,7 @@ impl RequestDecoder {
         RequestDecoder { bytes: Vec::new(), last: None, is_broken: false, is_strict, speed, dropped: None }
     }
 
-    /// Returns the last request that was dropped. Returns it once.
+    /// Returns the last request that was dropped. Each dropped request is returned at most once.
     pub(crate) fn take_dropped(&mut self) -> Option<DroppedRequest> {
         self.dropped.take()
     }

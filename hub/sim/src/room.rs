@@ -232,8 +232,8 @@ fn word(world: &WorldView, echo: &Echo, sun: f64, unit: Unit, mode: Mode, rng: &
     }
 }
 
-/// Returns the range in millimeters that the scanner reports for a beam with this `echo`. Otherwise returns the code
-/// that it reports, counted down from the highest value.
+/// Returns the range in millimeters that the scanner reports for a beam with this `echo`. If the scanner reports a code
+/// instead, returns the code, counted down from the highest value.
 pub(crate) fn reported_range(world: &WorldView, echo: &Echo, sun: f64, rng: &BeamRng) -> Result<f64, u16> {
     if world.noise.dazzles(sun, rng) {
         Err(beam::DAZZLE)
@@ -283,16 +283,17 @@ pub struct LabeledScan {
     pub truth: Vec<BeamTarget>,
 }
 
-/// Target of a beam with all of its spot.
+/// Target that the whole spot of a beam hits.
 ///
 /// An object that has appeared, disappeared or moved has the time of this change. The user of this type decides how
 /// long afterwards it counts as foreground.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BeamTarget {
-    /// The surroundings at the start of the world, and everything that people do not carry away.
+    /// A surface that has existed since the start of the world, or that a removed object has uncovered.
     Static {
-        /// Time from which on the beam hits it: 0, or the time at which an object in front of it was removed. The
-        /// surface is old then, but new to the beam. People who pass do not change it.
+        /// Time from which on the beam hits this surface: 0, or the time at which an object in front of the surface was
+        /// removed. In the second case, the surface is old, but new to the beam. People who pass do not change this
+        /// time.
         since_ns: Nanos,
     },
     /// A leg of a person who stands or walks.
@@ -301,13 +302,13 @@ pub enum BeamTarget {
     /// target. An object that moved away from the sensor is [`BeamTarget::Static`], like the surfaces that it
     /// uncovered.
     Box {
-        /// Time at which it was put down or came to rest; the time of the scan while it moves.
+        /// Time at which the object was put down or came to rest. While the object moves, it is the time of the scan.
         since_ns: Nanos,
     },
     /// A person or an object as in [`BeamTarget::Box`], and another surface next to it. The beam may report either of
     /// them. The edges of a box remain this target.
     Grazed,
-    /// Any target; the value is a code instead of a range.
+    /// Any target, if the value is a code instead of a range.
     Invalid,
 }
 
@@ -399,7 +400,7 @@ impl Changes {
 
 /// Standard deviation of a reflector level. A recording of a standing sensor shows no deviation at all.
 const LEVEL_DEVIATION: f64 = 0.1;
-/// Time between the measured scans. Its value has no influence.
+/// Time between the scans that are measured in advance. The choice of this time has no influence.
 const PERIOD: Nanos = 26_640_000;
 /// Start of the count of the first beam, in the unit of the range. With the count, it fits into 13 bits, below all
 /// codes.

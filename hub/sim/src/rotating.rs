@@ -40,7 +40,7 @@ pub struct TruePoint {
 impl Rotation {
     /// Creates the rotation of a head with a mean speed of `revolutions_per_second` that varies by the share
     /// `speed_variation`. The spin-up has a time constant of `spin_up_s` seconds; 0 means full speed at once. `seed`
-    /// selects the first angle and the phase of the variation.
+    /// selects the angle at the start and the phase of the variation.
     pub(crate) fn new(
         revolutions_per_second: f64,
         speed_variation: f64,
@@ -96,7 +96,7 @@ pub(crate) fn counterclockwise_deg(clockwise_deg: f64) -> f64 {
 #[derive(Clone, Debug)]
 pub(crate) struct BeamSampler {
     room: Room,
-    /// View of the static surroundings, reduced to those of the last beam. Each beam draws over it.
+    /// View of the static surroundings of the last beam. Each beam draws its own surroundings over it.
     view: Option<View>,
     /// Samplers of the rooms of precomputed scans.
     rooms: Vec<BeamSampler>,

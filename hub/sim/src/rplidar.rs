@@ -28,11 +28,11 @@ pub use protocol::{Mode, Model, PacketFormat};
 pub struct RplidarSettings {
     /// The model.
     pub model: Model,
-    /// Number that the scanner reports as its model; by default that of the model.
+    /// Number that the scanner reports as its model. The default is the number of `model`.
     pub id: u8,
-    /// Number of the mode that the scanner recommends; by default that of the model.
+    /// Number of the mode that the scanner recommends. The default is the mode that `model` recommends.
     pub typical: usize,
-    /// Mean revolutions per second; by default those of the model.
+    /// Mean revolutions per second. The default depends on `model`.
     pub revolutions_per_second: f64,
     /// Share by which the speed varies.
     pub speed_variation: f64,
@@ -44,7 +44,7 @@ pub struct RplidarSettings {
     pub health: (u8, u16),
     /// Whether the status remains after a RESET.
     pub keeps_health: bool,
-    /// Deviations from the manual. Those that only an LMS has are ignored.
+    /// Deviations from the manual. Deviations that only an LMS has are ignored.
     pub quirks: ProtocolQuirks,
     /// Faults of the scanner: times at which its head is blocked.
     pub faults: Faults,
@@ -99,10 +99,10 @@ pub struct RplidarSimulator {
     health: (u8, u16),
     /// Time of the boot message; `None` after the start-up.
     boot_at_ns: Option<Nanos>,
-    /// Time from which on the scanner receives requests.
+    /// Time from which the scanner receives requests.
     receives_from_ns: Nanos,
     stalls: FaultWindow,
-    /// Motion of the motor to resume; `None` while the head is not blocked.
+    /// Motion of the motor that resumes when the head is free again. `None` while the head is not blocked.
     held_motion: Option<Option<Motion>>,
     writes: u64,
 }
@@ -158,8 +158,8 @@ impl RplidarSimulator {
         Some(self.stream?.mode)
     }
 
-    /// Returns the number of packets of the present stream, including the current one. The next packet begins with the
-    /// point after their last one. Returns `None` before the first point.
+    /// Returns the number of packets of the present stream, including the current packet. The next packet begins with
+    /// the point after the last point of these packets. Returns `None` before the first point.
     pub fn sent(&self) -> Option<u64> {
         self.begin_ns()?;
         Some(self.stream?.sent())
@@ -190,7 +190,7 @@ impl RplidarSimulator {
         self.stalls = FaultWindow::once(now, span);
     }
 
-    /// Changes the reported status and code. They remain after a RESET if `stubborn` is set. A status of 2 ends a
+    /// Changes the reported status and code. Both remain after a RESET if `stubborn` is set. A status of 2 ends a
     /// stream.
     pub fn set_health(&mut self, now: Nanos, health: (u8, u16), stubborn: bool) {
         (self.health, self.settings.keeps_health) = (health, stubborn);
@@ -480,7 +480,7 @@ impl Stream {
     /// Returns the time at which the next packet has all its points.
     fn due_ns(&self, motor: Option<Motion>) -> Option<Nanos> {
         let points = self.mode.form.points() as u64 * (self.sent + 1);
-        // Ranges that are sent as a difference from the first range of the next packet wait for it.
+        // A range that is sent as a difference from the first range of the next packet must wait for that range.
         let last = if self.mode.form == PacketFormat::Ultra { points } else { points - 1 };
         self.time_and_angle(last, motor).map(|(at_ns, _)| at_ns)
     }
@@ -513,8 +513,8 @@ impl Stream {
     }
 }
 
-/// Optics of a head in a room. For each point, it determines the position that the laser hits, and whether and how
-/// strongly that reflects.
+/// Optics of a head in a room. For each point, it determines the position that the laser hits, whether the surface
+/// there reflects, and how strongly.
 struct Optics {
     model: Model,
     beams: BeamSampler,
@@ -578,8 +578,8 @@ impl Optics {
         if random.f64() < STRAY_SHARE { 2.0 + 7.0 * random.f64() } else { shift_deg(None) }
     }
 
-    /// Returns whether the echo is strong enough. Indoors, scanners that triangulate lose most points: those of dark,
-    /// far or oblique surfaces. The darkness of a patch of surface is drawn for its direction.
+    /// Returns whether the echo is strong enough. Indoors, scanners that triangulate lose most points, because many
+    /// surfaces are dark, far or oblique. The darkness of a patch of surface is drawn for its direction.
     fn has_return(&self, at_ns: Nanos, clockwise_deg: f64, beam: &BeamReading) -> bool {
         if !self.model.triangulates() {
             return true;
@@ -616,18 +616,18 @@ const BOOT_TO_REQUEST_NS: Nanos = 4 * MILLIS;
 const RESPONSE_DELAY_NS: Nanos = MILLIS;
 /// Time constant of the motor's spin-up, in seconds.
 const SPIN_UP_TIME_S: f64 = 0.4;
-/// Time after which the speed of the motor is steady enough to measure.
+/// Time from the start of the motor until its speed is steady enough to measure.
 const SETTLE_TIME_NS: Nanos = 1_600 * MILLIS;
 /// Share of the points without a return that are reported anywhere from 2 to 9 degrees behind the head.
 const STRAY_SHARE: f64 = 0.27;
 /// Range at which the search for a point begins, in millimeters.
 const START_RANGE_MM: f64 = 3_000.0;
-/// Maximum number of steps of this search.
+/// Maximum number of steps of the search for a point.
 const MAX_ITERATIONS: usize = 6;
 /// Width of a patch of surface that is equally dark, in degrees.
 const PATCH_DEG: f64 = 2.0;
 /// Minimum signal for a return from the brightest surfaces, relative to a white surface at 1 m. The darkest surfaces
-/// need [`MAX_DARKNESS`] times as much. With these values, 61 to 84 % of the points indoors are invalid, as on a real
-/// A1.
+/// need a signal that is [`MAX_DARKNESS`] times as strong. With these values, 61 to 84 % of the points indoors are
+/// invalid, as on a real A1.
 const MIN_SIGNAL: f64 = 0.003;
 const MAX_DARKNESS: f64 = 20_000.0;

@@ -55,8 +55,8 @@ pub(crate) struct Object {
     pub(crate) until_s: f64,
     /// Moves while the object is present, in the order of time. They do not overlap.
     pub(crate) moves: Vec<Movement>,
-    /// Time after which all moves start again, in seconds. The last move ends within this time, where the first one
-    /// began.
+    /// Time after which all moves start again, in seconds. The last move must end within this time, at the pose at
+    /// which the first move began.
     pub(crate) repeat_s: Option<f64>,
     /// Maximum distance by which the seed moves the object along each axis.
     pub(crate) jitter_mm: f64,
@@ -94,8 +94,8 @@ impl Object {
         self.from_s <= 0.0 && self.until_s.is_infinite() && self.moves.is_empty()
     }
 
-    /// Returns the pose at `time_s` if the object is present, and the time of its arrival there. This time is 0 if the
-    /// object has been there from the start, and `time_s` while it moves.
+    /// Returns the pose at `time_s` if the object is present, and the time at which the object arrived at this pose.
+    /// This time is 0 if the object has had this pose from the start, and `time_s` while the object moves.
     pub(crate) fn at(&self, time_s: f64) -> Option<Presence> {
         let start = Presence { pose: self.pose, since_s: self.from_s.max(0.0) };
         let last = |_, presence: Presence| presence;
@@ -104,8 +104,8 @@ impl Object {
             .then(|| self.poses(time_s, self.round(time_s)).fold(start, last))
     }
 
-    /// Returns the poses that the object had before `time_s` and has left. If the moves repeat, only the present and
-    /// the last round count.
+    /// Returns the poses that the object had before `time_s` and has left. If the moves repeat, only the poses of the
+    /// present round and the round before are returned.
     pub(crate) fn previous_presences(&self, time_s: f64) -> Vec<Presence> {
         let round = self.round(time_s);
         let rounds = if round > 0.0 { vec![round - 1.0, round] } else { vec![round] };
@@ -130,7 +130,7 @@ impl Object {
     }
 
     /// Returns the poses after the moves of `round` that have begun at `time_s`, and the times at which the object
-    /// arrived at each of them: `time_s` for a move that has not ended.
+    /// arrived at each of them: this time is `time_s` for a move that has not ended.
     fn poses(&self, time_s: f64, round: f64) -> impl Iterator<Item = Presence> {
         let offset_s = round * self.repeat_s.unwrap_or(0.0);
         let started = self.moves.iter().take_while(move |movement| movement.from_s + offset_s <= time_s);
@@ -193,7 +193,8 @@ pub(crate) struct Corner {
     pub(crate) point: Point,
     /// Time that the person spends there, in seconds.
     pub(crate) pause_s: f64,
-    /// Direction that the person faces if they sit there, in degrees counterclockwise from x.
+    /// Direction that the person faces while they sit at this corner, in degrees counterclockwise from x. `None` if
+    /// they do not sit there.
     pub(crate) seat_deg: Option<f64>,
 }
 
@@ -453,7 +454,7 @@ pub(crate) const SIT_DOWN_S: f64 = 1.2;
 const STRIDE_MM: f64 = 250.0;
 /// Double steps per second of a person who roams.
 const STEPS_HZ: f64 = 0.9;
-/// Length of a double step of a person on a path. With the stride above, one foot nearly stands while the other swings.
+/// Length of a double step of a person on a path. With [`STRIDE_MM`], one foot nearly stands while the other swings.
 const DOUBLE_STEP_MM: f64 = 1_400.0;
 
 #[cfg(test)]

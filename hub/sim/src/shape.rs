@@ -9,7 +9,7 @@ use std::f64::consts::TAU;
 /// A point or a vector in millimeters.
 pub type Point = (f64, f64);
 
-/// An obstacle of a ray.
+/// An obstacle that a ray can hit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
     /// A straight wall between two points.
@@ -167,8 +167,8 @@ impl Plane {
         Plane { eye, sin, cos }
     }
 
-    /// Calls `each` with the cut of each surface of an object with the outline `shapes`. A post has surfaces at its
-    /// ends, and so has an object that `is_box`.
+    /// Calls `each` with the cut of each surface of an object with the outline `shapes`. A post also has surfaces at
+    /// its top and its bottom, and so does an object if `is_box` is set.
     pub(crate) fn cut(&self, shapes: &[Shape], heights: Heights, is_box: bool, mut each: impl FnMut(Shape)) {
         let (bottom, top) = (heights.from_mm.min(MAX_DISTANCE_MM), heights.to_mm.min(MAX_DISTANCE_MM));
         let mut wall = |from: Point, to: Point| {
@@ -254,7 +254,8 @@ fn polygon(centre: Point, radius: f64) -> [Point; SIDES] {
     })
 }
 
-/// Number of sides of the polygon that replaces a round post. For a radius of 100 mm, it is off by 2 mm.
+/// Number of sides of the polygon that replaces a round post. For a radius of 100 mm, the polygon deviates from the
+/// circle by 2 mm.
 const SIDES: usize = 16;
 /// Maximum distance and height of everything that is measured, in millimeters.
 const MAX_DISTANCE_MM: f64 = 100_000.0;

@@ -114,7 +114,7 @@ pub fn simulate_with(
     Ok(summaries)
 }
 
-/// Runs each port in a separate thread. If one fails, the others end too.
+/// Runs each port in a separate thread. If one thread fails, the others end too.
 fn run(threads: Vec<PortThread<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failure> {
     let failed: OwnedFd = eventfd(0, EventfdFlags::CLOEXEC).map_err(|errno| {
         Failure::new(Kind::ResourceExhausted, format!("cannot create an eventfd: {errno}"), "")
@@ -300,7 +300,7 @@ struct PortThread<'a> {
     mismatch: BaudMismatch,
     /// Number of telegrams that were sent.
     sent: u64,
-    /// Bytes that wait for room in the host's buffer; only on a lossless line.
+    /// Bytes that wait for room in the host's buffer. Bytes wait only on a lossless line.
     unsent: Vec<u8>,
 }
 
@@ -312,7 +312,7 @@ pub enum Event {
     /// The host's adapter is unplugged for this time in nanoseconds. Afterwards it is another terminal with the same
     /// name.
     Unplug(Nanos),
-    /// The line has these faults from now on, with random numbers of this seed. Times count from now.
+    /// The line has these faults from now on, with random numbers of this seed. The times of the faults count from now.
     Faults(Box<Faults>, u64),
 }
 
@@ -329,7 +329,8 @@ impl ScaledClock {
     }
 
     fn of_clock(self, machine_ns: Nanos) -> Nanos {
-        // One more nanosecond, because a deadline must not be before the time that it represents.
+        // Add a nanosecond, because the division rounds down, and a deadline must not be before the time that it
+        // represents.
         self.zero_ns + (machine_ns as f64 / self.speed) as Nanos + 1
     }
 }
@@ -338,7 +339,7 @@ impl PortThread<'_> {
     /// Runs until one of `stops` is readable.
     pub(crate) fn run(mut self, stops: [BorrowedFd<'_>; 2]) -> Result<Summary, Failure> {
         let mut buffer = [0; 64];
-        // Time of the kernel's clock until which there was nothing to read.
+        // Last time at which there was nothing to read, by the kernel's clock.
         let mut quiet_ns = now_ns();
         loop {
             let read_ns = now_ns();
@@ -592,7 +593,8 @@ impl Truth {
     pub fn write(&self, line: &str) -> Result<(), Failure> {
         let line = format!("{line}\n");
         let written = match &self.file {
-            // A thread that panicked with the lock has written its line or not. In both cases, the next line is intact.
+            // A thread that panicked while it held the lock has written its whole line or nothing. In both cases, the
+            // next line is intact.
             Some(file) => {
                 file.lock().unwrap_or_else(std::sync::PoisonError::into_inner).write_all(line.as_bytes())
             }
@@ -616,9 +618,9 @@ const MAX_LAG_NS: Nanos = 100 * MILLIS;
 const PTY_DELAY_NS: Nanos = 2 * MILLIS;
 /// Interval at which a lossless line checks for room in the host's buffer.
 const ROOM_CHECK_INTERVAL_NS: Nanos = MILLIS;
-/// Interval between polls of the port, because no event reports that a host opened it. It also limits the uncertainty
-/// of the time at which a byte arrived. At 9600, where every host begins, it is short enough to prove to a strict
-/// scanner that a request was written without gaps.
+/// Interval between polls of the port. The port must be polled, because no event reports that a host opened it. The
+/// interval also limits the uncertainty of the time at which a byte arrived. At 9600, where every host begins, it is so
+/// short that a strict scanner can be sure that a request was written without gaps.
 const POLL_INTERVAL_NS: Nanos = 4 * MILLIS;
 
 #[cfg(test)]

@@ -241,7 +241,7 @@ pub(crate) struct Hit {
 }
 
 impl Hit {
-    /// Returns whether both rays end at the same face, and have done so for the same time.
+    /// Returns whether both rays end at the same face, and have ended there since the same time.
     pub(crate) fn is_of(&self, other: &Hit) -> bool {
         self.face == other.face && self.since_ns == other.since_ns
     }
@@ -252,7 +252,7 @@ impl Hit {
 pub(crate) struct View {
     faces: Vec<Face>,
     hits: Vec<Hit>,
-    /// Index of the first ray among all directions.
+    /// Index of the first ray in a full circle of rays.
     first: usize,
 }
 
@@ -281,7 +281,7 @@ impl View {
         self.first = still.first + middle - SPOT_RAYS;
     }
 
-    /// Draws `face` over the present rays. The nearest face wins.
+    /// Draws `face` over the present rays. Each ray ends at the nearest face.
     pub(crate) fn draw(&mut self, face: Face) {
         let number = self.faces.len() as u32;
         for ray in rays(&face.shape, self.ray_range()) {
@@ -359,9 +359,9 @@ fn rays(shape: &Shape, range: Range<usize>) -> impl Iterator<Item = usize> + use
     })
 }
 
-/// Number of rays per degree. They are 4 mm apart at 4 m, and each beam of each variant coincides with one.
+/// Number of rays per degree. Neighboring rays are 4 mm apart at 4 m. Each beam of each variant coincides with a ray.
 const RAYS_PER_DEGREE: i32 = 16;
-/// Number of rays to each side that the widest spot covers: more than a degree.
+/// Number of rays that the widest spot covers on each side of its middle. They span more than a degree.
 pub(crate) const SPOT_RAYS: usize = 20;
 /// Angle between two rays in radians.
 pub(crate) const RAY_STEP: f64 = std::f64::consts::PI / 180.0 / RAYS_PER_DEGREE as f64;

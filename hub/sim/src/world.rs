@@ -25,8 +25,8 @@ use crate::shape::{Heights, Point, Pose, Shape};
 pub enum World {
     /// No surface within the maximum range.
     Empty,
-    /// A wall around the scanner at which every value is 640. Its bytes are `80 02` throughout, so each beam except the
-    /// last ends with the first bytes of a header.
+    /// A wall around the scanner at which every value is 640. All bytes of the values are `80 02`, so each beam except
+    /// the last ends with the first bytes of a header.
     Wall640,
     /// Random values of all bits that the mode can set.
     Random,
@@ -85,7 +85,7 @@ impl World {
         }
     }
 
-    /// Returns the world with `faults` in place of the faults of all its mounts.
+    /// Returns the world with `faults` as the faults of all its mounts.
     pub fn with_mount_faults(self, faults: &[Fault]) -> World {
         let World::Scene(scene) = self else { return self };
         let mut scene = Arc::unwrap_or_clone(scene);
@@ -264,8 +264,8 @@ enum SpeedFile {
 struct SunFile {
     from_deg: Option<Spanned<f64>>,
     to_deg: Option<Spanned<f64>>,
-    /// Key of an earlier version, in which 0 was to the right. It is refused, because its values are valid in both
-    /// frames.
+    /// Key of an earlier version, whose angle 0 was to the right. The key is refused, because many of its values are
+    /// also valid as angles from ahead.
     sector_deg: Option<Spanned<(Number, Number)>>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,

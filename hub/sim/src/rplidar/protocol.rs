@@ -4,8 +4,9 @@
 //! all bytes follow. A response is a descriptor and its data. Angles and ranges are rounded here to the resolution of
 //! the format. The driver has its own description of the protocol, so that a mistake in one of them is detected.
 //!
-//! Whole microseconds, names and response types of the A1 are those of a real A1M8 with firmware 1.29. Those of the
-//! other models come from their data sheets and the logs of the vendor's driver, and were not measured.
+//! The times in whole microseconds, the names and the response types of the A1 come from a real A1M8 with firmware
+//! 1.29. The values of the other models come from their data sheets and the logs of the vendor's driver, and were not
+//! measured.
 
 /// Model of an RPLIDAR.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -28,7 +29,7 @@ pub enum Model {
     C1,
 }
 
-/// Format of a mode's points: the type in its descriptor.
+/// Format of the points of a mode, which is the type in the descriptor of the mode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PacketFormat {
     /// 0x81: one point in 5 bytes.
@@ -187,7 +188,8 @@ impl Model {
     }
 
     /// Returns whether the scanner triangulates, with a laser next to its lens. In that case, the angle of a point
-    /// depends on its range, and weak surfaces have no return. The others measure the time of flight of the light.
+    /// depends on its range, and weak surfaces have no return. The other scanners measure the time of flight of the
+    /// light.
     pub(crate) fn triangulates(self) -> bool {
         matches!(self, Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)
     }
@@ -200,8 +202,8 @@ impl Model {
         }
     }
 
-    /// Returns the firmware as (major, minor), and the number of the hardware. The vendor's driver expects 256,000 baud
-    /// from an A2 or A3 with hardware 6.
+    /// Returns the version of the firmware as (major, minor), and the number of the hardware. The vendor's driver
+    /// expects 256,000 baud from an A2 or A3 with hardware 6.
     fn versions(self) -> ([u8; 2], u8) {
         match self {
             Model::A1 => ([1, 29], 5),
@@ -212,8 +214,8 @@ impl Model {
         }
     }
 
-    /// Returns the duration of the scanner's microsecond, in microseconds of the host. A real A1 reported 508 us per
-    /// point, and sent 1,954 points per second.
+    /// Returns how long a microsecond of the scanner's clock takes, in microseconds of the host. A real A1 reported 508
+    /// us per point, and sent 1,954 points per second.
     pub(crate) fn clock_ratio(self) -> f64 {
         if self == Model::A1 { 1.0 / (508e-6 * 1_954.0) } else { 1.0 }
     }
@@ -381,7 +383,7 @@ pub(crate) fn configuration(model: Model, typical: usize, key: u32, mode: u16) -
     let of = model.modes().get(usize::from(mode));
     let eighths = |value: f64| ((value * 256.0).round() as u32).to_le_bytes().to_vec();
     let value = match key {
-        // Recommended revolutions per minute, and the duty cycle for them.
+        // Recommended revolutions per minute, and the duty cycle that leads to this speed.
         0x01 => {
             let rpm = (60.0 * model.revolutions_per_second()).round() as u16;
             [rpm.to_le_bytes(), DEFAULT_PWM.to_le_bytes()].concat()
@@ -463,7 +465,7 @@ pub(crate) fn express(is_first: bool, readings: &[Reading]) -> Vec<u8> {
 
 /// Encodes a packet of type 0x84: 32 words. Each word has one range of 12 bits, on a scale whose steps grow with the
 /// range. Two differences of 10 bits follow, in steps of that scale: one from this range, and one from the range of the
-/// next word. A range that no difference reaches becomes no return. `next` is the first range of the next packet.
+/// next word. A range that no difference can encode becomes no return. `next` is the first range of the next packet.
 pub(crate) fn ultra(is_first: bool, readings: &[Reading], next: &Reading) -> Vec<u8> {
     let mut body = start_angle(is_first, readings);
     let majors: Vec<u16> =
