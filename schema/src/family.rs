@@ -62,8 +62,8 @@ impl Family {
         }
     }
 
-    /// Returns whether the family's intensities are levels of reflectors, with 0 for any other surface. Otherwise they
-    /// are measured from every surface, and the user must configure the threshold for reflectors.
+    /// Returns whether the family's intensities are levels of reflectors, with 0 for any other surface. If not, the
+    /// intensity of every surface is measured, and the user must configure the threshold for reflectors.
     pub fn has_reflector_levels(self) -> bool {
         self == Family::Lms
     }
@@ -118,7 +118,8 @@ fn slamtec_packets(bytes: &[u8]) -> PacketInfo {
     const CAPSULE_LENS: [usize; 3] = [84, 132, 170];
     const POINT_LEN: usize = 5;
     const HEAD_LEN: usize = 7;
-    // A packet may start like a response. The head of a response has its length, unless a stream follows.
+    // A packet may start like a response. The head of a response contains the length of the response, unless a stream
+    // follows.
     if let Some(&[0xA5, 0x5A, low, middle, high, ..]) = bytes.first_chunk::<HEAD_LEN>() {
         let len = u32::from_le_bytes([low, middle, high, 0]) as usize;
         if bytes.len() == HEAD_LEN || bytes.len() == HEAD_LEN + len {

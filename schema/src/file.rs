@@ -22,11 +22,11 @@ pub const ENCODING_V1: &str = "scanhub";
 /// Name of the metadata record at the start of a recording, which describes its origin.
 pub const METADATA: &str = "scanhub";
 
-/// Writes a recording into `W`. Everything up to [`close_chunk`](Self::close_chunk) can be read even if the file ends
-/// there. Later samples are only in memory.
+/// Writes a recording into `W`. Every sample before the last [`close_chunk`](Self::close_chunk) can be read even if the
+/// file ends there. Later samples are only in memory.
 pub struct Writer<W: Write> {
     mcap: mcap::Writer<NoSeek<BufWriter<W>>>,
-    /// Channels of each sensor. They are few, so a linear search is enough.
+    /// Channels of each sensor. There are few channels, so a linear search is enough.
     channels: BTreeMap<String, Vec<(Topic, u16)>>,
     message: Vec<u8>,
 }
@@ -149,8 +149,8 @@ impl<W: Write> Writer<W> {
         self.mcap.write_to_known_channel(&header, data).map_err(io_error)
     }
 
-    /// Creates a channel like one of another file. `schema` has the name, language and definition of its messages'
-    /// type, if there is one.
+    /// Creates a channel that copies a channel of another file. `schema` has the name, language and definition of its
+    /// messages' type, if there is one.
     ///
     /// # Errors
     ///

@@ -12,8 +12,8 @@ pub const MAX_PUBLISHERS: usize = 1;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TopicLimits {
     /// Maximum number of subscribers of each topic at a time, one of [`TopicLimits::SUBSCRIBERS`]. For each sample, the
-    /// shared-memory library reads all slots three times. They are far apart in memory, and each has memory for the
-    /// samples that its subscriber may hold. With few subscribers, many slots cost more than the sample itself.
+    /// shared-memory library reads all slots three times. The slots are far apart in memory, and each slot has memory
+    /// for the samples that its subscriber may hold. With few subscribers, many slots cost more than the sample itself.
     pub subscribers: usize,
     /// Maximum number of beams of a scan.
     pub beams: usize,
@@ -24,7 +24,7 @@ pub struct TopicLimits {
 }
 
 impl TopicLimits {
-    /// Numbers of subscribers that a topic can be created for. The event that wakes them has no more slots.
+    /// Numbers of subscribers that a topic can be created for. The event that wakes the subscribers has no more slots.
     pub const SUBSCRIBERS: RangeInclusive<usize> = 1..=MAX_LISTENERS;
 
     /// Checks that the topics can be created.

@@ -1,5 +1,5 @@
-//! Payloads in memory and as they are sent over a network: the fields of shared memory in their order, without unused
-//! elements of arrays. A received payload is checked against its own counts before it is used.
+//! Payloads in memory and as they are sent over a network: the fields have the same order as in shared memory, and
+//! unused elements of arrays are left out. A received payload is checked against its own counts before it is used.
 //!
 //! Most payloads are structs of fixed size and implement only [`FixedPayload`]. The others have a head of fixed size
 //! and arrays whose length depends on the number of beams. The macro `sliced!` defines them, and they implement
@@ -20,8 +20,8 @@ pub trait DatagramPayload {
     /// require or contradicts itself. Bytes after it belong to a later revision.
     fn room(payload: &[u8]) -> Option<usize>;
 
-    /// Raises `limits` until a topic that is created with them has room for `payload`, for which [`room`](Self::room)
-    /// returned a length.
+    /// Raises `limits` until a topic that is created with these limits has room for `payload`. [`room`](Self::room)
+    /// must have returned a length for `payload`.
     fn widen(limits: &mut TopicLimits, payload: &[u8]) {
         let _ = (limits, payload);
     }
@@ -117,7 +117,8 @@ impl<P: FixedPayload> DatagramPayload for P {
     }
 }
 
-/// Copies the fields in `payload` into `memory`. `None` if it is too short, or has more elements than the struct.
+/// Copies the fields in `payload` into `memory`. Returns `None` if `payload` is too short, or has more elements than
+/// the struct.
 fn unpack_fields<P: FixedPayload>(memory: &mut [u8], payload: &[u8]) -> Option<()> {
     let whole = if payload.len() < memory.len() { P::FIRST_REVISION_LEN } else { memory.len() };
     let head = P::ARRAYS.first().map_or(whole, |array| array.at);
@@ -164,18 +165,19 @@ macro_rules! packed_as_is {
 pub(crate) use packed_as_is;
 
 impl<'a> Datagram<'a> {
-    /// Returns the payload of topic `telegram` as a telegram, if it is one of the sensor's family.
+    /// Returns the payload as a telegram, if the topic is `telegram` and the payload is a telegram of the sensor's
+    /// family.
     pub fn telegram(&self) -> Option<Telegram<'a>> {
         Telegram::of(self.head.family, self.payload)
     }
 
-    /// Returns the announcement, if it is a valid one.
+    /// Returns the announcement, if the payload is a valid announcement.
     pub fn announce(&self) -> Option<Announce> {
         let is_announcement = self.head.topic == Announce::NUMBER && self.is_versioned();
         if is_announcement { Announce::unpack(self.payload) } else { None }
     }
 
-    /// Returns whether it is a whole sample, and its payload has a revision.
+    /// Returns whether the datagram has a whole sample, and the payload has a revision.
     fn is_versioned(&self) -> bool {
         self.head.revision > 0 && self.head.parts == 1
     }
@@ -307,7 +309,7 @@ macro_rules! sliced {
                 copy
             }
 
-            /// Replaces `payload` by one of `len` bytes, filled with 0, if it has memory for fewer.
+            /// Replaces `payload` by a payload of `len` bytes, filled with 0, if it has memory for fewer bytes.
             pub fn grow(payload: &mut Box<Self>, len: usize) {
                 if payload.capacity() < len {
                     *payload = Self::zeroed(len);
@@ -345,7 +347,7 @@ macro_rules! sliced {
 
             fn deref(&self) -> &$head {
                 const NONE: [$word; size_of::<$head>() / size_of::<$word>()] = [$word { word: 0 }; size_of::<$head>() / size_of::<$word>()];
-                // A sample of an unknown publisher may be shorter than a head. It then has no beams.
+                // A sample of an unknown publisher may be shorter than a head. The sample then has no beams.
                 let head = self.memory().get(..Self::HEAD);
                 bytemuck::from_bytes(head.unwrap_or(bytemuck::cast_slice(&NONE)))
             }

@@ -208,7 +208,7 @@ impl Scan {
         if self.has(ArrayFlags::ANGLES) { self.array(0, 4) } else { &[] }
     }
 
-    /// Returns the number of beams: `count`, unless there is memory for fewer.
+    /// Returns the number of beams: `count`, or a lower number if there is memory for fewer beams only.
     #[inline]
     pub fn beams(&self) -> usize {
         let room = self.memory().len().saturating_sub(Scan::HEAD) / total_bytes_per_beam(self.contents);
@@ -221,7 +221,8 @@ impl Scan {
         self.ranges().get(i).copied().filter(|&value| value <= self.valid_to)
     }
 
-    /// Returns the reason why beam `i` has no valid reading. `None` if it has one or does not exist.
+    /// Returns the reason why beam `i` has no valid reading. Returns `None` if the beam has a valid reading or does not
+    /// exist.
     #[inline]
     pub fn code(&self, i: usize) -> Option<Code> {
         let value = *self.ranges().get(i)?;
@@ -272,7 +273,7 @@ impl Scan {
         self.contents & contents != 0
     }
 
-    /// Returns the array after the arrays of `before`, with values of `size` bytes.
+    /// Returns the array that follows the arrays `before`. Each of its values has `size` bytes.
     #[inline]
     fn array<T: Pod>(&self, before: u8, size: usize) -> &[T] {
         let n = self.beams();
@@ -348,7 +349,7 @@ pub fn in_sector_mdeg(radians: f64) -> i32 {
 /// Bit for the ranges, which every scan has, alongside [`ArrayFlags`].
 const RANGES: u8 = 0x80;
 
-/// Returns the bytes of a beam in the arrays of `contents`.
+/// Returns the number of bytes that a beam has in the arrays of `contents`.
 const fn bytes_per_beam(contents: u8) -> usize {
     4 * bit(contents, ArrayFlags::ANGLES)
         + 2 * bit(contents, RANGES)
@@ -360,7 +361,7 @@ const fn bit(contents: u8, mask: u8) -> usize {
     if contents & mask != 0 { 1 } else { 0 }
 }
 
-/// Returns the bytes of a beam in all arrays of a scan with `contents`.
+/// Returns the number of bytes that a beam has in all arrays of a scan with `contents`.
 const fn total_bytes_per_beam(contents: u8) -> usize {
     bytes_per_beam(contents & ArrayFlags::ALL | RANGES)
 }

@@ -103,7 +103,7 @@ impl Status {
         }
     }
 
-    /// Returns the scans per second. `None` while a stream that just started has not been measured.
+    /// Returns the scans per second. Returns `None` while a stream that just started has not been measured.
     pub fn rate_hz(&self) -> Option<f64> {
         let is_measured = self.rate_mhz != 0 || self.state() != Some(State::Streaming);
         is_measured.then(|| f64::from(self.rate_mhz) / 1000.0)
@@ -186,7 +186,7 @@ impl Status {
         word.starts_with(|c: char| c.is_ascii_lowercase()).then_some(word)
     }
 
-    /// Returns the unit that [`lost_on_line`](Self::lost_on_line) counts: scans or packets.
+    /// Returns what [`lost_on_line`](Self::lost_on_line) counts: scans or packets.
     pub fn transmission_name(&self) -> &'static str {
         if self.family() == Some(Family::Lms) { "scans" } else { "packets" }
     }

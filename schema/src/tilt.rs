@@ -209,8 +209,8 @@ impl fmt::Debug for Cloud {
 #[derive(Clone, Debug, Default)]
 pub struct SweepPoints {
     points: Vec<CloudPoint>,
-    /// Publisher's run and number of the next sample of this sweep. `None` while waiting for the first sample of a
-    /// sweep.
+    /// Run of the publisher, and number of the next sample of this sweep. `None` while waiting for the first sample of
+    /// a sweep.
     next: Option<(u64, u64)>,
 }
 

@@ -16,12 +16,13 @@ pub const fn line_time(bytes: usize, baud: u32) -> Nanos {
     bytes as u64 * 10 * 1_000_000_000 / baud as u64
 }
 
-/// Minimum time from the first to the last sample of a rate. Samples that a topic keeps, or that waited for a
-/// subscriber, arrive within microseconds, and a rate computed from them would be meaningless.
+/// Minimum time from the first to the last sample of a rate. Samples from the history of a topic, or samples that
+/// waited for a subscriber, arrive within microseconds. A rate that is computed from these samples would be
+/// meaningless.
 pub const MIN_RATE_SPAN: Duration = Duration::from_millis(200);
 
-/// Returns the samples per second if `intervals` samples followed the first one, the last of them `span` after it.
-/// `None` if the samples span less than [`MIN_RATE_SPAN`].
+/// Returns the samples per second if `intervals` samples followed the first one, and the last sample arrived `span`
+/// after the first one. `None` if the samples span less than [`MIN_RATE_SPAN`].
 pub fn rate_hz(intervals: u64, span: Duration) -> Option<f64> {
     (span >= MIN_RATE_SPAN).then(|| intervals as f64 / span.as_secs_f64())
 }

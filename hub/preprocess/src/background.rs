@@ -1,5 +1,5 @@
-//! Models of the background, which decide which beams of a scan hit the permanent surroundings, and which hit something
-//! in front of them.
+//! Models of the background. They decide which beams of a scan hit the permanent surroundings, and which beams hit
+//! something in front of the surroundings.
 //!
 //! A [`BackgroundModel`] learns the surroundings from the scans: beam by beam with one of two methods (`fixed`), or as
 //! a map around a sensor that moves (`moving`).
@@ -25,22 +25,22 @@ use crate::velocity::Velocity;
 pub struct Settings {
     /// Method of learning.
     pub method: Method,
-    /// Maximum difference in mm of readings of one surface, at least one unit of the sensor. `None`: 30, in cm mode 60,
-    /// in dm mode 100.
+    /// Maximum difference in mm between two readings of one surface, at least one unit of the sensor. `None`: 30, in cm
+    /// mode 60, in dm mode 100.
     pub threshold_mm: Option<u16>,
-    /// Maximum difference in mm of a reading and its candidate (`paper`).
+    /// Maximum difference in mm between a reading and its candidate (`paper`).
     pub candidate_mm: Option<u16>,
-    /// Number of scans until a surface is background. `None`: 375 at half degrees, 750 at 1, 188 at a quarter, which
-    /// are 10 s at the full rate. `multi` knows a surface well enough after 5/8 of this number. At most 8191, which is
-    /// 3.6 minutes at half degrees; a greater number counts as 8191.
+    /// Number of scans until a surface is background. `None`: the scans of 10 s at the full rate, which are 750 at
+    /// steps of 1 degree, 375 at half degrees, and 188 at a quarter. `multi` knows a surface well enough after 5/8 of
+    /// this number. At most 8191, which is 3.6 minutes at half degrees; a greater number counts as 8191.
     pub scans: Option<u32>,
     /// Reading that a candidate is compared with (`paper`).
     pub candidate: Candidate,
     /// Contents of the model at the start and after each reset.
     pub start: Start,
-    /// Whether a beam without a return has a far background. Otherwise, it is not a reading. `None`: true for `multi`,
-    /// which then detects people in front of glass, at no cost elsewhere; false for `paper`, because each such beam
-    /// ends a run.
+    /// Whether no return counts as a background far away. Otherwise, it counts as no reading. `None`: true for `multi`,
+    /// which then also detects people in front of glass, at no cost elsewhere. False for `paper`, because each beam
+    /// without a return would end a run.
     pub no_return_is_far: Option<bool>,
 }
 
@@ -60,10 +60,10 @@ pub enum Method {
 /// Reading that the readings of a run are compared with.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Candidate {
-    /// The first one. A person who walks straight at the sensor never becomes background.
+    /// The first reading of the run. A person who walks straight at the sensor never becomes background.
     #[default]
     First,
-    /// The previous one. It drifts along with anything that moves slowly.
+    /// The previous reading. It drifts along with anything that moves slowly.
     Latest,
 }
 
@@ -80,7 +80,7 @@ pub enum Start {
 /// The settings in the units of the scans.
 #[derive(Clone, Copy, Debug)]
 struct Limits {
-    /// Maximum difference of readings of one surface, in device units. It is low enough that no range is near
+    /// Maximum difference between two readings of one surface, in device units. It is so low that no range is near
     /// [`scanhub_schema::Background::FAR`].
     threshold: u16,
     /// In device units.
@@ -95,17 +95,18 @@ struct Limits {
     unit_um: u32,
 }
 
-/// Default of both thresholds: six standard deviations of a range (the paper names no value).
+/// Default of both thresholds in mm: six standard deviations of a range (the paper names no value).
 const THRESHOLD_MM: u16 = 30;
 /// Default in cm mode, where the quantization adds to the noise.
 const THRESHOLD_CM_MODE_MM: u16 = 60;
 /// Default in dm mode, where readings of surfaces 30 mm apart differ by at most one unit.
 const THRESHOLD_DM_MODE_MM: u16 = 100;
-/// 750 mirror revolutions of an LMS: this number of scans at 1 degree, half of them at half degrees.
+/// Number of revolutions of an LMS's mirror in 10 s. It is the number of scans at steps of 1 degree, and twice the
+/// number of scans at half degrees.
 const LEARNING_TIME_NS: f64 = 9.99e9;
 /// Maximum number of scans. The weights of `multi` grow by 8 per scan and have 16 bits.
 const MAX_SCANS: u32 = 8191;
-/// Maximum difference of two ranges. [`scanhub_schema::Background::FAR`] differs by more from all of them.
+/// Maximum difference between two ranges. [`scanhub_schema::Background::FAR`] differs by more from every range.
 const MAX_DIFFERENCE: u32 = 0x7FFF;
 /// Maximum rounding error of a quotient, so that rounding up keeps a whole number.
 const ROUNDING_ERROR: f64 = 1e-6;
@@ -118,7 +119,7 @@ impl Limits {
             10_000..100_000 => THRESHOLD_CM_MODE_MM,
             100_000.. => THRESHOLD_DM_MODE_MM,
         };
-        // With less than a unit, a reading between two of them would belong to no surface.
+        // With a difference of less than a unit, a reading between two units would belong to no surface.
         let units = |mm: Option<u16>| {
             (1000 * u32::from(mm.unwrap_or(default_mm)) / unit_um).clamp(1, MAX_DIFFERENCE) as u16
         };
@@ -156,8 +157,8 @@ pub enum Class {
 
 /// The background of one sensor.
 ///
-/// A scan with another shape than the previous one (number of beams, unit, angles) resets it. A reading of 0 is treated
-/// like any other, but as a background it cannot be distinguished from an unknown one.
+/// A scan resets the background if its shape (number of beams, unit, angles) differs from the shape of the previous
+/// scan. A reading of 0 is treated like any other, but as a background it cannot be distinguished from an unknown one.
 #[derive(Clone)]
 pub struct BackgroundModel {
     settings: Settings,
@@ -211,8 +212,8 @@ impl BackgroundModel {
         }
     }
 
-    /// Compares `scan` with the model, writes what is in front of it to `out`, and then learns from it. Writes every
-    /// byte of `out` except those of the segments.
+    /// Compares `scan` with the model, writes the foreground to `out`, and then learns from `scan`. Writes every byte
+    /// of `out` except the bytes of the segments.
     ///
     /// # Panics
     ///
@@ -242,8 +243,9 @@ impl BackgroundModel {
         write_foreground(scan, self.generation, &self.classes[..count], out);
     }
 
-    /// Sets the robot's position at the next scan, as in `motion`, and its `velocity` during that scan, for a sensor at
-    /// `pose` and [`Method::Moving`]. If the motion restarts or is refused, the model is reset.
+    /// Sets the robot's position at the next scan, which `motion` contains, and the robot's `velocity` during that
+    /// scan. The sensor is at `pose`. Only [`Method::Moving`] uses these values. If the motion restarts or is refused,
+    /// the model is reset.
     pub fn set_motion(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) {
         if let MethodState::Moving(moving) = &mut self.method_state
             && !moving.set_motion(pose, motion, velocity)
@@ -291,7 +293,7 @@ impl BackgroundModel {
         self.settings.method
     }
 
-    /// Returns the number of the model. It increases by 1 with a reset, a load, and a change of the scan's shape.
+    /// Returns the generation of the model. It increases by 1 with a reset, a load, and a change of the scan's shape.
     pub fn generation(&self) -> u32 {
         self.generation
     }
@@ -332,8 +334,12 @@ impl BackgroundModel {
     /// `model`.
     ///
     /// Before the first scan, its shape is unknown, so any model is accepted. If the first scan has another number of
-    /// beams or another unit, it resets the model, like any such change. # Errors Returns [`Mismatch`] if the number of
-    /// beams or the unit differs from those of the last scan, or if there are too many beams.
+    /// beams or another unit, it resets the model, like any other change of the shape.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Mismatch`] if the number of beams or the unit differs from that in the last scan, or if there are too
+    /// many beams.
     pub fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
         let ranges = model.ranges();
         let shape = (ranges.len() as u16, model.unit_um);
@@ -367,7 +373,7 @@ impl BackgroundModel {
         self.is_fitted = false;
     }
 
-    /// Adapts the model to scans such as `scan`.
+    /// Adapts the model to scans with the shape of `scan`.
     fn fit(&mut self, scan: &Scan) {
         let shape = (scan.beams().min(self.max_beams) as u16, scan.unit_um);
         let angles = (scan.first_angle, scan.step);
@@ -400,7 +406,7 @@ impl MethodState {
                 match self {
                     MethodState::Paper(paper) => paper.adopt(i, range),
                     MethodState::Multi(multi) => multi.adopt(i, range),
-                    // Ranges from one position are not a map.
+                    // The ranges of a model were measured from one position. They are not a map.
                     MethodState::Moving(_) => {}
                 }
             }
@@ -479,8 +485,8 @@ impl fmt::Display for Mismatch {
 
 impl std::error::Error for Mismatch {}
 
-/// Filter that decides how many neighboring beams, in how many scans, count as an object. Noise and mixed readings at
-/// edges affect single beams. People cover several beams, unless they are far away.
+/// Filter that decides how many neighboring foreground beams, in how many scans, count as an object. Noise and mixed
+/// readings at edges affect single beams. People cover several beams, unless they are far away.
 #[derive(Clone)]
 struct RunFilter {
     /// Readings of beams of the last scan that were nearer than their background; [`INVALID`] for the others.
@@ -504,12 +510,12 @@ impl RunFilter {
         self.objects.fill(INVALID);
     }
 
-    /// Keeps runs of foreground beams in `classes` that count as objects. Beams of other runs become unknown. Beams
-    /// without a reading neither end a run nor count.
+    /// Keeps the runs of foreground beams in `classes` that count as objects. Beams of other runs become unknown. A
+    /// beam without a reading does not end a run, and does not count as one of its beams.
     ///
-    /// A run of three beams counts at once. A shorter one counts if the last scan had a foreground beam of an object
-    /// there. It also counts if it is as long as a leg is wide at its range, and the last scan had any foreground beam
-    /// there. *There* means among or next to the run's own beams, within 200 mm of its nearest range.
+    /// A run of three beams counts at once. A shorter run counts if the last scan had a foreground beam of an object
+    /// there. A shorter run also counts if it is as wide as a leg at its range, and the last scan had any foreground
+    /// beam there. *There* means among or next to the run's own beams, within 200 mm of the run's nearest range.
     fn retain_objects(&mut self, readings: &[u16], limits: &Limits, classes: &mut [Class]) {
         let beam_count = self.foreground.len();
         let [foreground, objects] = &mut self.next;
@@ -559,13 +565,15 @@ fn leg_beams(range: u16, limits: &Limits) -> u64 {
         .map_or(MIN_OBJECT_BEAMS, |beams| beams.clamp(1, MIN_OBJECT_BEAMS))
 }
 
-/// Number of neighboring beams that are never noise. A run never needs more, however near the object is.
+/// Number of neighboring foreground beams that are never noise. A run never needs more beams, however near the object
+/// is.
 const MIN_OBJECT_BEAMS: u64 = 3;
-/// Width of a leg with trousers, plus that of a beam. Among 120, 135 and 150 mm, this width has the best recall that
-/// costs no precision in the room of Fig. 8.
+/// Width of a leg with trousers plus width of a beam, in mm. Of 120, 135 and 150 mm, this value has the best recall
+/// without a loss of precision in the room of Fig. 8.
 const LEG_WIDTH_MM: u64 = 135;
 const MDEG_PER_RADIAN: u64 = 57_296;
-/// Maximum movement of an object between two scans, and its depth: 5 m/s at 37.5 Hz is 133 mm.
+/// Maximum movement of an object between two scans plus the depth of the object, in mm. At 37.5 Hz, an object at 5 m/s
+/// moves by 133 mm.
 const MAX_MOVEMENT_MM: u32 = 200;
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use scanhub_schema::{Pose, Scan};
 
 /// Directions of the beams of one sensor in the robot's frame, as unit vectors.
 pub(crate) struct Directions {
-    /// Pose of the sensor, first angle and step of the scans for which the grid was computed.
+    /// Pose of the sensor, and first angle and step of the scans, for which the grid was computed.
     layout: Option<(Pose, f64, f64)>,
     grid: Box<[(f64, f64)]>,
 }
@@ -15,7 +15,8 @@ impl Directions {
         Directions { layout: None, grid: vec![(0.0, 0.0); beams].into() }
     }
 
-    /// Adapts the directions to scans such as `scan`, of a sensor at `pose`. Returns whether they have changed.
+    /// Adapts the directions to scans with the angles of `scan`, for a sensor at `pose`. Returns whether they have
+    /// changed.
     pub(crate) fn fit(&mut self, pose: &Pose, scan: &Scan) -> bool {
         let layout = Some((*pose, scan.first_angle, scan.step));
         if self.layout == layout {
@@ -33,8 +34,8 @@ impl Directions {
         self.grid.get(i).copied()
     }
 
-    /// Returns the readings of `scan` in the order of the beams, except those of 0: beam, direction, and range in
-    /// meters.
+    /// Returns the readings of `scan` in the order of the beams, except readings of 0. Each item has the beam, its
+    /// direction, and the range in meters.
     pub(crate) fn readings<'a>(
         &'a self,
         pose: &'a Pose,

@@ -1,9 +1,9 @@
-//! Straight lines of one scan: those that make the measured ranges likeliest, if each range has normal noise along its
-//! beam. A beam belongs to one line or to none. No state is kept from one scan to the next.
+//! Straight lines of one scan. The lines are chosen so that the measured ranges are likeliest, if each range has normal
+//! noise along its beam. A beam belongs to one line or to none. No state is kept from one scan to the next.
 //!
 //! The method is maximum likelihood as in Schaefer, Buescher, Luft, Burgard: "A Maximum Likelihood Approach to Extract
-//! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected: pairs of beams are joined
-//! to lines, the likeliest first, then the cuts between lines are moved (`pieces`).
+//! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected. Pairs of beams are joined
+//! to lines, the likeliest lines first. Then the cuts between lines are moved (`pieces`).
 //!
 //! No parameter is set by hand: the noise is estimated from the scan, and a Bayesian information criterion decides
 //! whether a line explains more than noise.
@@ -27,8 +27,8 @@ pub struct Settings {
     pub max: u8,
     /// Minimum number of beams of a line, at least 3.
     pub min_points: u16,
-    /// Whether to use the slower, better method: it moves cuts to where they help most, and drops beams at the ends of
-    /// a line that fit worst.
+    /// Whether to use the slower, better method: it moves cuts to where they help most, and drops the beams at the ends
+    /// of lines that fit their line worst.
     pub refine: bool,
     /// Condition that ends the joining of lines.
     pub stop: StopCriterion,
@@ -37,8 +37,8 @@ pub struct Settings {
 /// Condition that ends the joining of lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum StopCriterion {
-    /// Joining ends when one line less would explain the scan worse than noise does. Points more than one meter apart
-    /// are never joined; the paper uses this distance for real scans.
+    /// Joining ends when the next join would increase the error by more than noise explains. Points more than one meter
+    /// apart are never joined; the paper uses this distance for real scans.
     Likelihood,
     /// Joining ends when at most `max` lines are left. Points farther apart than this number of meters are never
     /// joined. For comparisons at equal numbers of lines.
@@ -59,7 +59,8 @@ pub struct LineFinder {
     /// Beams that have a range. `beams` has their indices.
     rays: Box<[Ray]>,
     beams: Box<[u16]>,
-    /// Index after the last ray of each group. Neighbors in a group are near enough to each other to be on one line.
+    /// Index after the last ray of each group. Neighboring rays of a group are so near to each other that they may be
+    /// on one line.
     ends: Box<[u16]>,
     /// Memory for estimating the noise.
     steps: Box<[[f64; 2]]>,
@@ -143,8 +144,8 @@ impl LineFinder {
     }
 
     /// Returns the standard deviation of a range in meters, at least that of rounding to the unit of `scan`. It is
-    /// computed from the distances of each beam from the lines through its neighbors, and through the beams after
-    /// these. Edges and corners do not change their median.
+    /// computed from the distance of each beam from the line through its two neighbors, and from the line through the
+    /// beams next to those neighbors. Edges and corners hardly change the median of these distances.
     fn noise(&mut self, groups: usize, scan: &Scan) -> f64 {
         let (mut count, mut first) = (0, 0);
         let steps = self.steps.as_flattened_mut();
@@ -166,8 +167,8 @@ impl LineFinder {
         let minimum = f64::from(scan.unit_um) * 1e-6 / 12_f64.sqrt();
         let Some(steps) = steps.get_mut(..count).filter(|steps| !steps.is_empty()) else { return minimum };
         let (_, median, _) = steps.select_nth_unstable_by(count / 2, f64::total_cmp);
-        // The median of the absolute value is .6745 deviations; that of one range and the mean of two others has the
-        // variance 1 + 1/2.
+        // The median of the absolute value is .6745 standard deviations. The difference between one range and the mean
+        // of two others has the variance 1 + 1/2.
         (*median / (0.6745 * 1.5_f64.sqrt())).max(minimum)
     }
 
@@ -196,14 +197,14 @@ impl LineFinder {
     }
 }
 
-/// Number of parameters of a line: its two numbers, and the cut to the next line, which counts twice, as in the
-/// criterion of Zhang and Siegmund (2007) for change points.
+/// Number of parameters of a line. They are its two numbers and the cut to the next line. The cut counts twice, as in
+/// the criterion of Zhang and Siegmund (2007) for change points.
 const PARAMETERS_PER_LINE: f64 = 4.0;
-/// Maximum distance of neighboring points of one line in meters. PLE uses it for real scans.
+/// Maximum distance between neighboring points of one line, in meters. PLE uses it for real scans.
 const MAX_GAP_M: f64 = 1.0;
 /// Cost of dropping a beam if there are more lines than allowed, as an error in meters. On logs of four sensors (aces,
-/// Freiburg, Intel, Orebro: `cargo bench --bench perception`), ten vertices then cover more beams than those of RANSAC,
-/// and fit better.
+/// Freiburg, Intel, Orebro: `cargo bench --bench perception`), ten vertices then cover more beams than ten vertices of
+/// RANSAC, and fit better.
 const BEAM_LOSS_M: f64 = 0.2;
 /// Maximum number of beams between neighboring lines.
 const MAX_NEIGHBOR_GAP: f32 = 4.5;
@@ -254,8 +255,8 @@ fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> 
 }
 
 /// Writes the corners of neighboring lines that are certainly not parallel, and that meet between the last beam of the
-/// first line and the first beam of the second one. Both lines have about the same range there, so no object is between
-/// them.
+/// first line and the first beam of the second one. At such a corner, both lines have about the same range, so no
+/// object is between them.
 fn corners(out: &mut Lines, pose: &Pose, step: f32) {
     let count = usize::from(out.count);
     // In a full revolution, the last line is a neighbor of the first one.

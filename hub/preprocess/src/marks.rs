@@ -13,7 +13,7 @@ use crate::search::position;
 pub struct Settings {
     /// Minimum level of a beam of a mark, for scanners whose intensities are reflector levels. 0 counts as 1.
     pub min_level: u8,
-    /// Minimum intensity for other scanners. 0 counts as 1. `None`: other scanners have no marks.
+    /// Minimum intensity of a beam of a mark, for other scanners. 0 counts as 1. `None`: other scanners have no marks.
     pub level: Option<u16>,
     /// Maximum difference between the ranges of neighboring beams in a mark, in mm.
     pub max_range_step_mm: u16,
@@ -65,7 +65,7 @@ impl MarkDetector {
         self.settings.level.map(|level| level.max(1)).ok_or(Marks::UNAVAILABLE | Marks::NO_LEVEL)
     }
 
-    /// Writes the marks, whose beams have at least the intensity `min_intensity`.
+    /// Writes the marks. Each beam of a mark has at least the intensity `min_intensity`.
     fn find(&self, scan: &Scan, min_intensity: u16, out: &mut Marks) {
         let (mut count, mut overflow) = (0, false);
         let mut push = |open: &OpenMark| match out.mark_array.get_mut(count) {
@@ -117,7 +117,8 @@ fn first_bright(intensities: &Intensities<'_>, from: usize, min_intensity: u16) 
     }
 }
 
-/// Mark that may get more beams: sums over its beams. They are integers, so that they are the same on every machine.
+/// Mark that may get more beams: sums over its beams. The sums are integers, so that they are the same on every
+/// machine.
 #[derive(Clone, Copy, Default)]
 struct OpenMark {
     /// Sum of the weights w.
@@ -158,7 +159,8 @@ impl OpenMark {
     }
 
     fn mark(&self, scan: &Scan) -> Mark {
-        // Integers round halves the same way on every machine. They are wide enough not to overflow with any scan.
+        // Integer arithmetic rounds halves the same way on every machine. The integers are so wide that no scan can
+        // overflow them.
         let [first_udeg, step_udeg] =
             [scan.first_angle, scan.step].map(|angle| (1e6 * in_degrees(angle)).round() as i128);
         let weight = 1000 * i128::from(self.weight);

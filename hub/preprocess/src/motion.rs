@@ -1,5 +1,5 @@
-//! Estimation of a robot's motion from scan to scan. Corners and lines of both scans are matched first, and then all
-//! beams, each of which should end on a surface of the reference scan.
+//! Estimation of a robot's motion from scan to scan. First, the corners and lines of both scans are matched. Then all
+//! beams are matched: each beam should end on a surface of the reference scan.
 //!
 //! The method is point-to-line matching as in Censi: "An ICP variant using a point-to-line metric" (ICRA 2008), with
 //! the covariance of Censi: "An accurate closed-form estimate of ICP's covariance" (ICRA 2007). Surfaces are the line
@@ -58,7 +58,8 @@ pub struct MotionEstimator {
     /// Stamp of the last scan, in ns.
     stamp_ns: u64,
     velocity: Velocity,
-    /// Velocity of the last step, if it was rejected because it differs too much from the one before.
+    /// Velocity of the last step, if that step was rejected because its velocity differs too much from the velocity
+    /// before.
     rejected: Option<Velocity>,
     undistorted: UndistortedScan,
     finder: LineFinder,
@@ -73,11 +74,11 @@ struct OdometryState {
     of_origin: Square,
     /// Position at the last scan, in the frame of the reference scan.
     last: Pose2,
-    /// Covariance of `last` by the last scan's own noise; `None` if the last scan is the reference.
+    /// Covariance of `last` that the noise of the last scan causes. `None` if the last scan is the reference.
     extra_covariance: Option<Square>,
-    /// Covariance of `last` by all causes.
+    /// Covariance of `last` from all causes.
     of_last: Square,
-    /// Whether the surroundings left a direction of `last` open.
+    /// Whether there is a direction in which the surroundings do not define `last`.
     is_degenerate: bool,
     /// Whether the sum of all steps contains a degenerate one.
     is_open: bool,
@@ -186,8 +187,8 @@ impl MotionEstimator {
         }
     }
 
-    /// Corrects the current scan by the velocity of the `first` step, which the robot made in `seconds`, and repeats
-    /// the match until velocity and step agree. Returns the position, the step, and the remaining offset of the beams.
+    /// Corrects the current scan by the velocity of the `first` step, which took the robot `seconds`. Repeats the match
+    /// until velocity and step agree. Returns the position, the step, and the remaining offset of the beams.
     fn correct(
         &mut self,
         scan: &Scan,
@@ -204,8 +205,8 @@ impl MotionEstimator {
             let offset = change.offset(scan);
             let is_again = self.rejected.is_some_and(|rejected| rejected.difference(&measured).is_possible());
             if !change.is_possible() && !is_again {
-                // No robot changes its velocity that fast: the step is an error, or the sensor was carried. If the next
-                // step agrees, this one was right.
+                // No robot changes its velocity that fast. Either the step is an error, or a person carried the sensor.
+                // If the next step agrees with this step, this step was right.
                 self.rejected = Some(measured);
                 return (self.stop_or_continue(scan, odometry, found), offset);
             }
@@ -229,9 +230,9 @@ impl MotionEstimator {
         }
     }
 
-    /// Decides after a rejected velocity whether the robot stands, because the sensor was carried, or continues as
-    /// before, because the `found` step is an error. The scan fits better with the right velocity, so both are tried.
-    /// Returns the position and the step.
+    /// Decides after a rejected velocity between two cases. If a person carried the sensor, the robot stands. If the
+    /// `found` step is an error, the robot continues as before. The scan fits better with the right velocity, so both
+    /// velocities are tried. Returns the position and the step.
     fn stop_or_continue(
         &mut self,
         scan: &Scan,
@@ -264,8 +265,8 @@ impl MotionEstimator {
         self.current.take(&self.pose, scan, &self.lines);
     }
 
-    /// Returns the robot's position and its step, if they are within the limits. The search starts at `begin`, if that
-    /// is known.
+    /// Returns the robot's position and its step, if they are within the limits. The search starts at `begin`, if
+    /// `begin` is known.
     fn find(&mut self, odometry: &OdometryState, begin: Option<Pose2>) -> Option<(Match, Pose2)> {
         let settings = self.settings;
         let begin =
@@ -308,7 +309,8 @@ fn write(
     out: &mut Motion,
 ) {
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
-    // Both scans have their own noise. The noise of the reference moves both positions alike, so it counts only once.
+    // Both scans have their own noise. The noise of the reference scan moves both positions by the same amount, so it
+    // counts only once.
     let reference_covariance = odometry.extra_covariance.unwrap_or(found.of_reference);
     let mut covariance = covariance::of_step(&found.own, &reference_covariance, &odometry.last, step);
     add_uncertainty(&mut covariance, odometry, found, step, offset);
@@ -334,8 +336,9 @@ fn write(
     }
 }
 
-/// Returns the covariance of the position that `step` leads to, in the frame of the reference scan. All positions in
-/// that frame are found independently of each other, so the covariances of the steps between them are not summed.
+/// Returns the covariance of the position to which `step` leads, in the frame of the reference scan. Each position in
+/// that frame is found without the other positions, so the covariances of the steps between the positions are not
+/// summed.
 fn covariance_in_reference(
     odometry: &OdometryState,
     found: &Match,
@@ -362,24 +365,24 @@ fn add_uncertainty(
     covariance::add_outer(covariance, offset, 1.0);
 }
 
-/// Distortion of a scan that is corrected, in meters from its first to its last beam, and change of the distortion
-/// after which the correction is repeated. A repeated correction adds the noise of the last step.
+/// Minimum distortion of a scan that is corrected, in meters from its first to its last beam. It is also the change of
+/// the distortion from which the correction is repeated. A repeated correction adds the noise of the last step.
 const MIN_DISTORTION_M: f64 = 0.003;
 const MIN_DISTORTION_CHANGE_M: f64 = 0.01;
-/// Maximum number of corrections after a change of velocity. Each one leaves less than half of the error.
+/// Maximum number of corrections after a change of velocity. Each correction leaves less than half of the error.
 const MAX_CORRECTIONS: u8 = 4;
 /// Time between two scans from which a velocity is computed, in seconds.
 const MIN_INTERVAL_S: f64 = 0.005;
 const MAX_INTERVAL_S: f64 = 1.0;
-/// Distance from the reference scan at which another one takes its place. Up to there, the robot sees its surfaces from
-/// about the same side.
+/// Distance from the reference scan at which another scan becomes the reference. Up to this distance, the robot sees
+/// the surfaces of the reference scan from about the same side.
 const MAX_REFERENCE_DISTANCE_M: f64 = 0.15;
 const MAX_REFERENCE_ANGLE_RAD: f64 = 0.15;
 /// Minimum share of readings on surfaces of the reference scan. With less, another scan becomes the reference.
 const MIN_REFERENCE_OVERLAP: f64 = 0.5;
 
-/// Returns the position at which the matching starts: the one that most of a few sampled beams agree with. Corners and
-/// lines that may be the same in both scans propose the positions.
+/// Returns the position at which the matching starts. Corners and lines that may be the same in both scans propose
+/// positions. The position with which most of a few sampled beams agree is returned.
 fn initial_guess(
     reference: &PreparedScan,
     current: &PreparedScan,
@@ -503,10 +506,10 @@ fn turned(from: f64, to: f64) -> f64 {
 const SAMPLED_BEAMS: usize = 48;
 /// Maximum number of positions that are tried.
 const MAX_TRIES: usize = 64;
-/// Maximum distance of a beam's end from a surface, in standard deviations, and in addition to that in meters.
+/// Maximum distance of a beam's end from a surface: a number of standard deviations plus a distance in meters.
 const MAX_DEVIATIONS: f64 = 3.0;
 const EXTRA_DISTANCE_M: f64 = 0.01;
-/// Maximum difference of the opening of equal corners: 5 degrees.
+/// Maximum difference between the openings of two equal corners: 5 degrees.
 const MAX_OPENING_DIFFERENCE_RAD: f64 = 0.09;
 /// Minimum number of beams of a line whose direction is reliable.
 const MIN_LINE_BEAMS: u16 = 10;

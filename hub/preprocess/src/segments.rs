@@ -10,8 +10,8 @@ use crate::directions::{Directions, exact_angle};
 
 /// Cuts the foreground of one sensor into segments.
 ///
-/// Points are computed in 64-bit floating point and rounded to mm: its four basic operations and the square root are
-/// the same on every machine.
+/// Points are computed in 64-bit floating point and rounded to mm. The four basic operations and the square root of
+/// this format have the same results on every machine.
 pub struct Segmenter {
     pose: Pose,
     directions: Directions,
@@ -35,7 +35,7 @@ struct Points {
 struct StepLimit {
     /// 2 (1 - cos step), of the law of cosines.
     spread: f64,
-    /// Maximum distance of two points of one surface, per mm of range.
+    /// Maximum distance between two points of one surface, in mm per mm of range.
     slope: f64,
 }
 
@@ -43,8 +43,8 @@ struct StepLimit {
 const MIN_INCIDENCE_DEG: f64 = 10.0;
 /// Additional distance for the noise of two ranges, in mm.
 const NOISE_MARGIN_MM: f64 = 15.0;
-/// Maximum distance of a point of the previous scan that supports a single beam, in mm. A person who runs at 3 m/s
-/// moves by this distance in one revolution of a scanner at 10 Hz.
+/// Maximum distance of a single beam's point from a point of the previous scan that supports it, in mm. It is the
+/// distance that a person at 3 m/s runs in one revolution of a scanner at 10 Hz.
 const MAX_SUPPORT_DISTANCE_MM: f64 = 300.0;
 
 impl Segmenter {
@@ -65,7 +65,7 @@ impl Segmenter {
     ///
     /// Two neighboring foreground beams belong to one segment if their points are as near to each other as those of a
     /// surface seen at 10 degrees. The limit is r sin(step) / sin(10 degrees - step) + 15 mm, where r is the range of
-    /// the first beam. The step is the one between the exact angles, if the scan has them.
+    /// the first beam. If the scan has exact angles, step is the difference between them.
     ///
     /// A segment is supported if it has several beams, or if its point is at most 0.3 m from a foreground point of the
     /// previous scan that was passed to this function or to [`pass`](Self::pass).
@@ -159,7 +159,7 @@ impl Segmenter {
         (range_mm - next_mm) * (range_mm - next_mm) + range_mm * next_mm * step.spread <= limit_mm * limit_mm
     }
 
-    /// Adapts the directions and the step to scans such as `scan`.
+    /// Adapts the directions and the step to scans with the angles of `scan`.
     fn fit(&mut self, scan: &Scan) {
         if self.directions.fit(&self.pose, scan) {
             self.step_limit = StepLimit::of(scan.step);
@@ -168,7 +168,7 @@ impl Segmenter {
 }
 
 impl Points {
-    /// Adds a point. There is memory for one of each beam.
+    /// Adds a point. There is memory for one point of each beam.
     fn add(&mut self, point: (f64, f64)) {
         if let Some(slot) = self.points.get_mut(self.count) {
             *slot = point;

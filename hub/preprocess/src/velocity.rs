@@ -53,28 +53,28 @@ impl Velocity {
         Velocity { x: other.x - self.x, y: other.y - self.y, yaw: other.yaw - self.yaw }
     }
 
-    /// Moves this velocity a part of the way toward the `measured` one, which has noise.
+    /// Moves this velocity a part of the way toward the `measured` velocity, which has noise.
     pub(crate) fn approach(&mut self, measured: &Velocity) {
         let Velocity { x, y, yaw } = self.difference(measured);
         (self.x, self.y, self.yaw) =
             (self.x + FILTER_GAIN * x, self.y + FILTER_GAIN * y, self.yaw + FILTER_GAIN * yaw);
     }
 
-    /// Returns whether a robot with this velocity moves by more than `limit_m`, or turns by more than a fifth of it in
-    /// radians, while `scan` is measured.
+    /// Returns whether a robot with this velocity moves by more than `limit_m`, or turns by more than a fifth of that
+    /// number in radians, while `scan` is measured.
     pub(crate) fn distorts(&self, scan: &Scan, limit_m: f64) -> bool {
         let [first_s, last_s] = times(scan);
         let span_s = last_s - first_s;
         span_s * self.x.hypot(self.y) > limit_m || span_s * self.yaw.abs() > limit_m / WALL_DISTANCE_M
     }
 
-    /// Returns whether a robot can change its velocity by this one from one scan to the next.
+    /// Returns whether a robot can change its velocity by this difference from one scan to the next.
     pub(crate) fn is_possible(&self) -> bool {
         self.x.hypot(self.y) < MAX_CHANGE_M_S && self.yaw.abs() < MAX_CHANGE_RAD_S
     }
 
-    /// Returns the mean offset of the beams of `scan`, if they were corrected by a velocity that differs from the true
-    /// one by this velocity.
+    /// Returns the mean offset of the beams of `scan`, if the beams were corrected by a velocity that differs from the
+    /// true velocity by this difference.
     pub(crate) fn offset(&self, scan: &Scan) -> [f64; 3] {
         let [first_s, last_s] = times(scan);
         [self.x, self.y, self.yaw].map(|speed| speed * (first_s + last_s) / 2.0)
@@ -151,7 +151,7 @@ impl UndistortedScan {
     }
 
     /// Computes `scan` without the distortion by a sensor that moves with `velocity`. Beams have exact angles. If two
-    /// are measured in the same direction, the nearer one remains.
+    /// beams were measured in the same direction, the nearer one remains.
     pub(crate) fn compute(&mut self, scan: &Scan, velocity: &Velocity) -> &Scan {
         let count = scan.beams().min(self.beams);
         let [first_s, last_s] = times(scan);
@@ -208,7 +208,7 @@ impl UndistortedScan {
 /// Returns the times of the first and the last beam, in seconds after the stamp of `scan`.
 pub(crate) fn times(scan: &Scan) -> [f64; 2] {
     let last = scan.beams().saturating_sub(1);
-    // The last beam is measured before others if there are several revolutions.
+    // If a scan takes several revolutions, the last beam is not measured last.
     let turns = usize::from(scan.turns.max(1));
     let of_turns = (last + 1).saturating_sub(turns)..=last;
     let latest = of_turns.map(|beam| scan.beam_ns(beam)).max().unwrap_or(0);
@@ -222,15 +222,15 @@ pub(crate) fn is_whole(beams: usize, step: f64) -> bool {
 
 /// Value of a beam without a reading in an undistorted scan.
 const NO_RETURN: u16 = u16::MAX;
-/// Half the turn of a step below which the arc counts as its chord, in radians.
+/// Limit for half of the turn of a step, in radians. Below the limit, the arc counts as its chord.
 const MIN_ARC_RAD: f64 = 1e-6;
 /// Part of the way to the measured velocity, per scan.
 const FILTER_GAIN: f64 = 0.3;
 /// Maximum change of velocity from one scan to the next, in m/s. Robots brake and turn less hard.
 const MAX_CHANGE_M_S: f64 = 2.0;
 const MAX_CHANGE_RAD_S: f64 = 6.0;
-/// Distance of walls in meters for comparing turns with motion: a turn by 1 rad moves the points of such a wall by this
-/// distance.
+/// Assumed distance of walls in meters, for comparing turns with motion. A turn by 1 rad moves the points of a wall at
+/// this distance by this distance.
 const WALL_DISTANCE_M: f64 = 5.0;
 
 #[cfg(test)]

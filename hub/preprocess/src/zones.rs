@@ -34,13 +34,15 @@ pub struct Settings {
     pub body_mask: Vec<Sector>,
     /// Distance in mm by which a circle is extended along every beam that meets it.
     pub margin_mm: u16,
-    /// Number of beams that must be inside for a scan to violate a zone; 0 counts as 1.
+    /// Number of beams that must end inside a zone for a scan to violate the zone. 0 counts as 1.
     pub min_beams: u16,
     /// Number of consecutive scans that must violate a zone; 0 counts as 1.
     pub min_scans: u16,
-    /// Maximum share of invalid beams among those through the largest circle. With more, the verdict is unknown.
+    /// Maximum share of invalid beams among the beams through the largest circle. If the share is larger, the verdict
+    /// is unknown.
     pub max_invalid: f64,
-    /// Whether objects between a sensor outside a circle and the circle's near side count as outside.
+    /// Whether an object between the sensor and the near side of a circle counts as outside, if the sensor is outside
+    /// the circle.
     pub exact: bool,
     /// Whether a beam without a return has met nothing. Otherwise, it is invalid.
     pub no_return_is_far: bool,
@@ -79,9 +81,10 @@ pub struct Warning {
 /// - Until `min_scans` scans have been seen since the start, a silence, a scan with too many invalid beams or a change
 ///   of the sensor's layout, the absence of a violation proves nothing. The verdict is unknown then, because clear
 ///   would be a guess.
-/// - A beam is relevant if one of its readings, in the scan's units and below its codes, can lie inside the largest
-///   circle and outside the robot's own body. All other beams count neither as invalid nor in the total.
-/// - If fewer beams are relevant than a violation takes, no zone can ever be violated, so the verdict is unknown.
+/// - A beam is relevant if it can have a reading inside the largest circle and outside the robot's own body. The
+///   reading is in the scan's units and below the scan's codes. All other beams count neither as invalid nor in the
+///   total.
+/// - If a violation takes more beams than are relevant, no zone can ever be violated, so the verdict is unknown.
 ///   Examples are an empty scan, a check without circles, a pose that is not finite, and a sensor that looks past the
 ///   largest circle.
 pub struct ZoneChecker {
@@ -90,9 +93,9 @@ pub struct ZoneChecker {
     table: Table,
     /// Number of scans since the start, a silence, a scan with too many invalid beams or a change of the layout.
     scan_count: u16,
-    /// Number of consecutive scans in which enough beams met something, for each circle.
+    /// For each circle, number of consecutive scans in which enough beams met something inside.
     streaks: [u16; MAX_ZONES],
-    /// Whether scans may be older than they seem.
+    /// Whether scans may be older than their stamps.
     is_backlogged: bool,
 }
 
@@ -109,8 +112,8 @@ impl ZoneChecker {
         }
     }
 
-    /// Writes the result for `scan` into `out`, every byte of it. Only the first scan of a layout costs the computation
-    /// of a table.
+    /// Writes the result for `scan` into `out`, every byte of it. A table is computed only for the first scan of a
+    /// layout.
     pub fn update(&mut self, scan: &Scan, out: &mut Zones) {
         let layout = Layout::of(scan, self.table.max_beams());
         if self.table.layout != layout {
@@ -133,15 +136,15 @@ impl ZoneChecker {
         out.invalid_beams = invalid;
         self.write_circles(&inside, out);
         if !is_valid {
-            // The scan may have ended the streak of a zone although its object is still there.
+            // The scan may have ended the run of violations of a zone although the object is still there.
             self.scan_count = 0;
         }
     }
 
-    /// Checks an incomplete scan with as many beams, `count`, and the same unit, `unit_um`, as the last one. `ranges`
-    /// are its first ranges. For a scan with exact `angles`, they are all of its ranges, and a nearer point may still
-    /// replace one of them. Returns the zone that the scan violates if no more points arrive, or `None`. Before the
-    /// first complete scan, the result is `None`.
+    /// Checks an incomplete scan of `count` beams with the unit `unit_um`. Both values must be the same as in the last
+    /// scan. `ranges` are the first ranges of the scan. For a scan with exact `angles`, `ranges` are all ranges, and a
+    /// nearer point may still replace one of them. Returns the zone that the scan violates if no more points arrive, or
+    /// `None`. Before the first complete scan, the result is `None`.
     pub fn check_partial(
         &mut self,
         count: usize,
@@ -172,8 +175,8 @@ impl ZoneChecker {
         self.write_circles(&[0; MAX_ZONES], out);
     }
 
-    /// Sets whether scans may be older than they seem from now on. Points of such a scan in the smallest circle count.
-    /// Otherwise, the verdict is unknown.
+    /// Sets whether scans may be older than their stamps from now on. For a scan that may be older, points inside the
+    /// smallest circle count. Without these points, the verdict is unknown.
     pub fn set_backlogged(&mut self, is_backlogged: bool) {
         self.is_backlogged = is_backlogged;
     }
@@ -373,8 +376,8 @@ impl Table {
         (from.max(beam.own), in_units(hi_mm as f64, unit_mm))
     }
 
-    /// Returns the number of relevant beams without a reading. A beam that was not measured counts if nothing was
-    /// measured over more than two spacings of the sensor's own points, which are `spacing` radians.
+    /// Returns the number of relevant beams without a reading. A beam that was not measured counts if it lies in a gap
+    /// of more than two spacings between points. The sensor's own points have a spacing of `spacing` radians.
     fn invalid_beams(&self, ranges: &[u16], spacing: f32) -> u16 {
         let Layout { valid_to, no_return, beyond, .. } = self.layout;
         let is_invalid = |value: u16| {
@@ -390,7 +393,7 @@ impl Table {
         if is_complete { invalid } else { invalid - self.unmeasured_between(ranges, spacing) }
     }
 
-    /// Returns the number of relevant beams that were not measured, but have measured ones near enough on both sides.
+    /// Returns the number of relevant beams that were not measured, but have measured beams near enough on both sides.
     fn unmeasured_between(&self, ranges: &[u16], spacing: f32) -> u16 {
         let is_measured = |value: &u16| *value != Scan::NOT_MEASURED;
         let (Some(first), Some(last)) =
@@ -420,8 +423,8 @@ impl Table {
         unmeasured
     }
 
-    /// Returns the points inside the circles for `ranges`, which are the first ones of a scan of the table's layout. If
-    /// there are exact `angles`, the points are computed from them.
+    /// Returns the points inside the circles for `ranges`, which are the first ranges of a scan with the table's
+    /// layout. If there are exact `angles`, the points are computed from these angles.
     fn hits(&mut self, ranges: &[u16], angles: &[f32]) -> ZoneHits {
         if !angles.is_empty() {
             return self.exact_hits(ranges, angles);
@@ -431,8 +434,8 @@ impl Table {
         ZoneHits { inside: std::array::from_fn(|zone| self.inside[zone].count(ranges, shortest)), nearest }
     }
 
-    /// Returns the points inside the circles of a scan with exact angles. Only points that are near enough to be inside
-    /// a circle, or the nearest one, are computed.
+    /// Returns the points inside the circles of a scan with exact angles. A point is computed only if it is so near
+    /// that it may be inside a circle or be the nearest point.
     fn exact_hits(&self, ranges: &[u16], angles: &[f32]) -> ZoneHits {
         let unit_mm = self.layout.unit_mm();
         let (sx, sy) = self.sensor_mm();
@@ -470,8 +473,8 @@ impl Table {
         zone_hits
     }
 
-    /// Returns beam and distance in mm of a point. `square` is the square of its distance minus that of the sensor's
-    /// distance, in device units.
+    /// Returns the beam of a point, and the distance of the point in mm. `square` is the square of the point's distance
+    /// minus the square of the sensor's distance, in device units.
     fn at_distance(&self, beam: usize, square: f64) -> (u16, u32) {
         let unit_mm = self.layout.unit_mm();
         let (sx, sy) = self.sensor_mm();
@@ -529,8 +532,8 @@ fn in_units(mm: f64, unit_mm: f64) -> u64 {
 /// Maximum rounding error of a quotient.
 const ROUNDING_ERROR: f64 = 1e-6;
 
-/// Tolerance in mm within which a value counts as a whole number. Rounding is never toward clear, but an object exactly
-/// on a circle is outside, whatever the errors of sine and cosine.
+/// Tolerance in mm within which a value counts as a whole number. Rounding never makes a verdict clear. But an object
+/// exactly on a circle is outside, regardless of the errors of sine and cosine.
 const ROUNDING_MM: f64 = 1e-6;
 
 fn floor(value: f64) -> f64 {
@@ -574,8 +577,8 @@ impl Nearest {
         }
     }
 
-    /// Returns the beam whose point is nearest to the center, the first one of several, and the square of its distance
-    /// minus that of the sensor's distance: r^2 + 2qr, in device units.
+    /// Returns the beam whose point is nearest to the center, the first beam if there are several, and the square of
+    /// the point's distance minus the square of the sensor's distance: r^2 + 2qr, in device units.
     fn find(&mut self, ranges: &[u16]) -> Option<(usize, f64)> {
         self.bound(ranges);
         let bounds = &self.bounds[..ranges.len().div_ceil(BLOCK_LEN)];
@@ -629,7 +632,7 @@ impl Nearest {
     }
 }
 
-/// Number of beams of a block: few enough that their directions differ little, and enough that there are few blocks.
+/// Number of beams of a block: so few that their directions differ little, and so many that there are few blocks.
 const BLOCK_LEN: usize = 32;
 
 /// Ranges `from..from + len` of each beam in device units. One comparison of integers tests a value.
@@ -638,7 +641,7 @@ struct Spans {
     /// Minimum value; the maximum of the type for beams that do not exist.
     from: Box<[u16]>,
     len: Box<[u16]>,
-    /// First value of each block of beams from which on no value counts.
+    /// For each block of beams, the lowest value from which no value counts.
     ends: Box<[u16]>,
 }
 

@@ -118,7 +118,7 @@ impl LdSimulator {
     }
 
     /// Returns point number `point` since the head started to rotate, without noise. The point must not be before the
-    /// last [`set_speed`](Self::set_speed). Returns `None` for a recording, which has no true points.
+    /// last [`set_speed`](Self::set_speed). For a recording, the range is `None`.
     pub fn truth(&mut self, point: u64) -> TruePoint {
         let (at_ns, clockwise_deg) = self.time_and_angle(point);
         let range_mm = match &mut self.source {

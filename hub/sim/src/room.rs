@@ -289,7 +289,8 @@ pub struct LabeledScan {
 /// long afterwards it counts as foreground.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BeamTarget {
-    /// A surface that has existed since the start of the world, or that a removed object has uncovered.
+    /// A surface of the surroundings at the start of the world, or another surface that is not nearer than the previous
+    /// target.
     Static {
         /// Time from which on the beam hits this surface: 0, or the time at which an object in front of the surface was
         /// removed. In the second case, the surface is old, but new to the beam. People who pass do not change this

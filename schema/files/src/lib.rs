@@ -1,5 +1,5 @@
-//! Files that a user names: bounded reads of regular files, and outputs that are complete or absent. Directories are
-//! opened component by component, so that no other user can redirect a path.
+//! Files that a user names: reads of regular files up to a maximum length, and output files that are complete or
+//! absent. Directories are opened component by component, so that no other user can redirect a path.
 
 #![forbid(unsafe_code)]
 

@@ -2,11 +2,13 @@
 //! its files here.
 //!
 //! A file that is written at once is complete or absent: [`OutputFile`] has a random name until it is complete. A file
-//! that grows has its own name from the start, see [`Target::create`], so that a kill loses nothing.
+//! that grows has its final name from the start, see [`Target::create`], so that the file survives if the process is
+//! killed.
 //!
 //! - The last component of a path is never a link, and never a device, a pipe or a socket.
-//! - A link on the way is followed, unless it belongs to another user and lies in a sticky directory, such as /tmp.
-//! - An existing file is replaced only by force.
+//! - A link among the other components is followed, unless it belongs to another user and lies in a sticky directory,
+//!   such as /tmp.
+//! - An existing file is replaced only if `force` is set.
 
 use std::ffi::OsString;
 use std::fs::{self, File, Permissions};
@@ -45,8 +47,8 @@ pub fn create_directory(path: &Path) -> Result<(), Failure> {
     open_directory(path, path, Some(Mode::RWXU | Mode::RWXG | Mode::RWXO)).map(drop)
 }
 
-/// A file that is written as a whole. Until [`commit`](Self::commit), it has a random name in the directory of its
-/// target and mode 0600. If it is dropped before, it is removed.
+/// A file that is written as a whole. Until [`commit`](Self::commit), it has mode 0600 and a random name in the
+/// directory of its target. If it is dropped before `commit`, the file is removed.
 #[derive(Debug)]
 pub struct OutputFile {
     // Dropping it removes the file, which needs the open directory.
@@ -87,7 +89,7 @@ impl OutputFile {
                 // Only root may give a file away. This clears some permissions, so they are set afterwards.
                 Some(old) => match fchown(file.as_file(), Some(old.st_uid), Some(old.st_gid)) {
                     Ok(()) => old.st_mode & 0o777,
-                    // The permissions were meant for another owner or group.
+                    // These permissions were meant for another owner or group.
                     Err(_) => old.st_mode & 0o600,
                 },
                 None => PUBLIC_MODE & !umask(),
@@ -247,7 +249,7 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
     });
     let error = match reached {
         Ok(walk) => return Ok(walk.into_parts().0),
-        // Usually it is this directory, and the message needs no second path.
+        // Usually the failed path is this directory, and the message needs no second path.
         Err(WalkError::System(failed_at, error)) if failed_at == directory => error.into(),
         Err(WalkError::System(failed_at, error)) => {
             io::Error::other(format!("{}: {}", failed_at.display(), io::Error::from(error)))
@@ -273,13 +275,13 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
         }
     };
     let failure = unwritable(path, &error);
-    // A missing directory is not the reason.
+    // The reason is not a missing directory.
     let hint =
         if make.is_some() { "name a directory that can be written to" } else { &failure.hint }.to_owned();
     Err(Failure { hint, ..failure })
 }
 
-/// Permissions of a new file before the umask removes some.
+/// Permissions of a new file. The umask removes some of them.
 pub const PUBLIC_MODE: u32 = 0o666;
 /// Permissions of a new file that only this user may read.
 pub const PRIVATE_MODE: u32 = 0o600;

@@ -1,4 +1,4 @@
-//! Walk to a directory, which opens its path component by component, so that no other user can substitute another
+//! Walk to a directory. The walk opens the path component by component, so that no other user can substitute another
 //! directory.
 
 use std::ffi::{OsStr, OsString};
@@ -11,7 +11,7 @@ use rustix::io::Errno;
 
 /// An open directory, and the path by which it was reached.
 pub struct PathWalk {
-    /// User who must own directories and whose links are followed.
+    /// User who must own the directories. Links of this user are followed.
     user: u32,
     policy: LinkPolicy,
     /// Last component that was opened.
@@ -36,7 +36,7 @@ pub enum LinkPolicy {
 pub enum WalkError {
     /// The system's error for this path.
     System(PathBuf, Errno),
-    /// Another user may have put this path there. The text continues a sentence that begins with the path.
+    /// Another user may have put this path there. The text is the rest of a sentence that begins with the path.
     Untrusted(PathBuf, String),
     /// The directory belongs to another user. Path, owner and mode.
     Foreign(PathBuf, u32, u32),
@@ -231,5 +231,5 @@ const OPEN_DIRECTORY: OFlags = OFlags::DIRECTORY.union(OFlags::NOFOLLOW).union(O
 const OTHERS_WRITE: u32 = 0o022;
 /// Mode bit with which only owners may rename and remove the files in a directory (inode(7)).
 pub const STICKY: u32 = 0o1000;
-/// Maximum number of links, which is that of the kernel (path_resolution(7)).
+/// Maximum number of links on a path, the same as in the kernel (path_resolution(7)).
 const MAX_LINKS: usize = 40;

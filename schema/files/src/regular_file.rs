@@ -10,8 +10,8 @@ use rustix::fs::OFlags;
 
 use scanhub_schema::{Failure, Kind};
 
-/// Maximum length of a configuration, a world or a model in bytes: many times the length of real files. The parsed form
-/// needs a hundred times the memory.
+/// Maximum length of a configuration, a world or a model, in bytes. It is many times the length of real files. The
+/// parsed form needs a hundred times as much memory.
 pub const MAX_FILE_BYTES: u64 = 512 << 10;
 
 /// Opens the regular file at `path`, without waiting.
@@ -52,7 +52,7 @@ pub fn read_text(path: &Path, max_bytes: u64) -> io::Result<String> {
         .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is not UTF-8 text"))
 }
 
-/// Returns everything up to the end of `input`.
+/// Returns the bytes of `input` up to its end.
 ///
 /// # Errors
 ///

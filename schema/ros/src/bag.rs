@@ -29,7 +29,8 @@ pub struct BagWriter {
 #[derive(Clone, Copy, Debug)]
 struct Transforms {
     channel: u16,
-    /// Number of the next message, and its minimum time. The latest message must be the one with the most poses.
+    /// Number of the next message of poses, and its minimum time. The message with the most poses must be the latest
+    /// one.
     number: u32,
     min_ns: u64,
 }
@@ -150,7 +151,7 @@ macro_rules! offered {
     };
 }
 
-/// A player offers this quality of service, and it is compatible with every subscriber.
+/// A player offers the following quality of service, which is compatible with every subscriber.
 const SCAN_QOS: &str = offered!(5, 2);
-/// Subscribers to transforms request this quality of service.
+/// Subscribers to transforms request the following quality of service.
 const LATCHED_QOS: &str = offered!(1, 1);

@@ -10,8 +10,8 @@ pub fn verdict_message(message: &mut Vec<u8>, verdict: Verdict) {
     Cdr::begin(message).text(verdict.name());
 }
 
-/// Appends the diagnostics of `sensor` at `now_ns` (since 1970) to `message`. `status` is the last one of its hub, or
-/// `None` if no hub publishes it. `age_ns` is the age of the last scan.
+/// Appends the diagnostics of `sensor` at `now_ns` (since 1970) to `message`. `status` is the last status of the
+/// sensor, or `None` if no hub publishes its status. `age_ns` is the age of the last scan.
 pub fn diagnosis(
     message: &mut Vec<u8>,
     sensor: &str,
@@ -31,7 +31,7 @@ pub fn hub_diagnosis(message: &mut Vec<u8>, now_ns: u64, is_running: bool) {
     write(message, now_ns, level, ["hub", summary, ""], &[]);
 }
 
-/// Writes an array of one status.
+/// Writes a DiagnosticArray with one status.
 fn write(
     message: &mut Vec<u8>,
     now_ns: u64,

@@ -6,9 +6,9 @@ use scanhub_schema::{Header, Marks, Track, TrackState, Tracks, Verdict, Zones};
 use crate::BASE_FRAME;
 use crate::cdr::Cdr;
 
-/// Appends `zones` to `message` as a MarkerArray: thin discs around the robot's center, the largest one lowest. They
-/// are red if something is inside and otherwise green. All of them are gray if the verdict is unknown. A viewer removes
-/// them one second after the last message.
+/// Appends `zones` to `message` as a MarkerArray: thin discs around the robot's center, the largest one lowest. A disc
+/// is red if something is inside its zone, and otherwise green. All discs are gray if the verdict is unknown. A viewer
+/// removes the discs one second after the last message.
 pub fn zone_markers(message: &mut Vec<u8>, header: &Header, zones: &Zones) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(zones.zones().len() as u32);
@@ -31,8 +31,8 @@ pub fn zone_markers(message: &mut Vec<u8>, header: &Header, zones: &Zones) {
     }
 }
 
-/// Appends `marks` in frame `frame` to `message` as a MarkerArray: one list of spheres, or its removal if there are no
-/// marks. A viewer removes them one second after the last message.
+/// Appends `marks` in frame `frame` to `message` as a MarkerArray: a list of spheres, or the removal of the list if
+/// there are no marks. A viewer removes the spheres one second after the last message.
 pub fn mark_markers(message: &mut Vec<u8>, frame: &str, header: &Header, marks: &Marks) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(1);
@@ -52,8 +52,8 @@ pub fn mark_markers(message: &mut Vec<u8>, frame: &str, header: &Header, marks: 
 }
 
 /// Appends the people of `tracks` in the map `frame` to `message` as a MarkerArray: a column for each track that is not
-/// tentative, with its ID above, gray if the person is not seen now. A viewer removes them one second after the last
-/// message.
+/// tentative, with the ID of the track above. The column is gray if no sensor sees the person now. A viewer removes the
+/// columns one second after the last message.
 pub fn people_markers(message: &mut Vec<u8>, frame: &str, header: &Header, tracks: &Tracks) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(2 * established_tracks(tracks).count() as u32);
@@ -84,7 +84,7 @@ pub fn people_markers(message: &mut Vec<u8>, frame: &str, header: &Header, track
 }
 
 /// Appends the people of `tracks` in the map `frame` to `message` as a PoseArray: a pose for each track that is not
-/// tentative. Its direction is that in which the person walks, or the x axis if the person stands.
+/// tentative. The direction of a pose is the direction in which the person walks, or the x axis if the person stands.
 pub fn people_poses(message: &mut Vec<u8>, frame: &str, header: &Header, tracks: &Tracks) {
     let mut cdr = Cdr::begin(message);
     cdr.header(header.wall_ns, frame);

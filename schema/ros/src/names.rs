@@ -26,11 +26,11 @@ pub fn scan_topic(sensor: &str) -> String {
 /// Names of topics and frames.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RosNames {
-    /// Start of every topic: empty, or names that each follow a slash.
+    /// Start of every topic. It is empty, or has names with a slash before each name.
     namespace: String,
-    /// The part between the namespace and the topics of sensors, in the same form.
+    /// Part between the namespace and the name of a sensor, in the same form.
     prefix: String,
-    /// Frames by sensor, for sensors whose frame does not have their name.
+    /// Frames by sensor, for sensors whose frame is not called like the sensor.
     frames: Vec<(String, String)>,
 }
 
@@ -89,7 +89,8 @@ impl RosNames {
 }
 
 /// Appends the `poses` of the sensors on the robot, by their frames, to `message` as `tf2_msgs/msg/TFMessage`, with the
-/// stamp `stamp_ns` (since 1970). Pass all of them, because a late joiner gets only the last message of the topic.
+/// stamp `stamp_ns` (since 1970). Pass the poses of all sensors, because a late joiner gets only the last message of
+/// the topic.
 ///
 /// A sensor that is mounted upside down is rotated by half a turn around its x axis, then by its yaw around the robot's
 /// z. The angles of its scans then run in the other direction.
@@ -105,7 +106,7 @@ pub fn static_transforms(message: &mut Vec<u8>, stamp_ns: u64, poses: &[(String,
     }
 }
 
-/// Returns the quaternion x, y, z, w that rotates a direction in the sensor's frame into the robot's.
+/// Returns the quaternion x, y, z, w that rotates a direction from the sensor's frame to the robot's frame.
 fn rotation(pose: &Pose) -> [f64; 4] {
     let (sin, cos) = (pose.yaw_rad / 2.0).sin_cos();
     if pose.upside_down == 0 { [0.0, 0.0, sin, cos] } else { [cos, sin, 0.0, 0.0] }

@@ -2,8 +2,8 @@
 //! the quality of service, and attachments of messages. Its sources are docs/design.md, `liveliness_utils.cpp` and
 //! `attachment_helpers.cpp` of `rmw_zenoh`.
 //!
-//! The attachment is that of rmw_zenoh from 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6 (Kilted, Rolling) on. Before, it had
-//! names between the values.
+//! The attachment has the format of rmw_zenoh from 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6 (Kilted, Rolling) on. In
+//! earlier versions, names separated the values.
 
 use sha2::{Digest, Sha256};
 
@@ -93,7 +93,7 @@ pub struct Node {
     pub namespace: String,
     /// Letters, digits and `_`.
     pub name: String,
-    /// Release of the nodes that it is for.
+    /// Release of the nodes that this node communicates with.
     pub distro: Distro,
 }
 
@@ -139,14 +139,16 @@ impl Node {
         format!("{}/{topic}/{type_name}/{}", self.domain, self.distro.hash(publisher.message_type))
     }
 
-    /// Returns the ID of `publisher` for the attachments of its messages. It is the same as long as its token is.
+    /// Returns the ID of `publisher` for the attachments of its messages. The ID stays the same as long as the token of
+    /// `publisher` stays the same.
     pub fn gid(&self, publisher: &Publisher<'_>) -> [u8; 16] {
         let digest = Sha256::digest(self.publisher_token(publisher));
         std::array::from_fn(|i| digest[i])
     }
 
-    /// Returns the key under which subscribers query the last message of a latched `publisher`. As a token, it
-    /// announces that they can. `AdvancedPublisher` of `zenoh-ext` does this for `rmw_zenoh`.
+    /// Returns the key under which subscribers query the last message of a latched `publisher`. Used as a token, the
+    /// key announces that subscribers can query the message. `AdvancedPublisher` of `zenoh-ext` does this for
+    /// `rmw_zenoh`.
     pub fn history_key(&self, publisher: &Publisher<'_>) -> String {
         format!("{}/@adv/pub/{}/{}/_", self.key(publisher), self.session, publisher.number)
     }
@@ -157,7 +159,7 @@ impl Node {
 }
 
 impl Type {
-    /// Returns the name in DDS: `sensor_msgs::msg::dds_::LaserScan_` for `sensor_msgs/msg/LaserScan`.
+    /// Returns the name of the type in DDS: `sensor_msgs::msg::dds_::LaserScan_` for `sensor_msgs/msg/LaserScan`.
     fn dds_name(&self) -> String {
         let name = self.name.replace('/', "::");
         match name.rsplit_once("::") {

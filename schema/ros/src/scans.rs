@@ -1,5 +1,5 @@
-//! Scans as `sensor_msgs/msg/LaserScan`, and points as `sensor_msgs/msg/PointCloud2`: those of a scan, of its
-//! foreground, and of a sweep in three dimensions.
+//! Scans as `sensor_msgs/msg/LaserScan`, and points as `sensor_msgs/msg/PointCloud2`. The points are those of a scan,
+//! those of its foreground, or those of a sweep in three dimensions.
 
 use std::mem::offset_of;
 
@@ -10,10 +10,10 @@ use crate::cdr::Cdr;
 
 /// Appends `scan` in frame `frame` to `message` as a LaserScan.
 ///
-/// - Angles are in radians, counterclockwise from the sensor's x axis (ahead), in ascending order. They are those of
-///   the sensor, even if it is mounted upside down.
-/// - Ranges are in meters (REP 103), each the float nearest to the sensor's value. +inf means no echo within the
-///   sensor's range, -inf an object that is too near, and NaN an unknown range (REP 117).
+/// - Angles are in radians, counterclockwise from the sensor's x axis (ahead), in ascending order. Angles are in the
+///   sensor's own frame, even if the sensor is mounted upside down.
+/// - Ranges are in meters (REP 103), each rounded to the nearest float. +inf means no echo within the sensor's range,
+///   -inf an object that is too near, and NaN an unknown range (REP 117).
 /// - The stamp is the time of the message's first beam. A clockwise scanner measures that beam last, and the time
 ///   between beams is then negative.
 pub fn laser_scan(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
@@ -59,7 +59,7 @@ fn beam_time_ns(scan: &Scan) -> f64 {
     }
 }
 
-/// Returns the period of scans: that of the header, or otherwise the duration of a revolution.
+/// Returns the period of scans: the period in the header, or the duration of a revolution if the header has no period.
 fn scan_time_us(header: &Header, scan: &Scan) -> f64 {
     match header.period_us {
         0 => f64::from(scan.beam_time_ns) * scan.beams() as f64 / 1e3,
@@ -128,7 +128,7 @@ pub fn foreground_cloud(
 
 /// Appends the `points` of a sweep, in the robot's frame, to `message` as a PointCloud2: x, y, z (meters, 32-bit
 /// floats), beam (index in the scan, 16 bits) and class (8 bits: 0 unknown, 1 background, 2 foreground, 3 behind the
-/// background). The stamp is that of `header`, which must belong to the last point.
+/// background). The stamp is taken from `header`, which must be the header of the last point's sample.
 pub fn sweep_cloud(message: &mut Vec<u8>, header: &Header, points: &[CloudPoint]) {
     let point_len = size_of::<CloudPoint>() as u32;
     let mut cdr = begin(message, header.wall_ns, BASE_FRAME, &SWEEP_FIELDS, (point_len, points.len()));
@@ -212,8 +212,8 @@ mod tests {
         it.arrays().upper[1] = 7;
         laser_scan(&mut message, "rear", &header, &it);
         assert_eq!(message[..4], [0, 1, 0, 0]);
-        // The first of six beams, 1 degree apart, was measured 5/360 of a revolution before the last one, whose time is
-        // the stamp.
+        // The first of six beams, 1 degree apart, was measured 5/360 of a revolution before the last one, which was
+        // measured at the stamp.
         let nanosec = 1_000_000_000 - 5 * 37_000;
         assert_eq!(message[4..8], 1_700_000_000_i32.to_le_bytes());
         assert_eq!(message[8..12], (nanosec as u32).to_le_bytes());

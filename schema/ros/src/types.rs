@@ -10,8 +10,8 @@ use sha2::{Digest, Sha256};
 pub struct Type {
     /// Name, such as `sensor_msgs/msg/LaserScan`.
     pub name: &'static str,
-    /// Definition in the language `ros2msg`, as rosbag2 stores it: the fields, then the types that it contains, each
-    /// after a separator.
+    /// Definition in the language `ros2msg`, as rosbag2 stores it: the fields, then the contained types, each after a
+    /// separator.
     pub text: &'static str,
 }
 
@@ -37,7 +37,7 @@ impl Type {
     }
 }
 
-/// Definition of a type: its own fields, then each type that it contains, once.
+/// Definition of a type. It has the fields of the type, then each contained type once.
 macro_rules! text {
     ($($field:literal)+ $(; $($of:ident)+)?) => {
         concat!($($field, "\n",)+ $($(contained!($of),)+)?)
@@ -155,7 +155,8 @@ pub const TF_MESSAGE: Type = Type {
 /// A parsed definition: a type and those that it contains.
 #[derive(Clone, Debug)]
 pub(crate) struct MessageDef<'a> {
-    /// Types by name, first the type itself. The names of the others have no `msg`, such as `std_msgs/Header`.
+    /// Types by name. The type itself is the first. The names of contained types have no `msg`, as in
+    /// `std_msgs/Header`.
     types: Vec<(&'a str, Vec<Field<'a>>)>,
 }
 
@@ -189,7 +190,7 @@ impl<'a> MessageDef<'a> {
     }
 }
 
-/// Parses a line with type, name and an optional default, which is not part of messages.
+/// Parses a line with type, name and an optional default. The default is not part of messages.
 fn field(line: &str) -> Option<Field<'_>> {
     let mut words = line.split_whitespace();
     let (type_name, name) = (words.next()?, words.next()?);
@@ -250,7 +251,7 @@ fn primitive_type_id(type_name: &str) -> Option<u8> {
 const HASH_VERSION: &str = "RIHS01_";
 /// Number of a type that has its own description.
 const NESTED_TYPE_ID: u8 = 1;
-/// Offset of the number for a sequence of any length.
+/// Offset that is added to the number of a type for a sequence of any length.
 const SEQUENCE_OFFSET: u8 = 144;
 
 #[cfg(test)]

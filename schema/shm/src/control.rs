@@ -1,5 +1,5 @@
-//! The control service: requests of clients, responses of the hub, and two events, one that wakes the hub and one that
-//! wakes clients. The hub's crate handles requests.
+//! The control service: requests of clients and responses of the hub. One event wakes the hub, and another event wakes
+//! clients. The hub's crate handles requests.
 
 use std::fmt::Debug;
 
@@ -18,7 +18,7 @@ use crate::resource_limits::{CONTROL_DESCRIPTORS, check_descriptors};
 use crate::service::{OpenFailure, clients_full, create, name, open, port_failure};
 use crate::wake::{Listener, Notifier, WakeService, create_listener, notifier, open_event, take_wakeups};
 
-/// The hub's end. Its listener [`requests`](Self::requests) is woken by each request.
+/// The hub's end. Each request wakes the listener [`requests`](Self::requests).
 pub struct ControlServer {
     server: server::Server<LocalService, [u8], (), [u8], ()>,
     requests: Listener,
@@ -27,7 +27,7 @@ pub struct ControlServer {
     _events: [WakeService; 2],
 }
 
-/// A request that has no response yet. If it is dropped, it gets none.
+/// A request that has no response yet. If it is dropped, the client gets no response.
 pub struct IncomingRequest(ActiveRequest<LocalService, [u8], (), [u8], ()>);
 
 /// A client's end.
@@ -83,7 +83,7 @@ impl ControlServer {
         &self.requests
     }
 
-    /// Returns the next request whose client still waits, or `None`. Takes the pending wake-ups.
+    /// Returns the next request whose client still waits, or `None` if there is no request. Takes the pending wake-ups.
     ///
     /// # Errors
     ///
@@ -227,7 +227,7 @@ fn create_event(node: &Node, service: &str) -> Result<WakeService, Failure> {
     })
 }
 
-/// Bytes that are reserved for a request. Most have no model.
+/// Bytes that are reserved for a request. Most requests have no model.
 const RESERVED_REQUEST_LEN: usize = 64;
 /// ID of both events.
 const EVENT_ID: usize = 1;

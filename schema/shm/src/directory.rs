@@ -3,9 +3,9 @@
 //!
 //! A directory is opened component by component from the root of the file system, and every file in it relative to the
 //! open directory. No other user can put another directory in its place. The last components (base and domain) must
-//! belong to this user and be writable by no other user, and a link is never followed there. Above them, a link is
-//! followed if root or this user made it in a directory that no other user can write to: `/home` or `/var/run` may be
-//! links. The owners of the directories above the base are not checked.
+//! belong to this user, no other user may be able to write to them, and they must not be links. In the components above
+//! them, a link is followed if root or this user made it in a directory that no other user can write to: `/home` or
+//! `/var/run` may be links. The owners of the directories above the base are not checked.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -36,7 +36,7 @@ pub struct Directory {
     purpose: Purpose,
 }
 
-/// Purpose of a directory, which decides about remedies.
+/// Purpose of a directory. The remedy in a message depends on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Purpose {
     /// Files of a domain.
@@ -108,7 +108,7 @@ impl Directory {
     /// written.
     pub(crate) fn replace(&self, name: &str, content: &[u8]) -> Result<(), Failure> {
         let temporary = format!("{name}.new");
-        // A crash may have left such a file.
+        // A crash may have left a file with this name.
         self.remove(OsStr::new(&temporary));
         let opened = self.open_file(&temporary, OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL);
         let mut file = self.check_file(&temporary, opened)?;
@@ -142,7 +142,8 @@ impl Directory {
         let _ = unlinkat(&self.fd, name, AtFlags::REMOVEDIR);
     }
 
-    /// Returns the names and the metadata of the directory's entries. Links are not followed.
+    /// Returns the names and the metadata of the directory's entries. For a link, it is the metadata of the link
+    /// itself.
     pub(crate) fn entries(&self) -> Vec<(OsString, Stat)> {
         let Ok(entries) = Dir::read_from(&self.fd) else { return Vec::new() };
         let names = entries.flatten().map(|entry| OsStr::from_bytes(entry.file_name().to_bytes()).to_owned());
@@ -288,7 +289,7 @@ impl Purpose {
         })
     }
 
-    /// Returns how to use another directory.
+    /// Returns the remedy, which is to use another directory.
     fn alternative(self) -> &'static str {
         match self {
             Purpose::Domain => "choose another --root",
@@ -299,8 +300,8 @@ impl Purpose {
 
 const STATE_REMEDY: &str = "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user";
 
-/// A lock on a file of a domain's directory. It ends with its process. The file has the ID of the process, because the
-/// kernel does not report it.
+/// A lock on a file of a domain's directory. It ends with its process. The file contains the ID of the process that
+/// holds the lock, because the kernel does not report this ID.
 #[derive(Debug)]
 pub(crate) struct FileLock {
     file: File,
@@ -322,7 +323,7 @@ impl FileLock {
         let file = loop {
             let file = Directory::create(root)?.open_or_create(name)?;
             match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
-                // The previous holder may have removed the domain, and the next one would lock another file.
+                // The previous holder may have removed the domain. The next process would then lock another file.
                 Ok(_) if file.metadata().is_ok_and(|metadata| metadata.nlink() == 0) => {}
                 Ok(_) => break file,
                 Err(nix::Error::EAGAIN | nix::Error::EACCES) => return Err(on_held(pid_in(&file))),
@@ -350,7 +351,7 @@ impl Drop for FileLock {
     }
 }
 
-/// Lock of a process that creates services in a domain, or removes unfinished ones.
+/// Lock of a process that creates services in a domain, or that removes unfinished services.
 pub(crate) struct ServiceCreationLock {
     _lock: FileLock,
 }
@@ -383,7 +384,7 @@ pub(crate) fn locked_file(root: &Path, name: &str) -> Result<Option<(Directory, 
     Ok((lock.l_type != libc::F_UNLCK as libc::c_short).then_some((directory, file)))
 }
 
-/// Returns the process ID in the file of a lock; 0 if it has none.
+/// Returns the process ID in the file of a lock. Returns 0 if the file has no ID.
 pub(crate) fn pid_in(file: &File) -> u32 {
     lock_text(file).lines().next().and_then(|pid| pid.parse().ok()).unwrap_or_default()
 }
@@ -419,8 +420,9 @@ pub struct StateDirectory {
 }
 
 impl StateDirectory {
-    /// Returns the directory above those of all domains, which the environment of this process names: the one that
-    /// systemd created for the service, otherwise the user's own. `None` if the environment names no directory.
+    /// Returns the directory that contains the directories of all domains, as the environment of this process names it.
+    /// It is the directory that systemd created for the service, otherwise the user's own directory. `None` if the
+    /// environment names no directory.
     pub fn base() -> Option<PathBuf> {
         base_in(|name| std::env::var_os(name))
     }
@@ -470,8 +472,8 @@ impl StateDirectory {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`check`](Self::check), and [`Kind::Failed`] if the file cannot be written. It then keeps
-    /// its content.
+    /// Returns the errors of [`check`](Self::check), and [`Kind::Failed`] if the file cannot be written. The file then
+    /// keeps its content.
     pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
         self.create()?.replace(name, text.as_bytes()).map_err(not_saved)
     }
@@ -514,7 +516,7 @@ impl StateDirectory {
     }
 }
 
-/// The directory of the domain, and the one of all domains above it.
+/// The directory of the domain, and above it the directory of all domains.
 const OWNED_COMPONENTS: usize = 2;
 
 /// Adds to the message that no state can be saved.

@@ -1,8 +1,8 @@
 //! Domains: the locations in which the shared memory of a hub may be, and the hubs that run on this machine.
 //!
 //! [`Domain`] and [`Environment`] only compute locations, in the order in which clients search them. [`RunningHub`]
-//! finds the hubs of all users, as /proc shows them. Shared memory is for one user, so a client of another user finds
-//! no hub. Its message then names the user whose hub runs, and the command that reaches it.
+//! finds the hubs of all users in /proc. Shared memory belongs to one user, so a client of another user finds no hub.
+//! The message of the client then names the user whose hub runs, and the command that reaches this hub.
 
 use std::ffi::{OsStr, OsString};
 use std::fs;
@@ -14,8 +14,8 @@ use scanhub_schema::{Failure, Kind};
 /// The default domain.
 pub const DEFAULT_DOMAIN: &str = "scanhub";
 
-/// Root and prefix, with its random part, must have fewer bytes than this. The path of a listener's socket has at most
-/// 107 bytes (unix(7)), and contains a number of up to 35 digits and 7 other bytes.
+/// Root and prefix together, with the random part of the prefix, must have fewer bytes than this. The path of a
+/// listener's socket has at most 107 bytes (unix(7)), and contains a number of up to 35 digits and 7 other bytes.
 const LOCATION_LEN_LIMIT: usize = 66;
 
 /// Bytes that are added to the prefix (`segments.rs`): five random letters, and `_`.
@@ -69,8 +69,8 @@ impl Domain {
     }
 
     /// Returns the locations in which a client searches for domain `name`, in this order: only below `base` if it is
-    /// given, otherwise in each directory that a hub may have chosen. Locations that are too long for a hub are left
-    /// out.
+    /// given, otherwise in each directory that a hub may have chosen. Locations whose path is too long for a hub are
+    /// left out.
     ///
     /// # Errors
     ///
@@ -105,7 +105,8 @@ impl Domain {
         &self.root
     }
 
-    /// Returns the start of the names of its shared memory. The rest of the prefix is in the directory's file `prefix`.
+    /// Returns the text with which the names of the domain's shared memory start. The rest of the prefix is in the file
+    /// `prefix` of the domain's directory.
     pub fn prefix(&self) -> String {
         format!("sh_{}_", self.name)
     }
@@ -137,8 +138,8 @@ impl Environment {
         }
     }
 
-    /// Returns every directory that may contain domains, in the order in which clients search. It contains the
-    /// directory of the login session even without XDG_RUNTIME_DIR, which sudo, ssh and cron do not set.
+    /// Returns every directory that may contain domains, in the order in which clients search. The list contains the
+    /// directory of the login session even if XDG_RUNTIME_DIR is not set. sudo, ssh and cron do not set this variable.
     pub fn bases(&self) -> Vec<PathBuf> {
         let mut bases: Vec<PathBuf> = self.runtime_directory.iter().cloned().collect();
         bases.push(SERVICE_BASE.into());
@@ -216,13 +217,14 @@ impl RunningHub {
             (!value.is_empty()).then(|| OsStr::from_bytes(value).to_owned())
         };
         let base = match command.root {
-            // A relative one counts from the process's working directory, which other users cannot read.
+            // A relative directory counts from the working directory of the process, which other users cannot read.
             Some(root) => Some(fs::read_link(path.join("cwd")).map_or(root.clone(), |cwd| cwd.join(root))),
             None => environment.is_some().then(|| Environment::of(variable, uid).base_of_hub()),
         };
         let domain = command.domain.or_else(|| variable("SCANHUB_DOMAIN")?.into_string().ok());
         let domain = domain.or_else(|| environment.is_some().then(|| DEFAULT_DOMAIN.to_owned()));
-        // Any user can start a process with any command line, and the name becomes part of a suggested command.
+        // Check the name. Any user can start a process with any command line, and the name becomes part of a suggested
+        // command.
         if let Some(domain) = &domain {
             check_name(domain).ok()?;
         }
@@ -236,7 +238,8 @@ impl RunningHub {
         Some(RunningHub { pid, uid, user, domain, base, program })
     }
 
-    /// Returns who runs the hub, and the command that reaches it, for a client of `caller` that searched for `domain`.
+    /// Returns the text that states who runs the hub, and the command that reaches the hub. The text is for a client of
+    /// `caller` that searched for `domain`.
     pub fn describe(&self, verb: &str, domain: &str, caller: &Environment) -> String {
         let owner =
             if self.uid == caller.uid { "this user".to_owned() } else { format!("user {}", self.user) };
@@ -248,8 +251,9 @@ impl RunningHub {
         format!("{owner} runs one{of_domain}, process {}: {}", self.pid, self.command(verb, domain, caller))
     }
 
-    /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one
-    /// that the caller searched for. If the hub's domain is unknown, the command lists the domains of the hub's user.
+    /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the
+    /// domain that the caller searched for. If the hub's domain is unknown, the command lists the domains of the hub's
+    /// user.
     pub fn command(&self, verb: &str, domain: &str, caller: &Environment) -> String {
         // sudo resets the environment of the command.
         let (sudo, environment, domain) = if self.uid == caller.uid {
@@ -289,7 +293,7 @@ impl CommandLine {
         let text = bytes.strip_suffix(&[0]).unwrap_or(bytes);
         let mut words = text.split(|&byte| byte == 0).map(|word| String::from_utf8_lossy(word));
         let program = Path::new(&*words.next()?).to_owned();
-        // A program on the usual path needs no directory.
+        // A program in a directory that sudo searches needs no directory in the command.
         let is_usual = program.parent().is_some_and(|directory| {
             USUAL_DIRECTORIES.iter().any(|directory_name| directory == Path::new(directory_name))
         });
@@ -494,7 +498,8 @@ mod tests {
         assert_eq!(command(998, &named, None, 1000), "sudo -u scanhub scanhub list");
         assert_eq!(command(1000, &run, None, 1001), "sudo -u alice scanhub list --domains");
         assert_eq!(command(65_531, &run, Some("A=b"), 0), "sudo -u '#65531' scanhub list");
-        // Root can read where the hub is: sudo does not pass the variable on, and a client looks there anyway.
+        // Root can read the location of the hub. sudo does not pass the variable on, but a client searches this
+        // location even without the variable.
         let logged_in = Some("HOME=/home/alice XDG_RUNTIME_DIR=/run/user/1000");
         assert_eq!(command(1000, &run, logged_in, 0), "sudo -u alice scanhub list");
         let elsewhere = Some("XDG_RUNTIME_DIR=/run/user/1000 SCANHUB_DOMAIN=lab");

@@ -2,12 +2,12 @@
 //! sleep. One system call of the hub wakes all threads that sleep on a word. An event needs one message for each
 //! subscriber.
 //!
-//! The page is in /dev/shm under the domain's prefix. Subscribers map it read-only. A killed hub leaves the page, and
-//! the next hub continues with it, so that subscribers that sleep meanwhile are woken. A hub that ends normally closes
-//! it.
+//! The page is in /dev/shm under the domain's prefix. Subscribers map it read-only. A killed hub leaves the page. The
+//! next hub continues to use this page, so that it can wake subscribers that still sleep on it. A hub that ends
+//! normally closes the page.
 //!
 //! A fourth word counts how often a program has attached to one of the sensor's services. The hub reads this word
-//! instead of the lists of subscribers. iceoryx2 has one for each topic, each in a different page.
+//! instead of the lists of subscribers. iceoryx2 has a list of subscribers for each topic, each in a different page.
 //!
 //! The operations on words, and their memory orders, must be right in all interleavings of hub and subscribers. The
 //! tests run all of them.
@@ -41,11 +41,11 @@ pub(crate) struct DoorbellRinger {
 }
 
 impl DoorbellRinger {
-    /// Opens the doorbell of `sensor` that a killed hub has left, which subscribers still have mapped, or creates a new
-    /// one.
+    /// Opens the doorbell of `sensor` that a killed hub has left, because subscribers may still have it mapped. Creates
+    /// a new doorbell if there is none.
     ///
-    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, and [`Kind::Failed`] if another user's file
-    /// has its name.
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, and [`Kind::Failed`] if a file of another user
+    /// has the doorbell's name.
     pub(crate) fn open_or_create<S: Service>(
         node: &Node<S>,
         sensor: &str,
@@ -69,8 +69,8 @@ impl DoorbellRinger {
         ring(self.mapping.page().word(word));
     }
 
-    /// Returns how often a program has attached to a service of the sensor, modulo 2^32. The services have all
-    /// subscribers and listeners that were counted.
+    /// Returns how often a program has attached to a service of the sensor, modulo 2^32. All subscribers and listeners
+    /// that were counted are then visible in the services.
     pub(crate) fn attached(&self) -> u32 {
         read_count(&self.mapping.page().attached)
     }
@@ -84,7 +84,7 @@ impl DoorbellRinger {
             if page.page().closed.load(Ordering::Relaxed) == 0 {
                 return Ok(page);
             }
-            // Its hub was killed while it ended. No subscriber may sleep at this page any more.
+            // The hub of this page was killed while it was ending. No subscriber may sleep on this page any more.
             std::fs::remove_file(path)?;
         }
     }
@@ -92,7 +92,8 @@ impl DoorbellRinger {
 
 impl Drop for DoorbellRinger {
     fn drop(&mut self) {
-        // A hub that is killed in between leaves no page that looks alive and has no name.
+        // This order ensures that a hub that is killed in between does not leave a page that is not closed but has no
+        // name.
         let words = self.mapping.page();
         close(&words.closed, words.word(DoorbellWord::First));
         ring(words.word(DoorbellWord::Last));
@@ -152,7 +153,7 @@ impl Doorbell {
         read_count(self.0.page().word(word))
     }
 
-    /// Returns whether its hub has ended and does not ring any more.
+    /// Returns whether the hub of this doorbell has ended and does not ring any more.
     pub fn is_closed(&self) -> bool {
         self.0.page().closed.load(Ordering::Relaxed) != 0
     }
@@ -221,7 +222,7 @@ impl DoorbellPage {
     }
 }
 
-/// The page. It is mapped until this is dropped.
+/// The mapped page. Dropping this value unmaps it.
 #[derive(Debug)]
 struct PageMapping(MmapRaw);
 

@@ -9,9 +9,9 @@ use std::path::Path;
 use nix::libc::{self, c_int};
 use rustix::fs::OFlags;
 
-/// Returns whether no process has the file at `path` open or mapped. Only then does the kernel grant a lease for
-/// writing (fcntl(2)). Only the kernel knows this: processes that this one cannot see, or in a container that shares
-/// the memory, count too.
+/// Returns whether no process has the file at `path` open or mapped. The kernel grants a lease for writing only in this
+/// case (fcntl(2)). The check must use the kernel, because it also covers processes that this process cannot see, for
+/// example in a container that shares the memory.
 ///
 /// Returns false if the answer is unknown, for example for a file of another user. A process that opens the file during
 /// this call waits until the call returns.
@@ -23,7 +23,8 @@ pub fn is_unused(path: &Path) -> bool {
         // SAFETY: these commands take a number and touch no memory of this process, and the descriptor is open.
         unsafe { libc::fcntl(file.as_raw_fd(), command, argument) == 0 }
     };
-    // The default signal to the holder of a lease that another process waits for would end this process.
+    // If another process waits for the lease, the kernel sends a signal to the holder. The default signal would end
+    // this process.
     control(F_SETSIG, libc::SIGURG)
         && control(libc::F_SETLEASE, libc::F_WRLCK)
         && control(libc::F_SETLEASE, libc::F_UNLCK)
@@ -60,7 +61,7 @@ mod tests {
         let free_again = is_unheld();
         fs::remove_file(&path).unwrap();
         assert_eq!([written, read, only_mapped], [false; 3]);
-        // A system without leases cannot tell.
+        // On a system without leases, the result is unknown.
         assert_eq!(free, free_again);
         assert!(free || fs::read_to_string("/proc/sys/fs/leases-enable").is_ok_and(|it| it.trim() == "0"));
     }

@@ -29,8 +29,9 @@ pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 /// Shared memory between processes, with ports that stay in their thread; nodes and services may move. The hub uses
 /// it.
 pub use iceoryx2::prelude::ipc::Service as LocalService;
-/// Shared memory between processes, with ports and samples that may move between threads. They differ from those of
-/// [`LocalService`] only in a lock within the process, so both kinds attach to one topic. Clients use it.
+/// Shared memory between processes, with ports and samples that may move between threads. These ports differ from the
+/// ports of [`LocalService`] only in a lock within the process, so both kinds of ports can attach to one topic. Clients
+/// use it.
 pub use iceoryx2::prelude::ipc_threadsafe::Service as ThreadSafeService;
 pub use iceoryx2::prelude::{CallbackProgression, PortFactory, ZeroCopySend};
 /// Kind of shared memory: [`LocalService`] or [`ThreadSafeService`].

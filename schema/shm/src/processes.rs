@@ -1,10 +1,10 @@
-//! Processes of a domain: their membership, the locks of those that publish, and the cleanup after those that have
-//! died.
+//! Processes of a domain: their membership, the locks of processes that publish, and the cleanup after processes that
+//! have died.
 //!
-//! - Each process joins with a [`Node`]. The last one to leave removes the domain's names.
+//! - Each process joins with a [`Node`]. The last process that leaves removes the domain's names.
 //! - At most one hub, at most one listener for remote sensors, and one process for each name of a sensor, tracker or
 //!   mount hold a lock. A lock ends with its process. Subscribers query the locks but never take one.
-//! - A cleanup does not touch files in shared memory that did not belong to a known dead process.
+//! - A cleanup removes only files in shared memory that belonged to a known dead process.
 
 use std::fs::{self, File};
 use std::os::unix::ffi::OsStrExt;
@@ -62,7 +62,7 @@ pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
 }
 
 /// Returns the node of this process in `domain`. The node of a publisher removes the files that dead publishers and
-/// subscribers left; that of a subscriber removes none.
+/// subscribers left. The node of a subscriber removes no files.
 ///
 /// # Errors
 ///
@@ -147,8 +147,8 @@ fn nodes_at(root: &Path) -> Result<NodeCounts, Failure> {
     Ok(nodes)
 }
 
-/// Lock of a hub on its domain. It ends with the value or with the process, however that ends. Drop it after the hub's
-/// node.
+/// Lock of a hub on its domain. The lock ends when this value is dropped, or when the process ends for any reason. Drop
+/// this value after the hub's node.
 #[derive(Debug)]
 pub struct HubLock(PublisherLock);
 
@@ -236,7 +236,7 @@ impl PublisherLock {
     /// file. `on_held` returns the failure if another process has the lock.
     fn acquire(root: &Path, name: &str, on_held: impl Fn(u32) -> Failure) -> Result<PublisherLock, Failure> {
         let lock = FileLock::acquire(root, name, on_held)?;
-        // A reader that finds a process ID relies on the prefix.
+        // Write the ID last: a reader that finds a process ID expects that the prefix exists.
         ensure_prefix(root, &ServiceCreationLock::wait(root)?)?;
         lock.write(root, &format!("{}\n", std::process::id()))?;
         Ok(PublisherLock { root: root.to_owned(), name: name.to_owned(), lock })
@@ -246,7 +246,7 @@ impl PublisherLock {
 impl Drop for PublisherLock {
     /// Removes the names while the lock is still held, if no other process uses them. The next hub chooses other names.
     fn drop(&mut self) {
-        // The holder of another lock uses the names, or is about to join under them.
+        // The holder of another lock uses the names, or will soon join with these names.
         let mut others = [HUB_LOCK_FILE, LISTENER_LOCK_FILE].into_iter().filter(|other| *other != self.name);
         if others.all(|other| matches!(lock_holder(&self.root, other), Ok(None))) {
             remove_names(&self.root);
@@ -366,7 +366,7 @@ fn remove_domain(directory: &Directory, root: &Path) -> bool {
 /// have seen.
 pub(crate) fn remove_names(root: &Path) {
     let Ok(Some(directory)) = Directory::open(root) else { return };
-    // Not while another process joins to publish.
+    // Keep the names while another process joins to publish.
     let Ok(_lock) = ServiceCreationLock::wait(root) else { return };
     if nodes_at(root).is_ok_and(|nodes| nodes == NodeCounts::default()) {
         remove_prefix(&directory, root);
@@ -402,7 +402,7 @@ fn remove_unfinished_services(root: &Path) {
     }
 }
 
-/// Returns whether the file was written in the last minute. A clock that was set back does not count.
+/// Returns whether the file was written in the last minute. Returns `false` if the clock was set back since.
 fn is_recent(file: &File) -> bool {
     let written = file.metadata().and_then(|metadata| metadata.modified());
     written.is_ok_and(|written| written.elapsed().is_ok_and(|age| age < MAX_START_TIME))
@@ -418,10 +418,10 @@ fn domain_held(root: &Path, program: &str, pid: u32) -> Failure {
 
 const HUB_LOCK_FILE: &str = "hub.lock";
 const LISTENER_LOCK_FILE: &str = "listen.lock";
-/// Maximum duration of a hub's start for clients. After it, a hub of a version that never reports that it is ready is
-/// up.
+/// Maximum duration of a hub's start for clients. After this time, a hub counts as ready even if its version never
+/// reports that it is ready.
 const MAX_START_TIME: Duration = Duration::from_secs(60);
-/// Second line of the file of a hub's lock once all topics exist.
+/// Second line of the file of a hub's lock, which the hub writes once all topics exist.
 const READY_LINE: &str = "ready";
 
 /// The library's directory of service descriptions, below the root.

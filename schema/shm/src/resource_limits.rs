@@ -58,8 +58,8 @@ fn check_file_size(needed: u64) -> Result<(), Failure> {
     ))
 }
 
-/// Fails if this process may not map `needed` more bytes and the memory for creating them. The library would leave a
-/// segment that it cannot map.
+/// Fails if this process may not map `needed` more bytes, plus the memory that creating them needs. Without this check,
+/// the library would leave behind a segment that it cannot map.
 ///
 /// # Errors
 ///
@@ -91,7 +91,7 @@ pub fn check_address_space(needed: u64) -> Result<(), Failure> {
 pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
     let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
     let open = match std::fs::read_dir(OPEN_DESCRIPTORS_DIRECTORY) {
-        // Listing them needs a descriptor too.
+        // Listing the open descriptors needs a descriptor too.
         Ok(entries) => entries.count() as u64 - 1,
         Err(error) => assumed_descriptors(&error, limit),
     };
@@ -125,8 +125,8 @@ pub fn memory_failure(what: &str) -> Failure {
     )
 }
 
-/// Fails if there is no room for another port of a client. The library would create one that receives nothing, or end
-/// the process.
+/// Fails if there is no room for another port of a client. Without this check, the library would create a port that
+/// receives nothing, or end the process.
 pub(crate) fn check_client() -> Result<(), Failure> {
     check_descriptors(PORT_DESCRIPTORS).and_then(|()| check_memory(CLIENT_BYTES, CLIENT_BYTES))
 }
@@ -174,7 +174,7 @@ fn free(stat: &StatVfs) -> u64 {
 /// failure.
 const CREATION_BYTES: u64 = 8 << 20;
 
-/// File with the number of pages of this process. The first number counts all that are mapped.
+/// File with the number of pages of this process. The first number counts all mapped pages.
 const PAGE_COUNTS_FILE: &str = "/proc/self/statm";
 
 /// Directory of this process's open descriptors.

@@ -27,9 +27,9 @@ use crate::directory::{Directory, ServiceCreationLock};
 use crate::domain::Domain;
 use crate::resource_limits::{self, SHARED_MEMORY_DIRECTORY, memory_failure};
 
-/// Returns the failure for `message` in the domain in `root`. If another user's directory or file is the reason, it
-/// reports that one with owner, mode and remedy. If a resource is short, it reports the shortage. Otherwise it reports
-/// `message`.
+/// Returns the failure for `message` in the domain in `root`. If a directory or file of another user is the reason, the
+/// failure reports its path, owner and mode, and the remedy. If a resource is short, the failure reports the shortage.
+/// Otherwise it reports `message`.
 pub(crate) fn access_failure(root: &Path, message: impl Into<String>) -> Failure {
     let directory = Directory::open(root).err();
     directory
@@ -89,8 +89,8 @@ impl Segment {
     }
 }
 
-/// Returns the files under the names of the domain in `root` that do not belong to this user alone, sorted by path.
-/// Empty if the domain has no names.
+/// Returns the files under the names of the domain in `root` that do not belong to this user alone, sorted by path. The
+/// list is empty if the domain has no names.
 pub fn foreign_segments(root: &Path) -> Vec<Segment> {
     let Ok(Some(prefix)) = prefix_of(root) else { return Vec::new() };
     let segments = entries(&prefix).filter_map(|path| Segment::at(&path));
@@ -130,7 +130,7 @@ fn entries(prefix: &str) -> impl Iterator<Item = PathBuf> {
 pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     let Some(prefix) = prefix_of(domain.root())? else { return Ok(()) };
     for path in entries(&prefix) {
-        // Skip segments of other users, and those that have been removed in between.
+        // Skip segments of other users, and segments that were removed in between.
         if !Segment::at(&path).is_some_and(|segment| segment.is_own()) {
             continue;
         }
@@ -146,7 +146,8 @@ pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Returns the prefix of the domain in `root`. `None` if no process has published there, or all have ended.
+/// Returns the prefix of the domain in `root`. `None` if no process has published there, or if all processes have
+/// ended.
 ///
 /// # Errors
 ///
@@ -191,8 +192,8 @@ fn random_word(mut random: u64) -> String {
     letters.take(RANDOM_WORD_LEN).collect()
 }
 
-/// Returns the prefix in the open `directory` of `root`. A prefix of another form was not written here, and counts as
-/// none.
+/// Returns the prefix in the open `directory` of `root`. A prefix of another form was not written by this module, and
+/// counts as no prefix.
 ///
 /// # Errors
 ///
@@ -217,14 +218,14 @@ fn prefix_start(root: &Path) -> String {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] with file, owner and remedy if another user's file has its name or another user could write
-/// to it. Returns [`Kind::ResourceExhausted`] if there is no memory for it.
+/// Returns [`Kind::Failed`] with file, owner and remedy if a file of another user has the counter's name, or if another
+/// user could write to the counter. Returns [`Kind::ResourceExhausted`] if there is no memory for it.
 pub(crate) fn ensure_node_counter(prefix: &str) -> Result<(), Failure> {
     let path = node_counter_path(prefix);
     loop {
         match Segment::at(&path) {
             Some(segment) if !segment.is_own() => return Err(name_conflict(&segment)),
-            // It is the library's own counter, or an unfinished one that the library would wait for forever.
+            // The file is the library's own counter, or an unfinished counter that the library would wait for forever.
             Some(segment) if segment.is_foreign() || segment.bytes != NODE_COUNTER_CONTENT.len() as u64 => {
                 remove_node_counter(prefix)
             }
@@ -239,7 +240,7 @@ fn remove_node_counter(prefix: &str) {
     let _ = fs::remove_file(node_counter_path(prefix));
 }
 
-/// Removes what only a running process needs of the names: the node counter, and the prefix in `directory`.
+/// Removes the node counter, and the prefix in `directory`. Only a running process needs them.
 pub(crate) fn remove_prefix(directory: &Directory, root: &Path) {
     if let Ok(Some(prefix)) = read_prefix(directory, root) {
         remove_node_counter(&prefix);
@@ -272,7 +273,7 @@ fn node_counter_path(prefix: &str) -> PathBuf {
 }
 
 /// Name with the hash of a type, as iceoryx2 0.10.0 computes it (`DynamicStorageConfiguration::path_for_with_type`).
-/// The test below compares the two.
+/// The test below compares this hash with the hash of iceoryx2.
 const NODE_COUNTER_NAME: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
 
 /// Content that the library writes (`posix_shared_memory::Data`): its packed version, then the counter, from 0.
@@ -288,11 +289,11 @@ const NODE_COUNTER_CONTENT: [u8; 16] = {
 
 /// Name of the prefix's file in the domain's directory.
 const PREFIX_FILE: &str = "prefix";
-/// Length of the random word, which has one of 60 million values.
+/// Length of the random word in letters. There are 60 million words of this length.
 const RANDOM_WORD_LEN: usize = 5;
 const ALPHABET: &[u8] = b"0123456789abcdefghijklmnopqrstuvwxyz";
 const MAX_PREFIX_FILE_BYTES: u64 = 64;
-/// Number of random words to try. If all are taken, this is not by chance.
+/// Number of random words to try. If the names of all these words are taken, this is not by chance.
 const MAX_ATTEMPTS: usize = 16;
 
 #[cfg(test)]

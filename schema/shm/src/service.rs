@@ -46,7 +46,7 @@ impl From<ServiceOpenError> for OpenFailure {
             E::DoesNotExist | E::HangsInCreation | E::IsMarkedForDestruction | E::Interrupt => {
                 OpenFailure::Absent
             }
-            // This happens while the hub creates the service or cleans up after a dead process.
+            // This error occurs while the hub creates the service or cleans up after a dead process.
             E::ServiceInCorruptedState => OpenFailure::Absent,
             E::ExceedsMaxNumberOfNodes => OpenFailure::Full,
             E::VersionMismatch => OpenFailure::Incompatible("the hub has another version of iceoryx2"),
@@ -77,7 +77,7 @@ impl From<PublishSubscribeOpenError> for OpenFailure {
     }
 }
 
-/// Converts the errors of `open_or_create`, which the library has for each kind of service.
+/// Converts the errors of `open_or_create`. The library has separate errors for each kind of service.
 macro_rules! open_failure {
     ($($error:ident: $open:ident, $create:ident;)*) => {
         $(impl From<$error> for OpenFailure {
@@ -98,15 +98,15 @@ open_failure! {
     RequestResponseOpenOrCreateError: RequestResponseOpenError, RequestResponseCreateError;
 }
 
-/// Returns the name of a service as the library takes it.
+/// Converts the name of a service to the library's type.
 pub(crate) fn name(service: &str) -> Result<ServiceName, Failure> {
     ServiceName::new(service).map_err(|error| {
         Failure::new(Kind::Configuration, format!("{service:?} is not a valid service name: {error:?}"), "")
     })
 }
 
-/// Calls `make` until the service exists, for at most two seconds. A service that its last user is just leaving can
-/// soon be created again.
+/// Calls `make` until the service exists, for at most two seconds. If the last process is just leaving the service, the
+/// service can soon be created again.
 #[expect(clippy::disallowed_methods, reason = "waits for a service that another process has half created")]
 pub(crate) fn create<T, S: Service>(
     node: &Node<S>,

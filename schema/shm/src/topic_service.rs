@@ -1,5 +1,5 @@
 //! A topic in shared memory: its service, its subscriber and its publisher. The publisher numbers samples, writes them
-//! in place, and counts those that it has no memory for. The code for each payload is generated from the table of
+//! in place, and counts the samples that it has no memory for. The code for each payload is generated from the table of
 //! topics.
 
 use std::borrow::BorrowMut;
@@ -45,8 +45,8 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     /// Type in shared memory: the payload itself, or the words of a payload of variable length.
     type Memory: IceoryxSend + Debug + ?Sized + 'static;
 
-    /// Returns the topic of `sensor`, for the hub. It is created with `limits` if it does not exist. If subscribers of
-    /// a dead hub keep it alive, it is reused with its number of slots.
+    /// Returns the topic of `sensor`, for the hub. The topic is created with `limits` if it does not exist. If
+    /// subscribers of a dead hub keep the topic alive, it is reused, with the number of slots that it already has.
     ///
     /// # Errors
     ///
@@ -76,7 +76,8 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
         limits: &TopicLimits,
     ) -> Result<Publisher<Self, S>, Failure>;
 
-    /// Returns a subscriber of a topic, and announces it to the hub, which sends it the next sample.
+    /// Returns a subscriber of a topic, and announces the subscriber to the hub. The hub then also sends the next
+    /// sample to this subscriber.
     ///
     /// # Errors
     ///
@@ -235,7 +236,7 @@ macro_rules! payload {
     };
 }
 
-/// A payload of variable length is loaned with the longest length.
+/// A payload of variable length is loaned with its maximum length.
 macro_rules! payloads {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         $(payloads!($payload, $topic);)*
@@ -324,7 +325,7 @@ pub trait SampleTransport<P: Payload + ?Sized> {
     ///
     /// # Errors
     ///
-    /// Returns the reason why one of them could not be connected.
+    /// Returns the reason why a subscriber could not be connected.
     fn connect(&self) -> Result<(), impl Debug + use<Self, P>>;
 
     /// Loans memory for a sample with a default payload. A payload of bytes has `len` bytes.
@@ -354,7 +355,7 @@ pub struct SharedMemory<P: Payload + ?Sized, S: Service = LocalService> {
 
 impl<P: Payload + ?Sized, S: Service> SharedMemory<P, S> {
     /// Creates the topic of `sensor` with payload `P` and `limits`, or takes over the topic of a dead process. The
-    /// [`WakeSender`](crate::WakeSender) of the sensor must exist before.
+    /// [`WakeSender`](crate::WakeSender) of the sensor must already exist.
     ///
     /// # Errors
     ///
@@ -365,8 +366,8 @@ impl<P: Payload + ?Sized, S: Service> SharedMemory<P, S> {
         Ok(SharedMemory { publisher: P::publisher(&service, limits)?, service })
     }
 
-    /// Returns the number of slots for subscribers. A topic that was taken over may have another number than its
-    /// limits.
+    /// Returns the number of slots for subscribers. A topic that was taken over may have another number of slots than
+    /// the given limits.
     pub fn subscriber_capacity(&self) -> usize {
         subscriber_capacity::<P, S>(&self.service)
     }
@@ -445,7 +446,7 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
     ///
     /// # Errors
     ///
-    /// Returns the reason why one of them could not be connected.
+    /// Returns the reason why a subscriber could not be connected.
     pub fn connect(&self) -> Result<(), impl Debug + use<P, M>> {
         self.transport.connect()
     }
@@ -477,7 +478,7 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
         self.transport.send(loan, &header).inspect_err(|_| self.failed += 1)
     }
 
-    /// Uses up the number of a sample for which there is no memory.
+    /// Skips one number, for a sample for which there is no memory.
     pub fn count_failed(&mut self) {
         self.next += 1;
         self.failed += 1;

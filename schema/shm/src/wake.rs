@@ -1,8 +1,9 @@
 //! Wake-ups of the subscribers of a sensor: a doorbell for programs that use this code, and an event service for all
-//! other languages. The hub uses both, whichever of them has subscribers.
+//! other languages. The hub wakes both kinds of subscribers.
 //!
-//! A thread can sleep on the events of several sensors at once. Waking up and taking the wake-ups are two calls, so
-//! that samples can be received in between. A pending wake-up loses nothing, and taking it costs several system calls.
+//! A thread can sleep on the events of several sensors at once. Sleeping and taking the pending wake-ups are two calls,
+//! so that samples can be received in between. A wake-up that stays pending loses nothing, and taking wake-ups costs
+//! several system calls.
 #![allow(unsafe_code)]
 
 use std::os::fd::BorrowedFd;
@@ -40,8 +41,8 @@ pub struct WakeSender<S: Service = LocalService> {
 }
 
 impl<S: Service> WakeSender<S> {
-    /// Creates the sender of `sensor`. Create it before the sensor's topics, because a subscriber that finds a topic
-    /// sleeps on it.
+    /// Creates the sender of `sensor`. Create the sender before the sensor's topics, because a subscriber that finds a
+    /// topic sleeps on the events of this sender.
     ///
     /// # Errors
     ///
@@ -64,16 +65,16 @@ impl<S: Service> WakeSender<S> {
         self.ringer.attached()
     }
 
-    /// Returns whether the event has a listener.
+    /// Returns whether the event service has a listener.
     pub fn has_listeners(&self) -> bool {
         self.service.dynamic_config().number_of_listeners() > 0
     }
 
-    /// Sends `event` to its listeners.
+    /// Sends `event` to all listeners.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] if it could not be sent to some of them.
+    /// Returns [`Kind::Failed`] if `event` could not be sent to some of the listeners.
     pub fn notify(&self, event: WakeEvent) -> Result<(), Failure> {
         if !self.has_listeners() {
             return Ok(());
@@ -84,7 +85,7 @@ impl<S: Service> WakeSender<S> {
             .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake subscribers: {error:?}"), ""))
     }
 
-    /// Wakes all subscribers for `event`, whichever topics they follow.
+    /// Wakes all subscribers for `event`, regardless of their topics.
     ///
     /// # Errors
     ///
@@ -158,7 +159,8 @@ pub(crate) fn notifier<S: Service>(service: &WakeService<S>, event: usize) -> Re
     builder.create().map_err(|error| port_failure(service.name(), &error))
 }
 
-/// Returns a listener of the event of a sensor, and announces it to the hub, which notifies it from the next event on.
+/// Returns a listener of the events of a sensor, and announces the listener to the hub. The hub notifies the listener
+/// from the next event on.
 ///
 /// # Errors
 ///

@@ -1,5 +1,5 @@
-//! Two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one range
-//! per beam ([`SingleSurface`]), and one with several surfaces per beam ([`MultiSurface`]).
+//! Two methods that learn a background beam by beam, for a sensor that does not move: the method of the paper with one
+//! range per beam ([`SingleSurface`]), and a method with several surfaces per beam ([`MultiSurface`]).
 //!
 //! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of
 //! [`MultiSurface`] were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
@@ -8,7 +8,7 @@ use super::{Class, INVALID, Limits, RunFilter};
 use crate::search::position;
 use scanhub_schema::Background;
 
-/// State of the paper's method: one range per beam, which is replaced by a new range once it was read in a number of
+/// State of the paper's method: one range per beam. A new range replaces it once the new range was read in enough
 /// consecutive scans. A beam that flips between two surfaces never learns either of them.
 #[derive(Clone)]
 pub(super) struct SingleSurface {
@@ -33,9 +33,9 @@ impl SingleSurface {
         self.run.fill(0);
     }
 
-    /// Classifies the beams and learns from them (paper III.B.3). Beams without a reading neither count nor end a run.
-    /// Readings beyond the background count, but are never foreground. The scan that completes a run is compared with
-    /// the old background.
+    /// Classifies the beams and learns from them (paper III.B.3). A beam without a reading neither counts nor ends a
+    /// run. A reading behind the background counts, but is never foreground. The scan that completes a run is compared
+    /// with the old background.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
         for ((&reading, &background), class) in readings.iter().zip(&self.background).zip(classes) {
             let other = if reading < background { Class::Foreground } else { Class::Behind };
@@ -90,10 +90,10 @@ pub(super) struct MultiSurface {
     nearest: Box<[u16]>,
 }
 
-/// Surfaces of neighboring beams.
+/// Surfaces that a block of neighboring beams has met.
 ///
 /// In a room where nothing moves, each beam of most blocks meets the same fully known surface in every scan. Such a
-/// scan changes only the surface's range, so the block takes a short path with the same result.
+/// block changes only the range of each surface in a scan, so it takes a short path with the same result.
 #[derive(Clone)]
 #[cfg_attr(test, derive(Debug, PartialEq))]
 struct BeamBlock {
@@ -169,8 +169,8 @@ impl MultiSurface {
     }
 
     /// Classifies the beams between `right` and `left`, the nearest beams with a known background on either side. A
-    /// beam that is near both is foreground if it ends nearer than both, and meets no surface that it has met for a
-    /// while.
+    /// beam that is at most [`MAX_NEIGHBORS`] beams away from both is foreground if it ends nearer than both
+    /// backgrounds, and meets no surface that it has met for a while.
     fn compare_with_neighbors(
         &self,
         right: usize,
@@ -208,8 +208,8 @@ impl MultiSurface {
     }
 
     /// Returns the best known background of beam `i`, or the nearer one of two that are equally well known. A surface
-    /// takes precedence over no return, however frequent: a model that starts without a surface would report it as
-    /// foreground.
+    /// takes precedence over no return, however frequent no return is. A model that starts without the surface would
+    /// report it as foreground.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         if let Some(ranges) = &self.blocks[i / BLOCK_LEN].single_surfaces {
             return ranges[i % BLOCK_LEN];
@@ -288,9 +288,10 @@ impl BeamBlock {
         }
     }
 
-    /// Updates the surfaces. The beam met the surface that is nearest to the reading, if it is within the threshold.
-    /// The others lose weight: surfaces that the beam passed through lose more than those that may be hidden. If the
-    /// reading meets no surface, it replaces the surface with the lowest weight, unless all weights are too high.
+    /// Updates the surfaces. The beam met the surface that is nearest to the reading, if that surface is within the
+    /// threshold. The other surfaces lose weight. A surface that the beam passed through loses more weight than a
+    /// surface that may be hidden. If the reading meets no surface, it replaces the surface with the lowest weight,
+    /// unless all weights are too high.
     #[inline]
     fn learn(&mut self, readings: &[u16; BLOCK_LEN], bounds: WeightBounds) {
         match &mut self.single_surfaces {
@@ -322,7 +323,7 @@ impl BeamBlock {
         self.single_surfaces = self.single_surfaces(bounds.full);
     }
 
-    /// Returns the ranges of the surfaces, if each beam has only one, and its weight is `full`.
+    /// Returns the ranges of the surfaces, if each beam has only one surface, and the weight of that surface is `full`.
     #[inline]
     fn single_surfaces(&self, full: i16) -> Option<[u16; BLOCK_LEN]> {
         let (mut ranges, mut known, mut empty) = ([0; BLOCK_LEN], [0; BLOCK_LEN], [0; BLOCK_LEN]);
@@ -375,7 +376,7 @@ fn mask(is_set: bool) -> i16 {
     -i16::from(is_set)
 }
 
-/// Returns the surfaces of one beam after `reading`. The surface that was met gains this weight.
+/// Returns the surfaces of one beam after `reading`. The surface that the beam met gains this weight.
 #[inline]
 fn learned(
     range: [u16; SLOT_COUNT],
@@ -435,7 +436,7 @@ impl WeightBounds {
     }
 }
 
-/// Number of surfaces per beam: two at an edge, and one that may replace either.
+/// Number of surfaces per beam: two surfaces at an edge, and a third one that may replace either.
 const SLOT_COUNT: usize = 3;
 /// Number of beams of a [`BeamBlock`]: as many 16-bit numbers as the processor handles in one instruction.
 pub(super) const BLOCK_LEN: usize = 8;
@@ -447,26 +448,26 @@ const DRIFT_SHIFT: u32 = 4;
 const NO_WEIGHT: i16 = i16::MIN;
 /// Weight of a scan in which the surface was met. It is fully known after the configured number of scans.
 const MET_WEIGHT: i16 = 8;
-/// A surface also counts as met in the preceding scans without a return. It is at most this number of scans, including
-/// the one in which it was met, and at most one per this number of configured scans. A wall that returns 15 % of the
-/// beams therefore becomes background after 5/4 of the configured scans, and a lost beam does not make a standing
-/// person background any sooner.
+/// A surface also counts as met in the preceding scans without a return. The surface gains the weight of at most this
+/// number of scans, including the scan in which it was met. The number is also limited to one per this number of
+/// configured scans. A wall that returns 15 % of the beams therefore becomes background after 5/4 of the configured
+/// scans, and a lost beam does not make a standing person background any sooner.
 const MAX_NO_RETURN_SCANS: u16 = 16;
 const SCANS_PER_NO_RETURN: u16 = 16;
-/// Weight lost in a scan that saw something behind the surface. An object that was removed is no longer background
-/// after 3/4 of the configured scans, and a surface that is met in more than a third of the scans finally becomes
-/// background.
+/// Weight that a surface loses in a scan that saw something behind it. An object that was removed is no longer
+/// background after 3/4 of the configured scans, and a surface that is met in more than a third of the scans finally
+/// becomes background.
 const PASSED_LOSS: i16 = 4;
-/// Weight lost in a scan that saw something in front of the surface, which may still exist. It is not 0, because
-/// otherwise hidden surfaces could take all slots.
+/// Weight that a surface loses in a scan that saw something in front of it. The surface may still exist. It is not 0,
+/// because otherwise hidden surfaces could take all slots.
 const HIDDEN_LOSS: i16 = 1;
 /// Weight per configured scan from which on a surface is background: 5/8 of the full weight, so that readings may be
 /// missing.
 const KNOWN_WEIGHT: u16 = 5;
 /// Weight per configured scan below which a surface can be replaced.
 const REPLACEABLE_WEIGHT: u16 = 2;
-/// Number of beams on either side of an unknown beam. One of them must have a known background to replace the unknown
-/// one.
+/// Maximum number of beams from a beam with an unknown background to the nearest beam on each side whose known
+/// background is used instead.
 const MAX_NEIGHBORS: usize = 8;
 
 #[cfg(test)]
@@ -474,7 +475,7 @@ mod tests {
     use super::super::{ScanHead, Settings};
     use super::*;
 
-    /// Two whole blocks of beams and a part of one. Each beam has one surface, or a window.
+    /// Two whole blocks of beams and a part of one. Each beam hits one surface, or a window.
     const BEAMS: usize = 19;
 
     #[test]

@@ -1,6 +1,6 @@
 //! Background for a scanner that moves: a map of the standing objects around the robot, which scrolls with the robot. A
-//! beam that ends in space that was seen free is in the foreground. Space behind objects, and the edge of the space
-//! that was seen, are unknown. The robot's position is given with each scan.
+//! beam is in the foreground if it ends in space that earlier scans saw free. Space behind objects, and the edge of the
+//! space that was seen, are unknown. The robot's position is given with each scan.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -35,8 +35,8 @@ struct Cell {
     hits: u16,
     /// Number of scans that saw through the cell, minus an eighth of the number of scans in which a beam ended in it.
     free: u16,
-    /// Number of times that a beam ended in the cell after others had seen through. Chair legs are thinner than the
-    /// distance between two beams.
+    /// Number of times that a beam ended in the cell after other beams had seen through the cell. Chair legs are
+    /// thinner than the distance between two beams.
     returns: u8,
     /// Number of consecutive scans that saw through the cell.
     through: u8,
@@ -89,8 +89,9 @@ impl OccupancyMap {
         self.run_filter.reset();
     }
 
-    /// Takes the robot's position at the next scan from `motion`, and its `velocity` during that scan, for a sensor at
-    /// `pose`. Returns whether the map still shows the robot's surroundings: it does not after an uncertain step.
+    /// Takes the robot's position at the next scan from `motion`, and the robot's `velocity` during that scan. The
+    /// sensor is at `pose`. Returns whether the map still shows the robot's surroundings. After an uncertain step, it
+    /// does not.
     pub(super) fn set_motion(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) -> bool {
         let robot = Pose2::new(motion.x_m, motion.y_m, motion.yaw_rad);
         let (x, y) = robot.point((pose.x_m, pose.y_m));
@@ -258,7 +259,7 @@ impl OccupancyMap {
         }
     }
 
-    /// Returns the range of beam `i` without a foreground, in device units.
+    /// Returns the range at which beam `i` would end without a foreground, in device units.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         let Some(map_pose) = self.map_pose.filter(|map_pose| map_pose.unit_m > 0.0) else {
             return Background::UNKNOWN;
@@ -280,8 +281,8 @@ impl OccupancyMap {
 }
 
 impl Cell {
-    /// Returns whether an object stands in the cell. It must have stood there before the cell was seen free, or for
-    /// long enough.
+    /// Returns whether an object stands in the cell. The object must have stood there before the cell was seen free, or
+    /// must have stood there for long enough since.
     fn is_occupied(&self, limits: &Limits) -> bool {
         self.hits >= MIN_HITS && self.free < MIN_FREE_SCANS
             || self.hits >= limits.scans.max(MIN_HITS)
@@ -329,7 +330,7 @@ fn index(x: i32, y: i32) -> usize {
     (x.rem_euclid(MAP_WIDTH) * MAP_WIDTH + y.rem_euclid(MAP_WIDTH)) as usize
 }
 
-/// Width of a cell in meters. People are several cells wide, and a position is known to less than one.
+/// Width of a cell in meters. A person is several cells wide, and the error of a position is less than one cell.
 const CELL_M: f64 = 0.05;
 /// Number of cells on each side of the map: 40 m.
 const MAP_WIDTH: i32 = 800;
@@ -346,7 +347,8 @@ const MIN_RETURNS: u8 = 24;
 const MAX_THROUGH_SCANS: u8 = 60;
 /// Number of cells before the end of a beam that do not count as seen free.
 const END_MARGIN_CELLS: f32 = 2.5;
-/// Maximum standard deviation of a step with which the map continues. Otherwise, walls would appear in free space.
+/// Maximum standard deviation of a step after which the map is kept. With a larger error, walls would appear in free
+/// space.
 const MAX_STEP_SIGMA_M: f64 = CELL_M;
 /// Maximum distance of a robot from its start.
 const MAX_DISTANCE_M: f64 = 1e6;

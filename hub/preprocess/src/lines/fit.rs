@@ -1,11 +1,12 @@
-//! Fit of the line that is most likely for some beams with radial noise.
+//! Fit of the likeliest line for some beams whose noise is along the beams.
 //!
 //! A line is the pair (a, b) for which the beam in direction (cos, sin) meets it at the range 1 / (a cos + b sin): the
 //! normal form r = cos (t - alpha) * range with a = cos alpha / r and b = sin alpha / r. Ranges have normal noise along
 //! their beams. The likeliest line therefore has the minimum sum of squares of (measured range - range of the line).
-//! That difference is not linear in a and b. The expression range^2 (a cos + b sin) - range is linear, and is the same
-//! up to the factor measured / true range. Its sums are updated beam by beam ([`Sums`]). A few Gauss-Newton steps lead
-//! from its line to the likeliest one ([`LineEquation::refined`]).
+//! That difference is not linear in a and b. The expression range^2 (a cos + b sin) - range is linear, and differs from
+//! that difference only by the factor measured / true range. The sums of this expression are updated beam by beam
+//! ([`Sums`]), and give a first line. A few Gauss-Newton steps lead from the first line to the likeliest line
+//! ([`LineEquation::refined`]).
 
 /// A beam that has a range: its direction as a unit vector, and its range in meters.
 #[derive(Clone, Copy, Debug, Default)]
@@ -40,7 +41,8 @@ impl LineEquation {
         self.a * ray.cos + self.b * ray.sin
     }
 
-    /// Returns the sum of squares of the ranges' differences from the line, in m2; infinite if a ray does not meet it.
+    /// Returns the sum of the squared differences between the ranges and the line, in m2. It is infinite if a ray does
+    /// not meet the line.
     pub(super) fn error(&self, rays: &[Ray]) -> f64 {
         let mut sum = 0.0;
         for ray in rays {
@@ -96,7 +98,7 @@ impl LineEquation {
     }
 }
 
-/// Inverse of a range beyond that of every scanner: 10 km.
+/// Inverse of a range that no scanner reaches: 10 km.
 const MIN_INVERSE_RANGE: f64 = 1e-4;
 
 /// Information of rays about a line: the sums of the products of slopes, and of slope times difference.
@@ -182,7 +184,7 @@ impl Sums {
         }
     }
 
-    /// Returns the error of that line in m2.
+    /// Returns the error of the line with the minimum error, in m2.
     pub(super) fn error(&self) -> f64 {
         if self.count < 2.5 {
             return 0.0;

@@ -1,7 +1,7 @@
 //! Partition of the rays of a scan into pieces, each of which ends on one line.
 //!
-//! - Neighboring pieces are joined, starting with pairs of rays and with the cheapest join, until there are few enough
-//!   pieces and one more join would cost too much.
+//! - Neighboring pieces are joined. At first, each piece has two rays. The cheapest join is always the next one.
+//!   Joining ends when there are few enough pieces and one more join would cost too much.
 //! - The cuts between the pieces are moved to where they cost least.
 //! - Cuts are moved from where they help least to where they help most.
 //! - The rays at the ends of pieces that fit worst are dropped.
@@ -13,7 +13,7 @@ use super::fit::{LineEquation, Ray, Sums};
 pub(super) struct Bounds {
     /// Maximum number of pieces.
     pub(super) max: usize,
-    /// Below `max`, pieces are joined while that costs less than this, in m2.
+    /// If there are fewer than `max` pieces, a join must cost less than this, in m2.
     pub(super) penalty: f64,
     /// Variance of a range in m2. Two pieces whose own variance is greater are joined at a higher cost.
     pub(super) variance: f64,
@@ -25,14 +25,14 @@ pub(super) struct Bounds {
     pub(super) rounds: usize,
     /// Whether cuts are also moved from one piece to another.
     pub(super) exchange: bool,
-    /// Maximum number of rays at ends of pieces that may be dropped: those that fit worst.
+    /// Maximum number of rays at the ends of pieces that may be dropped. The rays that fit worst are dropped first.
     pub(super) trimmed: usize,
 }
 
 /// Pieces of a scan.
 pub(super) struct Pieces<'a> {
     pub(super) list: &'a [Piece],
-    /// Whether there were more pieces than allowed. The others were joined or dropped.
+    /// Whether there were more pieces than allowed. The excess pieces were joined or dropped.
     pub(super) is_full: bool,
 }
 
@@ -64,8 +64,8 @@ impl ScanPartitioner {
         Pieces { list: &self.pieces[..self.count], is_full }
     }
 
-    /// Creates a piece of each pair of rays. The last one of an odd group has three. Groups that are too small are
-    /// dropped.
+    /// Creates a piece of each pair of rays. In a group with an odd number of rays, the last piece has three. Groups
+    /// that are too small are dropped.
     fn begin(&mut self, rays: &[Ray], ends: &[u16], min_points: usize) {
         self.count = 0;
         let mut first = 0;
@@ -152,8 +152,8 @@ impl Piece {
         ((self.sums + next.sums).error() - apart) / (apart / free / variance).max(1.0)
     }
 
-    /// Adds the rays of `gap`, starting with those next to the piece, while they are within three standard deviations of its
-    /// line. Returns their number.
+    /// Adds the rays of `gap`, the rays next to the piece first, as long as each is within three standard deviations of
+    /// the line of the piece. Returns their number.
     fn grow<'a>(&mut self, gap: impl Iterator<Item = &'a Ray>, variance: f64) -> usize {
         let mut taken = 0;
         for ray in gap {
@@ -171,7 +171,7 @@ impl Piece {
     }
 }
 
-/// Joiner of neighboring pieces: their order, and the cost of joining each of them with the next one.
+/// Joiner of neighboring pieces. It has the order of the pieces, and the cost of joining each piece with the next one.
 struct Joiner {
     before: Box<[u16]>,
     after: Box<[u16]>,
@@ -188,7 +188,8 @@ impl Joiner {
         Joiner { before, after, costs: TournamentTree::new(beams) }
     }
 
-    /// Joins `pieces`. Returns how many are left, which are then the first ones, and whether there were more than allowed.
+    /// Joins `pieces`. Returns how many pieces are left, and whether there were more pieces than allowed. The pieces
+    /// that are left are then the first ones.
     pub(super) fn join(&mut self, pieces: &mut [Piece], bounds: &Bounds) -> (usize, bool) {
         self.begin(pieces, bounds.variance);
         let (mut remaining, mut is_full) = (pieces.len(), false);
@@ -278,7 +279,7 @@ impl Joiner {
 /// Tournament tree: finds the minimum of numbers that change one at a time.
 struct TournamentTree {
     values: Box<[f64]>,
-    /// Winner of each match. The root is 1; the numbers themselves follow after the matches.
+    /// Winner of each match. The root has index 1. The numbers follow after the matches.
     winners: Box<[u16]>,
     size: usize,
 }
@@ -337,7 +338,7 @@ impl TournamentTree {
     }
 }
 
-/// Moves each cut to where it costs least. Returns whether any moved.
+/// Moves each cut to where it costs least. Returns whether any cut moved.
 fn move_cuts(pieces: &mut [Piece], rays: &[Ray]) -> bool {
     let mut moved = false;
     for i in 1..pieces.len() {
@@ -363,7 +364,8 @@ fn move_cuts_until_stable(pieces: &mut [Piece], rays: &[Ray], rounds: usize) {
     }
 }
 
-/// Moves cuts from where they help least to where they help most, while that lowers the cost, at most once per piece.
+/// Moves cuts from where they help least to where they help most, as long as this lowers the cost, at most once per
+/// piece.
 fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     let min_points = bounds.min_points.max(2);
     for _ in 0..pieces.len() {
@@ -379,7 +381,7 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
             }
         }
         let (gain, split, cut, sums) = best;
-        // Find the neighbors that are cheapest to join, without the piece that will be cut.
+        // Find the two neighboring pieces that are cheapest to join, and leave out the piece that will be cut.
         let mut cheapest = (f64::INFINITY, 0);
         for i in 1..pieces.len() {
             let price = pieces[i - 1].join_cost(&pieces[i], bounds.variance);
@@ -408,7 +410,8 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     }
 }
 
-/// Drops rays at the ends of pieces, the most expensive one first, while it costs more than three average rays.
+/// Drops rays at the ends of pieces, the most expensive ray first, as long as that ray costs more than three average
+/// rays.
 fn trim(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     let count: usize = pieces.iter().map(Piece::len).sum();
     let mut error: f64 = pieces.iter().map(|piece| piece.error).sum();
@@ -474,5 +477,5 @@ fn best_cut(rays: &[Ray], left: &Piece, right: &Piece) -> Option<(usize, (Sums, 
     best.1
 }
 
-/// Maximum number of rounds. Cuts need fewer to settle.
+/// Maximum number of rounds in which cuts are moved. Cuts settle in fewer rounds.
 const MAX_ROUNDS: usize = 8;

@@ -66,8 +66,9 @@ pub(super) fn of_step(own: &Square, reference: &Square, start: &Pose2, step: &Po
     sum(&transformed(&back, own), &transformed(&by_before, reference))
 }
 
-/// Returns the covariance of `first` followed by `next`, whose covariances are `of_first` and `of_next`, as in Smith, Self and
-/// Cheeseman: "Estimating uncertain spatial relationships in robotics" (1990). The two errors must be independent.
+/// Returns the covariance of the step `first` followed by the step `next`. Their covariances are `of_first` and
+/// `of_next`. The method is from Smith, Self and Cheeseman: "Estimating uncertain spatial relationships in robotics"
+/// (1990). The two errors must be independent.
 pub(super) fn of_both(of_first: &Square, of_next: &Square, first: &Pose2, next: &Pose2) -> Square {
     let (x, y) = first.turned((next.x, next.y));
     let by_first = [[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]];

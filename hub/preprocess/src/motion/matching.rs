@@ -1,5 +1,5 @@
-//! Match of a scan with a reference scan. Each beam should end on the surface nearest to its end, so the position of
-//! the scan is the one at which the beams are off least.
+//! Match of a scan with a reference scan. Each beam should end on the surface that is nearest to its end. The position
+//! of the scan is therefore the position at which the beams are off least.
 //!
 //! A [`PreparedScan`] has the data of one scan for the comparison: its points, the surfaces on which they lie, and its
 //! lines.
@@ -16,7 +16,8 @@ use crate::velocity::{Pose2, is_whole};
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Match {
     pub(super) pose: Pose2,
-    /// Covariance of the position by the noise of the scan, and by that of the reference.
+    /// Covariance of the position that the noise of the scan causes, and covariance that the noise of the reference
+    /// causes.
     pub(super) own: Square,
     pub(super) of_reference: Square,
     /// Share of the readings that lie on surfaces.
@@ -24,7 +25,7 @@ pub(super) struct Match {
     /// Sum of the weights of the readings. A reading near a surface has more weight, so a match with a greater sum fits
     /// better.
     pub(super) weight: f64,
-    /// Whether a direction of the position is not known.
+    /// Whether there is a direction in which the position is unknown.
     pub(super) is_degenerate: bool,
     /// Whether the scans have a corner in common.
     pub(super) has_corners: bool,
@@ -46,12 +47,13 @@ struct Run {
     first: u16,
     /// Number of readings.
     all: u16,
-    /// Readings in space that was empty before.
+    /// Number of readings in space that was empty before.
     in_free_space: u16,
-    /// Readings on objects that moved before, and the maximum number of reference scans for which these are ignored.
+    /// Number of readings on objects that moved before, and maximum number of reference scans for which these objects
+    /// are ignored.
     on_moving_objects: u16,
     ignored_scans: u8,
-    /// Readings near a surface.
+    /// Number of readings near a surface.
     beams: u16,
     /// Sum of their squared distances from the surface, in variances of their noise.
     squared_distances: f64,
@@ -64,7 +66,7 @@ struct Sums {
     /// each direction.
     weight: Square,
     slope: [f64; 3],
-    /// Part of `weight` that surfaces of uncertain direction add by chance.
+    /// Part of `weight` that surfaces with an uncertain direction add by chance.
     chance: f64,
     own: Square,
     of_reference: Square,
@@ -79,7 +81,7 @@ struct Sums {
 struct Observability {
     values: [f64; 3],
     vectors: [[f64; 3]; 3],
-    /// For each direction, whether enough beams meet walls across it to be better than a guess.
+    /// For each direction, whether enough beams meet walls across it for an estimate that is better than a guess.
     is_significant: [bool; 3],
     /// For each direction, whether enough beams meet walls across it.
     is_known: [bool; 3],
@@ -92,8 +94,8 @@ impl ScanMatcher {
     }
 
     /// Returns the position of the current scan relative to the reference, near `begin`; `None` if too few beams match.
-    /// In directions that the surroundings do not define, the position is that of `begin`, with a standard deviation of
-    /// `unknown_m`.
+    /// In a direction that the surroundings do not define, the position is taken from `begin`, with a standard
+    /// deviation of `unknown_m`.
     pub(super) fn find(
         &mut self,
         reference: &PreparedScan,
@@ -150,7 +152,7 @@ impl ScanMatcher {
     /// Marks readings of moving objects. Returns whether the marked readings have changed. A run of neighboring
     /// readings is marked if one of these is true:
     ///
-    /// - Together, they are farther from surfaces than their noise.
+    /// - Together, the readings of the run are farther from surfaces than noise explains.
     /// - Most of them lie in space that was empty before.
     /// - Most of them lie on objects that moved before.
     fn mark_moving(&mut self, pair: &Pair<'_>, pose: &Pose2) -> bool {
@@ -220,8 +222,8 @@ struct SurfaceResidual {
     distance: f64,
     /// Whether the surface belongs to a moving object.
     is_moving: bool,
-    /// Variance of the residual by the noise of the current scan. `reference_variance` is that by the noise of the
-    /// reference.
+    /// Variance of the residual that the noise of the current scan causes. `reference_variance` is the variance that
+    /// the noise of the reference causes.
     current_variance: f64,
     reference_variance: f64,
 }
@@ -262,7 +264,7 @@ impl Pair<'_> {
     /// Returns the residual of reading `i`, if it is less than `width` away from a surface.
     fn residual(&self, i: usize, pose: &Pose2, width: f64) -> Option<SurfaceResidual> {
         let (reading, point) = (&self.current.readings()[i], pose.point(self.current.points()[i]));
-        // The nearest beam may end as far from the point as neighboring beams are apart.
+        // The end of the nearest beam may be as far from the point as two neighboring beams are from each other.
         let nearest = &self.reference.readings()[self.reference.nearest(point, width + MAX_SPACING_M)?];
         let surface = nearest.surface?;
         let distance = surface.distance(point);
@@ -321,8 +323,8 @@ fn scale(now: &PreparedScan) -> Option<f64> {
 }
 
 impl Observability {
-    /// Computes the observability from `sums`. A direction is known if enough beams meet walls across it, without the
-    /// part that chance adds.
+    /// Computes the observability from `sums`. A direction is known if enough beams meet walls across it. The part of
+    /// their weight that chance adds does not count.
     fn of(sums: &Sums, stride: usize) -> Observability {
         let (values, vectors) = eigen(sums.weight);
         let min_beams = (MIN_BEAMS as f64 / stride as f64).max(MIN_BEAM_SHARE * sums.weights);
@@ -350,8 +352,8 @@ impl Observability {
         step
     }
 
-    /// Returns the covariances of the position by the noise of the current scan and by that of the reference, in meters
-    /// and radians.
+    /// Returns the covariance of the position that the noise of the current scan causes, and the covariance that the
+    /// noise of the reference causes, in meters and radians.
     fn covariances(&self, sums: &Sums, scale: f64, unknown_m: f64) -> (Square, Square) {
         // If beams are off by more than their noise, the position is less certain.
         let factor = (sums.squared_distances / sums.expected).max(1.0);
@@ -392,8 +394,8 @@ fn same_corners(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) 
     current.lines.corners().iter().any(is_same)
 }
 
-/// Returns whether a line of the current scan at `pose` is also a line of the reference: both of its ends lie on that
-/// line, and the two overlap.
+/// Returns whether a line of the current scan at `pose` is also a line of the reference: both ends of the one line lie
+/// on the other line, and the two lines overlap.
 fn same_lines(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) -> bool {
     let near = MATCH_DEVIATIONS * reference.noise.hypot(current.noise) + MATCH_MARGIN_M;
     let is_same = |line: &Line| {
@@ -497,7 +499,7 @@ impl PreparedScan {
         }
     }
 
-    /// Sets the surface of the readings of each line, except of those that are far from it.
+    /// Sets the surface of the readings on each line. Readings that are far from their line are left out.
     fn set_surfaces_of_lines(&mut self) {
         for line in self.lines.lines() {
             let alpha = f64::from(line.alpha_rad);
@@ -608,8 +610,8 @@ impl PreparedScan {
     }
 
     /// Returns the index of the reading whose point is nearest to `point`, if it is nearer than `max_distance`. The
-    /// sine of the angle between a beam and `point` limits the distance of all beams farther aside from below, so only
-    /// a few beams are compared.
+    /// sine of the angle between a beam and the direction of `point` gives a lower bound for the distance of this beam
+    /// and all beams farther aside. Therefore only a few beams are compared.
     pub(super) fn nearest(&self, point: (f64, f64), max_distance: f64) -> Option<usize> {
         let (_, step, beams) = self.grid;
         if self.count == 0 {
@@ -657,7 +659,7 @@ impl Surface {
     }
 }
 
-/// Maximum distance of a beam from its surface in the first round. It is halved in each round.
+/// Maximum distance of a beam from its surface in the first round, in meters. It is halved in each round.
 const FIRST_WIDTH_M: f64 = 0.3;
 /// Maximum distance in the last rounds, in standard deviations. With this constant of Tukey, almost nothing is lost if
 /// there is only noise.
@@ -667,7 +669,7 @@ const MAX_ROUNDS: usize = 20;
 const COARSE_BEAMS: usize = 120;
 const MIN_STEP_M: f64 = 2e-5;
 const MIN_STEP_RAD: f64 = 1e-5;
-/// Minimum number of beams that define a direction. Fewer may be a leg.
+/// Minimum number of beams that define a direction. Fewer beams may come from a leg.
 const MIN_BEAMS: usize = 6;
 /// Minimum number of beams with which a direction is better than a guess.
 const MIN_SIGNIFICANT_BEAMS: f64 = 1.5;
@@ -675,8 +677,8 @@ const MIN_SIGNIFICANT_BEAMS: f64 = 1.5;
 const MIN_BEAM_SHARE: f64 = 0.03;
 /// Maximum number of readings in a run. In a longer run, one end of a wall could mark the whole wall as moving.
 const MAX_RUN_LEN: usize = 24;
-/// Maximum square that a reading adds, in variances of its noise, so that a few readings at an edge do not decide about
-/// the others.
+/// Maximum squared distance that a reading adds, in variances of its noise, so that a few readings at an edge do not
+/// decide about the others.
 const MAX_SQUARE: f64 = 9.0;
 /// Number of times that moving objects are searched for.
 const MAX_SEARCHES: usize = 2;
@@ -688,16 +690,17 @@ const IGNORED_SCANS: u8 = 3;
 const MIN_VARIANCE_SHARE: f64 = 0.05;
 /// Factor of the part of the weight that is expected by chance.
 const CHANCE_FACTOR: f64 = 2.0;
-/// Maximum distance of neighboring points whose surface is used for a point between them, in meters.
+/// Maximum distance between two neighboring points whose surface is used for a point between them, in meters.
 pub(super) const MAX_SPACING_M: f64 = 0.2;
-/// Maximum distance of equal corners and lines in standard deviations, and in addition to that in meters.
+/// Maximum distance between equal corners or equal lines: a number of standard deviations plus a distance in meters.
 const MATCH_DEVIATIONS: f64 = 3.0;
 const MATCH_MARGIN_M: f64 = 0.02;
 /// Minimum standard deviation of a range in meters, for errors of a scanner other than noise.
 const MIN_NOISE_M: f64 = 0.005;
 /// Number of neighbors on each side that define a surface.
 const SURFACE_NEIGHBORS: usize = 4;
-/// Maximum distance of two points of one object, in addition to that of a surface that is seen at a flat angle.
+/// Maximum distance between two points of one object, in meters. It is added to the distance that a surface at a flat
+/// angle explains.
 const MAX_CONNECTED_M: f64 = 0.1;
-/// Maximum variance of the direction of a surface: 10 degrees.
+/// Maximum variance of the direction of a surface, which is the square of 10 degrees.
 const MAX_DIRECTION_VARIANCE: f64 = 0.03;

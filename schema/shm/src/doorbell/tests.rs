@@ -18,7 +18,7 @@ struct Futex {
     changed: Condvar,
 }
 
-/// Number of wake-ups, and number of hubs that may still wake threads.
+/// Number of wake-ups so far, and number of hubs that may still wake threads.
 #[derive(Default)]
 struct Calls {
     wakes: u32,
@@ -146,8 +146,8 @@ fn spawn_hub(sensor: &Arc<Sensor>, act: impl FnOnce(&Sensor) + 'static) -> threa
 }
 
 /// Runs `act` in all interleavings with at most two switches away from a thread that could continue. Nearly all defects
-/// of this kind need no more, and it takes seconds instead of hours. Returns the number of interleavings in which `act`
-/// returns `false`.
+/// of this kind need no more switches. With this limit, a run takes seconds instead of hours. Returns the number of
+/// interleavings in which `act` returns `false`.
 fn count_lost_wakeups(act: impl Fn() -> bool + Sync + Send + 'static) -> usize {
     let lost = Arc::new(AtomicUsize::new(0));
     let count = lost.clone();
