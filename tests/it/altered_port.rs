@@ -62,7 +62,7 @@ fn a_program_that_is_known_to_change_ports_is_named() {
     let other = OtherProcess::open(&env.path("front"));
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
-    // Stands for any other program with this name.
+    // This symlink makes a process of `scanhub` look like ModemManager.
     symlink(env!("CARGO_BIN_EXE_scanhub"), env.path("ModemManager")).expect("a link");
     let mut command = Command::new(env.path("ModemManager"));
     command

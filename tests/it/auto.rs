@@ -185,8 +185,8 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
         assert!(counts.iter().all(|count| *count == 666), "{counts:?}");
         hub.end(how);
     }
-    // Connect another model that uses the same rate. Its first scans have the saved number of beams. The hub changes
-    // the number once it is certain.
+    // Connect another model that uses the same rate. The hub publishes its first scans with the saved number of beams,
+    // and changes the number once it is certain.
     env.kill_port_simulator(ld14p, "front");
     let _ld19 = env.simulator(&["front"], LD19_FLAGS);
     let hub = hub(&env);
@@ -206,7 +206,8 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
     assert_eq!(log.matches(message).count(), 1, "{log}");
 }
 
-/// A recording that starts during a stream contains no reply with the scanner's type, but a status with it.
+/// A recording that starts during a stream contains no reply with the scanner's type. It contains a status with the
+/// type.
 #[test]
 fn a_recording_has_the_model_of_its_scanner() {
     for (simulated, model) in [(LMS_FLAGS, "lms200"), (LD19_FLAGS, "ld19"), (A1_FLAGS, "a1")] {

@@ -7,7 +7,7 @@ use crate::testkit;
 use crate::testkit::{Outcome, Program, TERM, TestEnv, is_class, number};
 use serde_json::Value;
 
-/// Setting with which a wall is learned within a second.
+/// Setting with which the hub learns a wall within a second.
 const QUICK_LEARNING: &str = "--set=background.scans=20";
 
 fn simulator(env: &TestEnv) -> Program {
@@ -24,7 +24,7 @@ fn background_line(env: &TestEnv, arguments: &[&str]) -> Value {
     let [line] = &outcome.lines()[..] else { panic!("exactly one line was expected: {outcome}") };
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let mut line = line.clone();
-    // The hub may save the model at any time, and a file does not contain the time of this.
+    // The hub may save the model at any time, and a file does not contain the time at which the hub saved it.
     line.as_object_mut().map(|line| line.remove("kept_wall_ns"));
     line
 }

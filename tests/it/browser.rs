@@ -17,7 +17,7 @@ use crate::testkit::{Child, WAIT_TIMEOUT, spawn};
 /// Names of the program in Debian, with and without support for windows.
 const BROWSER_NAMES: [&str; 2] = ["chromium", "chromium-headless-shell"];
 
-/// Window and device with which a page is shown.
+/// Window and device in which the browser shows a page.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Appearance {
     pub(crate) width: u32,
@@ -93,7 +93,7 @@ impl Browser {
         let screen =
             json!({ "width": width, "height": height, "deviceScaleFactor": ratio, "mobile": is_phone });
         self.call("Emulation.setDeviceMetricsOverride", screen);
-        // With reduced motion, the view is in its final position after the next frame, however long that takes.
+        // With reduced motion, the view reaches its final position in the next frame, however long that frame takes.
         let features = json!([
             { "name": "prefers-color-scheme", "value": scheme },
             { "name": "prefers-reduced-motion", "value": "reduce" },

@@ -99,10 +99,11 @@ fn ends_processes_of_interrupted_runs() {
     ended.wait().expect("the process exits");
     let start = run.rsplit(':').next().expect("the start time of this process");
     let (target, ended_pid) = (env.path_argument("target"), ended.id());
-    // In the second case, another process has the ID of the test binary by now.
+    // The test binary of each process has ended. In the second case, another process now has its ID.
     let left =
         [format!("{target}:{ended_pid}:5"), format!("{target}:{own}:5")].map(|run| start_with_run(&run));
-    // The test binary still runs, started too late, is in another directory, or is not named.
+    // These test binaries must not match: one still runs, one started too late, one is in another directory, and one is
+    // not named.
     let kept = [
         format!("{target}:{own}:{start}"),
         format!("{target}:{ended_pid}:6"),
@@ -140,7 +141,7 @@ fn written_programs_start_at_once() {
     let env = TestEnv::new();
     let is_over = AtomicBool::new(false);
     thread::scope(|scope| {
-        // Threads that start processes: each child would inherit a file that this process has open for writing.
+        // These threads start processes. Each child would inherit a file that this process has open for writing.
         for _ in 0..4 {
             scope.spawn(|| {
                 while !is_over.load(Ordering::Relaxed) {

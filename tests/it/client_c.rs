@@ -1,5 +1,5 @@
-//! Library for C and C++, tested from outside: its header is compared with `schema`, and programs in C and C++ are
-//! built as users build them and run against a hub. These tests are skipped if there is no C compiler.
+//! Library for C and C++, tested from outside. The tests compare its header with `schema`. They also build programs in
+//! C and C++ as users do, and run these programs with a hub. The tests are skipped if there is no C compiler.
 
 pub(crate) mod installed;
 mod layout;
@@ -19,7 +19,7 @@ fn expect_success(output: &Output) -> String {
     text(&output.stdout)
 }
 
-/// Starts a program that finds the hub of this environment.
+/// Starts `program` with the arguments `words`. It finds the hub of `env`.
 fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
     let mut command = Command::new(program);
     command.args(words).env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
@@ -116,8 +116,8 @@ fn c_header_computes_the_same_values_as_schema() {
     }
 }
 
-/// Programs that wait by `doorbell`, `poll` or `event` or that spin receive the same samples, in the memory where the
-/// hub wrote them.
+/// Programs receive the same samples whether they wait by `doorbell`, `poll` or `event` or spin. The samples lie in the
+/// memory to which the hub wrote them.
 #[test]
 fn a_program_in_c_has_every_sample_in_shared_memory() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -282,7 +282,8 @@ fn zones_get_unknown_when_the_hub_is_killed() {
     }
 }
 
-/// The combined verdict is that of the worst sensor. First one sensor is switched off, then the hub is killed.
+/// The combined verdict is the verdict of the worst sensor. The test first switches off one sensor and then kills the
+/// hub.
 #[test]
 fn a_robot_is_as_unknown_as_its_worst_sensor() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -332,8 +333,8 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     }
 }
 
-/// Runs the program without checks of its memory, with those of the compiler, and with those of valgrind, because the
-/// library shares memory with the program.
+/// Runs the program without memory checks, with the compiler's checks, and with valgrind's checks. The checks matter
+/// because the library shares memory with the program.
 #[test]
 fn c_library_rejects_misuse() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -349,8 +350,8 @@ fn c_library_rejects_misuse() {
         Err(_) => eprintln!("not run with memory checks of the compiler, which has none"),
     }
     if is_installed("valgrind") {
-        // A child process keeps pointers to the memory of its parent, some of them into the middle of blocks. These
-        // blocks do not count as definite leaks.
+        // A child process has pointers into the middle of memory blocks that its parent allocated. These blocks are
+        // possible leaks, and only definite leaks are errors.
         let leaks = ["--leak-check=full", "--show-leak-kinds=definite", "--errors-for-leak-kinds=definite"];
         let known =
             concat!("--suppressions=", env!("CARGO_MANIFEST_DIR"), "/tests/it/client_c/valgrind.supp");
@@ -367,8 +368,7 @@ fn c_library_rejects_misuse() {
     }
 }
 
-/// Builds the examples in the ways that their page describes, and a program into which the library is linked
-/// statically.
+/// Builds the examples in the ways that their page describes. Also builds a program that links the library statically.
 #[test]
 fn the_examples_build_and_run() {
     let Some(installed) = InstalledLibrary::installed() else { return };

@@ -11,7 +11,7 @@ use crate::testkit::{Child, INT, TERM, TestEnv, number, spawn, terminal, wait_un
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Running `scanhub configure` in a terminal, in which the test answers its question.
+/// A running `scanhub configure`. It has a terminal in which the test answers its question.
 struct ConfigureSession {
     process: Child,
     /// User's side of the terminal.
@@ -43,7 +43,7 @@ impl ConfigureSession {
         });
         let mut errors = Vec::new();
         let mut byte = [0];
-        // Reading from a terminal that no program has open any more fails with an error.
+        // Once no program has the terminal open, reading from it fails with an error.
         while !errors.ends_with(b"Type yes: ") && self.keys.read(&mut byte).is_ok_and(|len| len > 0) {
             errors.push(byte[0]);
         }

@@ -43,7 +43,7 @@ fn paused_sensor_stops_and_resumes_without_a_gap() {
         subscribers[2].await_lines(10, "a scan of the other sensor", is_class("scan"));
         before == sent
     });
-    // The hub repeats the status during the pause, so the second one was sent after it began.
+    // The hub repeats the status during the pause, so it sent the second status after the pause had begun.
     let statuses = env.run(&["echo", "front/status", "-n", "2", "--timeout", "5s"]);
     assert_eq!(statuses.exit_code, Some(0), "{statuses}");
     let paused = env.info("front");

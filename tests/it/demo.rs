@@ -10,7 +10,7 @@ use crate::testkit::{
 };
 use crate::web::{channels, connect_viewer};
 
-/// Runs the demo with an empty environment. `end` waits for its end, and may cause it.
+/// Runs the demo with an empty environment. `end` waits until the demo exits, and may make it exit.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     let place = tempfile::tempdir().expect("a directory");
@@ -248,7 +248,7 @@ fn second_interrupt_ends_at_once() {
         let mut echo = run_in_demo(domain, &["echo", "front/scan"]);
         echo.await_lines(2, "a scan", testkit::is_class("scan"));
         assert_eq!(echo.end(INT).exit_code, Some(0));
-        // Telegrams that a stopped simulator has not sent never arrive, so the demo waits for them.
+        // Stop the simulator, so that the demo waits for telegrams that never arrive.
         let simulator = process_of(domain, "simulate");
         rustix::process::kill_process(simulator, rustix::process::Signal::STOP).expect("the process runs");
         program.signal(INT);

@@ -9,8 +9,8 @@ use rustix::io::Errno;
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Returns state and finding of the check `name`, followed by its remedy. `port` is the port of the line, if it has
-/// one.
+/// Returns state and finding of the check `name`, and appends the remedy to the finding. `port` is the port of the
+/// line, if the line has one.
 fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str, String) {
     let found = findings.iter().find(|line| line["name"] == name && line["port"].as_str() == port);
     let found = found.unwrap_or_else(|| panic!("no {name} of {port:?}: {findings:#?}"));
@@ -25,8 +25,8 @@ fn doctor(env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome)
     checks(run(env, arguments), code)
 }
 
-/// Runs the same as [`doctor`], for the scanner at `port`. On a busy machine, a simulated scanner may reply too late;
-/// `doctor` is then run again.
+/// Runs [`doctor`] for the scanner at `port`. On a busy machine, a simulated scanner may reply too late. This function
+/// then runs `doctor` again.
 fn doctor_of_port(port: &str, env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
     let is_late =
         |line: &Value| line["name"] == "sensor" && line["port"] == port && line["state"] == "failed";

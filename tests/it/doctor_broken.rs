@@ -1,5 +1,5 @@
 //! Setups with faults between scanner and configuration: `scanhub doctor` finds each fault and names the remedy.
-//! `--nocapture` prints them as a table. Faults of the machine are in `doctor_machine.rs`.
+//! `--nocapture` prints the faults as a table. Faults of the machine are in `doctor_machine.rs`.
 
 use std::fs::{self, File};
 use std::net::TcpListener;

@@ -7,12 +7,12 @@ use std::cell::RefCell;
 use crate::testkit::{INT, Program, TERM, TestEnv, checked_topic_seqs, is_class, number};
 use serde_json::Value;
 
-/// World with a post in the smaller zone, to the right and a little ahead. It is in the first third of each telegram
-/// and of each revolution.
+/// World with a post in the smaller zone, to the right and a little ahead. The post is in the first third of each
+/// telegram and of each revolution.
 pub(crate) const POST_WORLD: &str = "[noise]\nerrors = 0\n[[thing]]\nradius_mm = 60\npose = [460, 200]\n\
     [[thing]]\nline = [[-3000, -1000], [3000, -1000], [3000, 4000], [-3000, 4000], [-3000, -1000]]\n";
 
-/// Scanner: flags of the simulator, keys of the link, and slightly more beams than a third of its scan has.
+/// Scanner: flags of the simulator, keys of the link, and a number of beams slightly above a third of a scan.
 struct Scanner {
     flags: &'static [&'static str],
     keys: &'static [&'static str],
@@ -39,8 +39,8 @@ impl Scanner {
     }
 }
 
-/// Receives `front/early` and `front/zones` from a line with `faults` until `is_enough` is true for the fates of the
-/// warnings. Asserts that no warning is wrong.
+/// Receives `front/early` and `front/zones` from a line with `faults`. Ends when `is_enough` returns true for the fates
+/// of the warnings. Asserts that no warning is wrong.
 fn check_warnings(
     env: &TestEnv,
     scanner: &Scanner,
@@ -121,7 +121,8 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
         if is_withdrawn(line) {
             let stood = at.checked_sub(1).map(|before| warnings[before].line);
             let is_its = stood.is_some_and(|stood| !is_withdrawn(stood) && is_of_same(stood));
-            // The first sample that the client receives may withdraw a warning from before it attached.
+            // The first sample that the client receives may withdraw a warning that the hub sent before the client
+            // attached.
             if !is_its && *missed == 0 && at > 0 {
                 counts.wrong.push(format!("nothing to withdraw: {line}"));
             }
@@ -146,8 +147,8 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
             }
             _ => {}
         }
-        // The `seq` of a warning for a revolution is that of a packet before it is complete, so the zones of the scan
-        // have a greater one.
+        // A warning for a revolution has the `seq` of a packet that arrives before the revolution is complete. The
+        // zones of the scan therefore have a greater `seq`.
         let is_telegram = number(line, "bytes_seen") > 0;
         let of_scan = zones.iter().position(|zones| number(zones.line, "seq") >= seq);
         let Some(NumberedSample { line: of_scan, missed }) = of_scan.map(|at| &zones[at]) else {
@@ -205,7 +206,8 @@ fn warning_of_a_damaged_telegram_is_withdrawn() {
     });
 }
 
-/// Line that loses most of some revolutions. The hub counts them as lost and publishes no scan of them.
+/// Flag for a line that loses most of some revolutions. The hub counts these revolutions as lost and publishes no scan
+/// of them.
 const GAPS: &str = "--fault=silence=0.07,silence_at=3,silence_every=0.3";
 
 #[test]

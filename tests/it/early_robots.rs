@@ -69,8 +69,8 @@ impl SimulatedSensor {
     }
 }
 
-/// Starts programs that print the verdict of `robot1.front`, each one with and without warnings. The flag is whether it
-/// uses warnings.
+/// Starts programs that print the verdict of `robot1.front`: each program once with warnings and once without them. The
+/// flag is true for a program that uses warnings.
 fn start_robots(env: &TestEnv) -> Vec<(bool, Program)> {
     let mut commands = Vec::new();
     for early in [false, true] {

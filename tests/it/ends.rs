@@ -1,4 +1,4 @@
-//! Exits of programs after a signal, after a reader has closed the pipe, and after being killed, and the files that
+//! Tests how programs exit after a signal, after the reader of a pipe has closed it, and after SIGKILL, and which files
 //! remain.
 
 use std::fs::{self, File};

@@ -10,9 +10,9 @@ use rustix::fs::{CWD, FileType, Mode, mknodat};
 use crate::foreign_user::{OTHER_UID, scanhub, with_another_user};
 use crate::testkit::{Outcome, Program, TestEnv};
 
-/// Command lines with an input file in place of `FILE`, and whether the file is a recording, which may have any size.
-/// `doctor` is not in this list, because it reports such a file as a failed check. Neither are files that a
-/// configuration names, because their name is a value of the configuration (78).
+/// Command lines in which `FILE` stands for an input file. The flag is true if the file is a recording, which may have
+/// any size. `doctor` is not in this list, because it reports an unreadable file as a failed check. A file that a
+/// configuration names is not in it either, because the file name is a value of the configuration (78).
 const INPUT_COMMANDS: [(&str, bool); 20] = [
     ("run --no-system-config --config FILE", false),
     ("run --no-system-config --link=a=file:FILE", true),
@@ -36,7 +36,7 @@ const INPUT_COMMANDS: [(&str, bool); 20] = [
     ("site check FILE", false),
 ];
 
-/// Command lines with an output file in place of `FILE`.
+/// Command lines in which `FILE` stands for an output file.
 const OUTPUT_COMMANDS: [&str; 6] = [
     "record --output FILE",
     "convert LOG FILE",
@@ -49,7 +49,7 @@ const OUTPUT_COMMANDS: [&str; 6] = [
 const SITE_FILE: &str = "[[sensor]]\nname = \"front\"\npose = { x = 0, y = 0, yaw = 0 }\n[[room]]\nname = \"a\\u0007<b>\"\npolygon = \
                     [[0, 0], [4, 0], [4, 3]]\n";
 
-/// Runs the program with the words of `line`, with `file` in place of `FILE`.
+/// Runs the program with the words of `line`, and replaces `FILE` by `file`.
 fn run(env: &TestEnv, line: &str, file: &str) -> Outcome {
     let words: Vec<String> = line
         .split(' ')

@@ -35,8 +35,9 @@ fn resident_kb(pid: u32) -> u64 {
     line.split_whitespace().nth(1).and_then(|number| number.parse().ok()).expect("a number")
 }
 
-/// Waits for all telegrams in `sent`, in order and with the same bytes. By chance, one in 65,536 random frames has a
-/// right checksum. Such telegrams must be marked as suspect; returns their number.
+/// Waits for all telegrams in `sent`, in order and with the same bytes. One in 65,536 random frames has a right
+/// checksum by chance. The hub must mark each telegram from random bytes as suspect. Returns the number of these
+/// telegrams.
 fn receive(subscriber: &mut Program, sent: &[Vec<u8>]) -> u64 {
     let mut wrong = 0;
     for sent in sent {
@@ -108,7 +109,7 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
     let hub = env.hub(&[link]);
     let mut subscriber = env.echo(&["front/telegram"]);
     let (mut server, _) = listener.accept().expect("the hub connects");
-    // Send more than is allowed at once, with telegrams in it, and then endless garbage.
+    // Send more bytes than the hub accepts at once, with telegrams among them. Then send garbage without end.
     let mut random = Rng::with_seed(5);
     let sent: Vec<Vec<u8>> = (0..20).map(|number| scan(1000 + number)).collect();
     let steady = scan(0);

@@ -1,6 +1,6 @@
-//! Quality of the method `multi`: it separates people from a room, and better than the paper's method. Each scene that
-//! has a target is run once. `benches/perception` runs each scene ten times. Changes of the simulated world or of a
-//! method show here first.
+//! Quality of the background method `multi`: it separates people from a room, and does so better than the paper's
+//! method. This test runs each scene that has a target once. `benches/perception` runs each scene ten times. Changes of
+//! the simulated world or of a method show here first.
 
 #[path = "../testkit/foreground.rs"]
 mod scenes;
@@ -53,8 +53,8 @@ fn boxes_are_learned_and_forgotten() {
     );
 }
 
-/// A model that starts with a saved background, which has one range per beam, reports no more wrong beams than a model
-/// that was not interrupted.
+/// A saved background has one range per beam. A model that starts with it reports no more wrong beams than a model that
+/// was not interrupted.
 #[test]
 fn a_model_taken_back_is_right_at_once() {
     for world in ["fig8", "faint"] {

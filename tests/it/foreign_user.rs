@@ -1,6 +1,6 @@
-//! Attacks by another user of the same machine: the hub and its clients name that user, but are not harmed otherwise.
-//! Each test has its own /tmp and /dev/shm. The programs run as root, whom no permission stops, and the attacker is
-//! another user.
+//! Attacks by another user of the same machine. The hub and its clients may refuse to run and then name that user, but
+//! the attacks do no other harm. Each test has its own /tmp and /dev/shm. The programs run as root, so no permission
+//! stops them. The attacker is another user.
 
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt, symlink};
@@ -159,7 +159,7 @@ fn segments(env: &TestEnv) -> Vec<PathBuf> {
     paths
 }
 
-/// Returns the operations on `path` that another user is allowed: its mode if it is not private, and attacks that
+/// Returns what another user may do with `path`: the mode of `path` if it is not private, and each attack that
 /// succeeded.
 fn allowed_attacks(path: &Path) -> Vec<String> {
     let mode = fs::metadata(path).map_or(0, |metadata| metadata.mode() & 0o077);
@@ -186,7 +186,8 @@ fn shared_memory_of_strangers() {
         let hub = env.hub(&[env.link("front")]);
         let mut subscriber = env.echo(&["front/scan"]);
         let mut allowed = Vec::new();
-        // With its next scans, the hub removes segments of a subscriber that has exited, perhaps during the attacks.
+        // With its next scans, the hub removes the segments of a subscriber that has exited. It may do so during the
+        // attacks.
         wait_until("the attacks change nothing", || {
             let own = segments(&env);
             subscriber.await_lines(10, "a scan", is_class("scan"));
@@ -195,7 +196,7 @@ fn shared_memory_of_strangers() {
             own == segments(&env)
         });
         assert!(allowed.is_empty(), "{allowed:?}");
-        // Now that every user can see the prefix, useless files with it do no harm.
+        // Every user can see the prefix now. Useless files with this prefix do no harm.
         let prefix =
             fs::read_to_string(env.domain().root().join("prefix")).expect("the hub has written its prefix");
         let prefix = prefix.trim_end();

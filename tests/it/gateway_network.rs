@@ -41,8 +41,8 @@ fn await_growth(gateway: &mut Program, key: &str) {
     wait_until(key, || current() > now + 3);
 }
 
-/// Returns the first sequence number that the counters of `row` can start with: that of its first datagram, or the next
-/// number in an earlier announcement.
+/// Returns the first sequence number that the counters of `row` include: the number of the first datagram, or the next
+/// number in an announcement that arrived earlier.
 fn first_sequence(received: &[Vec<u8>], row: &StreamCounters) -> u64 {
     let found = received.iter().find_map(|bytes| {
         let Datagram { head, payload, .. } = decode_datagram(bytes);
@@ -59,7 +59,7 @@ fn first_sequence(received: &[Vec<u8>], row: &StreamCounters) -> u64 {
     u64::from(found.expect("a datagram of the row was received"))
 }
 
-/// Asserts that each sequence number from the first received one on was used once: each datagram was received, or the
+/// Asserts that each sequence number from [`first_sequence`] on was used once: the datagram was received, or the
 /// gateway counted it as failed.
 fn check_gap_free(received: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");

@@ -40,8 +40,9 @@ fn next_hub_begins_its_search_at_the_saved_rate() {
     assert!(outcome.stderr.contains("delete it; its content is learned again"), "{outcome}");
 }
 
-/// Runs a hub until it has sent a request on `line`, and returns its outcome with the log. The log shows where the
-/// search started. The baud rate of the line does not, because on a busy machine the test may read a later one.
+/// Runs a hub until it has sent a request on `line`, and returns its outcome with the log. The log shows at which rate
+/// the search started. The rate of the line does not show this, because the test may read a later rate on a busy
+/// machine.
 fn search(env: &TestEnv, line: &TestLine, link: String) -> Outcome {
     let mut command = env.command(&["run", "--json", &link]);
     command.env("SCANHUB_LOG", "debug");

@@ -1,5 +1,5 @@
-//! `scanhub latency` with a streaming hub: the parts of an age add up, an exceeded limit ends it with 5, and for remote
-//! sensors it reports the parts that this machine can measure.
+//! `scanhub latency` with a streaming hub: the parts of an age add up, and the verb exits with 5 if a limit is
+//! exceeded. For remote sensors, it reports the parts that this machine can measure.
 
 use std::collections::BTreeSet;
 
@@ -49,7 +49,7 @@ fn ages_of_a_stream_are_split_and_judged() {
         assert_eq!((number(&line, "received"), number(&line, "in_future")), (20, 0), "{line}");
         assert_eq!(line["flags"][0], "simulated");
         assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
-        // A header cannot hold the long time that a sample may spend in the hub on a busy machine.
+        // On a busy machine, a sample may spend more time in the hub than a header can hold.
         let in_hub = count(&line, "hub");
         assert!(in_hub == count(&line, "wake") && in_hub <= count(&line, "age"), "{line}");
         // If the stamps of a telegram were estimated on a busy machine, its time on the line is unknown.

@@ -301,7 +301,7 @@ fn on_a_terminal_one_line_is_drawn_over_itself() {
         command.stdin(Stdio::null()).stderr(Stdio::null()).stdout(Stdio::from(screen));
         let mut process = spawn(command).unwrap();
         let mut printed = Vec::new();
-        // Reading from a terminal that no program has open any more fails with an error.
+        // Once no program has the terminal open, reading from it fails with an error.
         let _ = keys.read_to_end(&mut printed);
         assert_eq!(process.wait().unwrap().code(), Some(3));
         let text = String::from_utf8(printed).unwrap();

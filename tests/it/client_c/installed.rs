@@ -32,7 +32,7 @@ impl InstalledLibrary {
             let _ = std::fs::remove_dir_all(&here);
             let (prefix, library) = (here.join("prefix"), here.join("library"));
             std::fs::create_dir_all(&library).expect("a directory");
-            // Without the static library, which has 100 MB.
+            // Leave out the static library, which has 100 MB.
             let shared = "libscanhub.so";
             std::os::unix::fs::symlink(build_directory().join(shared), library.join(shared))
                 .expect("the link can be created");
@@ -95,13 +95,13 @@ impl InstalledLibrary {
         Some(program.unwrap_or_else(|message| panic!("{message}")))
     }
 
-    /// Builds the project `source` with CMake in each way in which CMake can find the package. Returns the build
-    /// directories, which is an empty list if a tool is missing.
+    /// Builds the project `source` with CMake, once for each way in which CMake can find the package. Returns the build
+    /// directories, or an empty list if a tool is missing.
     pub(crate) fn cmake(&self, env: &TestEnv, source: &Path) -> Vec<PathBuf> {
         if !["cmake", "c++"].into_iter().all(is_installed) {
             return Vec::new();
         }
-        // A package that contains the path of its prefix does not work after this.
+        // After this move, a package that contains the path of its prefix would not work.
         let moved = env.path("moved");
         let mut copy = Command::new("cp");
         copy.arg("-a").arg(&self.prefix).arg(&moved);

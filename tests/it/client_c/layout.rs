@@ -72,7 +72,8 @@ pub(crate) fn program() -> String {
     format!("#include <scanhub/attach.h>\n#include <stdio.h>\nint main(void) {{\n{says}return 0;\n}}\n")
 }
 
-/// Returns scans of all kinds: LMS scans in each mode, revolutions with all arrays and without any, and an empty scan.
+/// Returns scans of all kinds: LMS scans in each mode, revolutions with all arrays, revolutions without arrays, and an
+/// empty scan.
 pub(crate) fn scans() -> Vec<Box<Scan>> {
     let ranges = |count: u32, greatest: u32| -> Vec<u16> {
         (0..count).map(|i| (greatest - (i * 3) % 40) as u16).collect()
@@ -112,8 +113,8 @@ pub(crate) fn scans() -> Vec<Box<Scan>> {
     scans
 }
 
-/// Returns a program that computes the values that the header provides for all beams of `scan` and for three more. For
-/// an invalid sample and for one that is cut short, it checks that no value is read outside of it.
+/// Returns a C program that prints the values that the header computes for each beam of `scan` and for three beams
+/// more. The program also checks that the header reads nothing outside of an invalid or a truncated sample.
 pub(crate) fn computed_values_c(header: &Header, scan: &Scan) -> String {
     let bytes = scan.bytes();
     let list: Vec<String> = bytes.iter().map(u8::to_string).collect();

@@ -1,4 +1,5 @@
-//! Golden datagrams with a MAC, and the result for each in a receiver with the key that gets them one after the other.
+//! Golden datagrams with a MAC, and the result for each one. The receiver has the key and receives the datagrams in
+//! order.
 
 use std::fs;
 use std::path::Path;

@@ -20,8 +20,8 @@ fn await_link(gateway: &mut Program, to: &str, state: &str) {
     gateway.await_line(state, is_it);
 }
 
-/// Waits until the statistics, which are printed every second, have at least `min_increase` more failures to `to` than
-/// the first ones.
+/// Waits until the gateway has counted at least `min_increase` more failed datagrams to `to` than in its first
+/// statistics. The gateway prints statistics every second.
 fn await_failures(gateway: &mut Program, to: &str, min_increase: u64) {
     let count =
         |line: &Value| (line["class"] == "lan_to" && line["to"] == to).then(|| number(line, "send_failed"));
@@ -29,7 +29,7 @@ fn await_failures(gateway: &mut Program, to: &str, min_increase: u64) {
     gateway.await_line("failures", |line| count(line).is_some_and(|failed| failed >= before + min_increase));
 }
 
-/// Returns the total numbers of datagrams to `to` that were sent and that failed.
+/// Returns how many datagrams to `to` were sent, and how many failed.
 fn sent_and_failed(outcome: &Outcome, to: &str) -> (u64, u64) {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let last = outcome.of_class("lan_to").into_iter().rfind(|line| line["to"] == to);
@@ -37,7 +37,7 @@ fn sent_and_failed(outcome: &Outcome, to: &str) -> (u64, u64) {
     (number(&last, "sent"), number(&last, "send_failed"))
 }
 
-/// Returns the total numbers of datagrams that a receiver received and that it counts as lost.
+/// Returns how many datagrams a receiver received, and how many it counts as lost.
 fn count_received_and_lost(received: &[Vec<u8>]) -> (u64, u64) {
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
     received.iter().for_each(|bytes| assert!(table.receive(bytes, 1, 0).is_ok()));

@@ -46,8 +46,8 @@ impl Reader {
     }
 }
 
-/// Asserts that the reader's result for every golden datagram is that of the list. If the result in the list depends on
-/// earlier datagrams or on a key, the reader must agree with `schema`, which reads the datagram alone.
+/// Asserts that the reader's result for each golden datagram equals the result in the list. If the result in the list
+/// depends on earlier datagrams or on a key, the reader must agree with `schema`, which reads the datagram alone.
 pub(crate) fn check_vectors(reader: &mut Reader) {
     for vector in vectors::vectors() {
         let says = vector.description.as_object().expect("an object");

@@ -9,9 +9,9 @@ use serde_json::Value;
 pub(crate) struct Vector {
     pub(crate) name: String,
     pub(crate) bytes: Vec<u8>,
-    /// `head` and `payload` of an accepted datagram; otherwise `refusal` and, if the receiver needs a history,
-    /// `with_key`, `after` (names of datagrams that it received before), `after_hubs` (number of other hubs that
-    /// delivered for a second before), or `from_another` (a sender other than that of the datagrams before).
+    /// `head` and `payload` of an accepted datagram, or `refusal` of a refused one. If the receiver needs a history,
+    /// this also has `with_key`, `after` (names of the datagrams that it received before), `after_hubs` (number of
+    /// other hubs that delivered for a second before), or `from_another` (another sender sent the datagrams before).
     pub(crate) description: Value,
 }
 

@@ -10,8 +10,8 @@ use scanhub_schema::datagram::{DatagramPayload, HEADER_LEN, Head};
 use scanhub_schema::{EventKind, Family, PointClass, State, Topic, TrackState, Verdict, Zones};
 use serde_json::Value;
 
-/// Returns the values of a payload in the list by the dissector's name of their field, in order and as the dissector
-/// shows them.
+/// Returns the values of the payload `description`, which is from the list. The key is the dissector's name of a field.
+/// The values are in order and in the format in which the dissector shows them.
 fn fields(topic: &str, description: &Value) -> BTreeMap<String, Vec<String>> {
     let mut fields = BTreeMap::new();
     flatten(topic, "", description, &mut fields);
@@ -116,7 +116,7 @@ fn golden_datagrams_are_shown_field_by_field() {
                 target.insert("scanhub.refused".to_owned(), Vec::new());
                 target.insert("scanhub.crc_status".to_owned(), vec!["good".to_owned()]);
             }
-            // The dissector shows a part as such, without the content of the sample.
+            // The dissector marks a part, and does not show the content of its sample.
             Some("payload") if vector.name.starts_with("scan_part_") => {
                 let part = vector.name.trim_start_matches("scan_part_");
                 for (field, value) in [("part", part), ("parts", "3"), ("crc_status", "good")] {
