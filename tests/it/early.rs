@@ -226,7 +226,7 @@ fn warnings_are_computed_only_for_subscribers() {
         let mut zones = env.echo(&["front/zones"]);
         zones.await_lines(10, "a post", |line| line["verdict"] == "stop");
         let first = env.echo(&["front/early"]).await_line("a warning", is_class("early"));
-        // Results that the hub computed without sending them have a number, too.
+        // The hub numbers every warning that it computes. The number 0 shows that it has computed none before.
         assert_eq!(number(&first, "topic_seq"), 0, "{first}");
     }
 }

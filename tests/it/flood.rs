@@ -67,8 +67,8 @@ fn telegrams_in_a_flood_of_garbage() {
             line.send(&sent[sent.len() - 1]);
         }
     };
-    // Send a stream until the hub has adopted it and has stopped requesting the sensor's mode, because this test does
-    // not reply. The first flood then makes the hub touch all memory that it will ever use.
+    // Send a stream until the hub has adopted it and no longer requests the scanner's mode. This test does not reply to
+    // requests. The first flood then makes the hub touch all memory that it will ever use.
     let steady = scan(0);
     line.send(&[&steady[..], &steady].concat());
     subscriber.await_lines(2, "the stream", is_class("telegram"));

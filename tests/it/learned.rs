@@ -1,5 +1,5 @@
-//! Saved backgrounds: the next hub starts with the background that the previous one has learned, even if that one was
-//! killed. It does not if the background would be wrong: at another pose, after a reset, with other settings, or in a
+//! Saved backgrounds: a hub starts with the background that the previous hub learned, even if that hub was killed. It
+//! does not use the background if this would be wrong: at another pose, after a reset, with other settings, or in a
 //! recording.
 
 use std::fs;
@@ -12,7 +12,8 @@ use serde_json::Value;
 
 /// Setting with which a hub learns the background within a test.
 const QUICK_LEARNING: &str = "--set=background.scans=20";
-/// Setting with which a hub does not learn a background within a test, so that a known background must be a loaded one.
+/// Setting with which a hub does not learn a background within a test, so that a known background must come from a
+/// file.
 const SLOW_LEARNING: &str = "--set=background.scans=8191";
 
 /// World with a wall around the sensor, 3 m ahead.
@@ -118,7 +119,7 @@ fn unusable_or_unwanted_background_is_not_loaded() {
     );
     empty(&["--set=background.keep=false"], "");
     empty(&["--set=background.start=empty"], "");
-    // Damaged, cut short, of another sensor, or writable by other users.
+    // Files that are damaged, truncated, from another sensor, or writable by other users.
     let text = String::from_utf8(kept.clone()).expect("text");
     for (wrong, why) in [
         (text[..text.len() / 2].to_owned(), "cut short"),

@@ -114,7 +114,7 @@ fn leds_show_the_verdict_and_red_without_one() {
         assert_eq!(line["mark"], line["marks"].as_u64().is_some_and(|marks| marks > 0), "{line}");
     }
     for pair in lines.windows(2) {
-        // A busy machine may lose scans. A line is then printed because its reason changes.
+        // On a busy machine, scans may be lost. `leds` then prints a line because the reason has changed.
         let shown = |line: &Value| ["verdict", "marks", "reason"].map(|key| line[key].clone());
         assert!(shown(&pair[0]) != shown(&pair[1]), "no change: {pair:#?}");
     }

@@ -1,5 +1,5 @@
-//! Shortage of descriptors: a program that cannot work reports it and exits with 75. A hub that runs out of them
-//! continues to serve its subscribers, and reports that others receive nothing.
+//! Shortage of descriptors: a program that cannot work reports it and exits with 75. A hub that runs out of descriptors
+//! continues to serve its subscribers, and reports that new subscribers receive nothing.
 
 use std::process::Command;
 

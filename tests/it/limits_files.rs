@@ -1,6 +1,6 @@
-//! Files that could use too much memory or time: a device or a pipe in place of a file, a file that unpacks to much
-//! more than its size, and thousands of channels or links. The program refuses or reads each one within 64 MB and a
-//! second, with a suitable message and exit code.
+//! Files that could use too much memory or time: a device or a pipe instead of a file, a file that unpacks to much more
+//! than its size, and thousands of channels or links. The program refuses or reads each one within 64 MB and a second,
+//! with a suitable message and exit code.
 
 use std::io::Write;
 use std::process::Command;

@@ -178,7 +178,7 @@ fn killed_subscribers_leave_no_samples() {
         holder.wait_for_text("holding");
         assert_eq!(holder.end(KILL).exit_code, None);
     }
-    // The numbers before may include resources of the client that counted the subscribers and was just exiting.
+    // The numbers from before may include resources of the client that counted the subscribers. It was exiting then.
     wait_until("the hub has as many descriptors and segments as before", || {
         descriptors() <= open_before && segments() <= segments_before
     });
@@ -191,7 +191,7 @@ fn killed_subscribers_leave_no_samples() {
     assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
 }
 
-/// Receives as many samples as it may hold, prints how many it holds, and waits to be killed.
+/// Borrows as many samples as it may, prints their number, and waits to be killed.
 fn hold_samples(domain: &Domain) {
     let node = scanhub_shm::client_node(domain).expect("the process can join the domain");
     let topic = Scan::open(&node, "front").expect("the topic can be opened").expect("the topic exists");

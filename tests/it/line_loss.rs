@@ -3,7 +3,7 @@
 
 use crate::testkit::{INT, TERM, TestEnv, is_class, number, wait_until};
 
-/// Rate and length of the bursts that the paper found on a line.
+/// Rate and length of the bursts that the paper measured on a line.
 const BURST_FAULTS: &str = "--fault=loss=0.00135,burst=1.89";
 
 #[test]
@@ -81,7 +81,7 @@ fn a_line_that_is_well_says_so_from_the_first_second() {
     assert_eq!(simulator.end(INT).exit_code, Some(0));
 }
 
-/// Replies arrive now and then, but hardly ever a scan.
+/// Replies arrive now and then. Hardly any scan arrives.
 #[test]
 fn line_that_damages_all_scans_is_reported() {
     let env = TestEnv::new();

@@ -242,7 +242,7 @@ fn the_account_is_exact() {
         for n in order {
             sender.send_bytes(Topic::Zones, &datagrams[n]);
         }
-        // Two scans are lost before an announcement makes this known. Telegrams are not requested.
+        // Two scans are lost, and an announcement then makes this known. Telegrams are not requested.
         sender.send(Topic::Scan, &*scan());
         sender.next[usize::from(Topic::Scan.number())] += 2;
         sender.next[usize::from(Topic::Telegram.number())] += 9;
@@ -263,7 +263,7 @@ fn the_account_is_exact() {
             let notices = outcome.of_class("notice").into_iter().filter(|line| line["topic"] == topic);
             notices.map(|line| testkit::number(&line, "missed")).sum()
         };
-        // Numbers 20 and 40 count as missed, because they had not arrived when the next number did.
+        // Numbers 20 and 40 count as missed, because each of them arrived after the next number.
         assert_eq!((missed("zones"), missed("scan")), (5, 2));
     });
 }
@@ -377,7 +377,7 @@ fn each_refusal_has_its_reason() {
         let outcome = program.end(INT);
         let refused = refusals(&outcome);
         for reason in DatagramError::ALL {
-            // A listener without a key does not use three of the reasons.
+            // Three of the reasons need a key, which this listener does not have.
             const KEY_ERRORS: [DatagramError; 3] =
                 [DatagramError::Unauthenticated, DatagramError::Mac, DatagramError::Untimely];
             let expected = u64::from(!KEY_ERRORS.contains(&reason));
@@ -400,7 +400,7 @@ fn reports_two_gateways_with_one_id_once() {
         let mut gateways = [9, 7].map(|epoch| TestGateway::new(HUB_ID, epoch, 0, "front"));
         for _ in 0..80 {
             gateways.iter_mut().for_each(|gateway| gateway.send(Topic::Zones, &zones(Verdict::Clear)));
-            // Send them over several seconds, because datagrams in a short time do not count as a second gateway.
+            // Send for several seconds. Datagrams within a short time do not count as a second gateway.
             wait_at_least(Duration::from_millis(50));
         }
         let line = program.await_line("notice with a remedy", |line| line["kind"] == "problem");

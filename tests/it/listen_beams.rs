@@ -1,6 +1,6 @@
 //! Remote sensors with more beams than an LMS, and with exact angles. `scanhub listen --publish` creates their topics
-//! with the length of the received samples. Gateway, network and listener are real, and each sample of the remote
-//! sensor is compared with that of the hub.
+//! with the length of the received samples. Gateway, network and listener are real. The test compares each sample of
+//! the remote sensor with the hub's sample.
 
 use serde_json::{Value, json};
 

@@ -1,5 +1,5 @@
-//! `scanhub listen` with more gateways and sensors than it has room for, as when a sender invents them. Delivering
-//! sensors are not evicted, a genuine one that starts later is received at once, and the log reports the shortage
+//! `scanhub listen` with more gateways and sensors than it has room for, as when a sender invents them. It does not
+//! evict sensors that deliver. It receives a genuine sensor that starts later at once. Its log reports the shortage
 //! without a line for each sender.
 
 use std::time::Duration;
@@ -27,7 +27,7 @@ fn deliver_samples(sender: &mut TestGateway) {
 const PROOF_TIME: Duration = Duration::from_secs(1);
 
 /// Delivers until the sender counts as proven. `wait_until_received` waits until the listener has received the sample
-/// before.
+/// that was sent last.
 fn deliver_for_proof_time(sender: &mut TestGateway, mut wait_until_received: impl FnMut(&mut TestGateway)) {
     deliver_samples(sender);
     wait_until_received(sender);
@@ -36,7 +36,7 @@ fn deliver_for_proof_time(sender: &mut TestGateway, mut wait_until_received: imp
     wait_until_received(sender);
 }
 
-/// Sends `verdict` until `echo` prints it. A verdict that a client reads too late is printed as unknown.
+/// Sends `verdict` repeatedly until `echo` prints it. A verdict that a client reads too late is printed as unknown.
 fn await_verdict(sender: &mut TestGateway, echo: &mut Program, verdict: Verdict) {
     let mut printed = Value::Null;
     while printed["verdict"] != verdict.name() {
@@ -137,8 +137,8 @@ fn publisher(env: &TestEnv) -> Program {
     env.start(&["listen", "--json", "--publish", NAME_FLAG]).ready()
 }
 
-/// Creates a genuine sensor, and waits until it is published, which is when its gateway has delivered for a second. The
-/// sensor itself is not proven by then, because samples from before do not count for it.
+/// Creates a genuine sensor, and waits until the listener publishes it. The listener does so once the gateway has
+/// delivered for a second. The sensor itself is not proven by then, because earlier samples do not count for it.
 fn published_sender(program: &mut Program) -> TestGateway {
     let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
     wait_until("the sensor is published", || {

@@ -141,7 +141,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
         assert!(lines.len() <= 1024, "{} lines", lines.len());
         let own = lines.iter().find(|it| it["hub"] == "000000000000abcd" && it["topic"] == "zones");
         let own = own.unwrap_or_else(|| panic!("the sender was evicted: {lines:?}"));
-        // The listener cannot count datagrams that the flood displaced after the last one that it received.
+        // If the flood displaced the last datagrams of this sensor, the listener cannot count them.
         let known = number(own, "received") + number(own, "lost");
         assert!((1..=counted).contains(&known), "{known} of {counted}");
         let sensors = &outcome.of_class("lan_published")[0]["sensors"];

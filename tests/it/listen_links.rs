@@ -10,7 +10,7 @@ use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, eth, recv, 
 /// Socket that receives the IGMP messages (version 2) that a switch would receive.
 struct FakeSwitch {
     socket: OwnedFd,
-    /// Type of each message and last byte of its group. A leave removes the reports of its group from before.
+    /// Type of each message and last byte of its group. A leave message removes the earlier reports of its group.
     memberships: BTreeSet<(u8, u8)>,
 }
 
@@ -89,8 +89,8 @@ fn rejoins_groups_each_time_an_interface_is_recreated() {
         let mut switch = FakeSwitch::new();
         let env = TestEnv::on(&machine);
         let listener = env.start(&["listen", "--json"]).ready();
-        // A socket can join 20 groups, and four are used. Joining must therefore not use up more of them with each new
-        // cable.
+        // A socket can join 20 groups, and the listener needs four. A new cable must therefore not use up more of the
+        // 20.
         for _ in 0..8 {
             switch.memberships.clear();
             machine.replace_cable();
@@ -101,9 +101,9 @@ fn rejoins_groups_each_time_an_interface_is_recreated() {
     });
 }
 
-/// Makes the kernel use IGMP version 2 on `interface` of `machine`, in which it reports leaving a group. A report after
-/// a leave can therefore be distinguished from the repetition of the first report. Skips the test and returns false if
-/// this is not possible.
+/// Makes the kernel use IGMP version 2 on `interface` of `machine`. In this version, the kernel reports that it leaves
+/// a group. A report after a leave can therefore be distinguished from the repetition of the first report. Skips the
+/// test and returns false if the version cannot be selected.
 fn force_igmp_version_2(machine: &Machine, interface: &str) -> bool {
     let mut version = command_in(&machine.network(), "sh");
     let path = format!("/proc/sys/net/ipv4/conf/{interface}/force_igmp_version");

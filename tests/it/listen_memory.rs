@@ -48,7 +48,7 @@ fn invented_sensors_stay_within_the_memory() {
         front.wait_until_published(&mut program, &topics);
         let mut echo = env.echo(&["robot1.front/scan"]);
         let own = Scan::of(ScanHead::lms(361, -90_000, 500, 1, 13), &[2_000; 361]);
-        // A sensor that has delivered for a second is never removed for others while it delivers.
+        // While a sensor delivers and has delivered for a second, the listener never removes it for others.
         for pause_ms in [1_100, 0] {
             front.send(Topic::Scan, &*own);
             echo.await_line("sample of the genuine sensor", is_class("scan"));

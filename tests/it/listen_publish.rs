@@ -28,7 +28,7 @@ fn start_and_publish(env: &TestEnv, sender: &mut TestGateway) -> Program {
     program
 }
 
-/// Returns whether a line has zones that were sent, not those that a client reports for a silence.
+/// Returns whether a line has zones that were sent. In a silence, a client also prints zones that were not sent.
 fn is_zones(line: &Value) -> bool {
     line["class"] == "zones" && line["stale"] != true
 }
@@ -392,8 +392,8 @@ fn there_is_room_for_sixteen_sensors() {
         let mut program = publisher(&env);
         let mut senders: Vec<_> =
             (0..17).map(|number| TestGateway::new(0xab, 7, number, &format!("s{number}"))).collect();
-        // All except the last one are published when their gateway has delivered for a second. They then deliver for
-        // another second.
+        // The listener publishes the first 16 sensors when their gateway has delivered for a second. These sensors then
+        // deliver for another second.
         for (count, wait_ms) in [(16, 1100), (16, 1100), (17, 0)] {
             for sender in &mut senders[..count] {
                 sender.announce(&[Topic::Zones]);

@@ -1,6 +1,6 @@
 //! Two machines with one state directory, for example after a disk was copied. Their gateways use the same ID and
-//! epoch. A listener accepts one of them and reports the conflict, and it never accepts a sample of the other one as
-//! one of the first.
+//! epoch. A listener accepts one of the gateways and reports the conflict. It never takes a sample of one gateway for a
+//! sample of the other.
 
 use crate::testkit::{INT, Machine, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number};
 use serde_json::{Value, json};
@@ -76,8 +76,8 @@ fn reports_two_machines_with_one_id_and_mixes_nothing() {
         late.await_lines(10, "scans", is_class("scan"));
         let late = late.end(INT);
         assert!(beam_counts(&late) == [361] || beam_counts(&late) == [181], "{:?}", beam_counts(&late));
-        // After the first gateway has exited, the running listeners do not accept the other one in its place: they
-        // refuse its datagrams for more than 3 s.
+        // After the first gateway has exited, the running listeners do not accept the other gateway: they refuse its
+        // datagrams for more than 3 s.
         assert_eq!(first.end(TERM).exit_code, Some(0));
         let mut other = env.start(&["listen", "--json"]).ready();
         other.await_lines(200, "scans of the second machine", is_class("scan"));

@@ -10,7 +10,7 @@ fn world(env: &TestEnv, thing: &str) -> String {
     format!("--world={}", env.file("world.toml", format!("{room}\n{thing}")))
 }
 
-/// What is told beside a mask that a person should look at; on a busy machine also that scans were missed.
+/// Parts of the warnings about a mask that a user should check. On a busy machine, stderr also reports missed scans.
 const WARNINGS: [&str; 3] = ["nothing of the robot", "something moved", "are hidden"];
 
 const POST_WORLD: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
@@ -71,7 +71,7 @@ fn mask_hides_the_robots_own_post() {
     let violations: Vec<_> =
         lines.iter().filter(|line| line["verdict"] == "stop" || line["verdict"] == "slow").collect();
     assert!(violations.is_empty(), "{violations:#?}");
-    // An active mask does not affect the next one: topic `scan` is published without the mask.
+    // An active mask does not affect the next run of the verb: topic `scan` is published without the mask.
     let again = mask(&env, &["--json"]);
     assert_eq!(again.exit_code, Some(0), "{again}");
     let mask = &again.of_class("mask")[0];
@@ -99,7 +99,7 @@ fn empty_mask_loads_into_a_hub() {
     let _hub = env.hub(&[&env.link("front"), "--config", &file]);
     await_verdict(&env, "clear");
 
-    // Walls are not part of the robot, but with a circle as large as the room they are masked, which a warning reports.
+    // Walls are not part of the robot. With a circle as large as the room, the verb masks them and prints a warning.
     let outcome = mask(&env, &["--within", "6"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert!(outcome.stderr.contains("the hub will be blind there"), "{outcome}");

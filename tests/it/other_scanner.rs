@@ -123,8 +123,8 @@ fn doctor_and_configure_suggest_scanhub_probe() {
     check_each_scanner(&IDLE_SCANNERS, check);
 }
 
-/// The suggested command finds the scanner once the hub has stopped, and so does removing the key `family`. `probe`
-/// cannot search a port while the hub uses it.
+/// Once the hub has stopped, the suggested command finds the scanner. Without the key `family`, the hub finds it too.
+/// `probe` cannot search a port while the hub uses it.
 #[test]
 fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
     let (env, other) = (TestEnv::new(), TestEnv::new());

@@ -15,18 +15,18 @@ fn a_telegram_costs_no_more_than_before() {
     use std::time::Duration;
 
     // Upper bounds: a quarter above the values that this test prints with `cargo test --test it -- path_cost
-    // --nocapture`. After a change that makes the path shorter, set them to 1.25 times the new values, so that a later
-    // regression fails. Take the highest of five runs: the hub publishes the status with most telegrams that are
-    // stepped through, but not with all.
+    // --nocapture`. After a change that reduces the cost, set them to 1.25 times the new values, so that a later
+    // regression fails. Take the highest of five runs: the hub publishes the status with most of the stepped telegrams,
+    // but not with all.
     /// With a learned background, in the profile `dev`. 182,000 to 217,000 were measured.
     const MAX_INSTRUCTIONS: u64 = 271_000;
     /// At 500,000 baud. 7 were measured, and 5 to 9 on a busy machine.
     const MAX_SYSTEM_CALLS: u64 = 9;
 
-    /// Telegrams that are stepped through. Each takes some seconds.
+    /// Number of telegrams that are stepped through. Each of them takes some seconds.
     const STEPPED_TELEGRAMS: usize = 10;
-    /// Telegrams whose system calls are counted, after [`LEARNING_TELEGRAMS`], in which the hub estimates how long
-    /// before the end of a telegram it has to wake up.
+    /// Number of telegrams whose system calls are counted. They follow [`LEARNING_TELEGRAMS`] others. During those, the
+    /// hub estimates how long before the end of a telegram it has to wake up.
     const COUNTED_TELEGRAMS: usize = 40;
     const LEARNING_TELEGRAMS: usize = 110;
     /// Time between two telegrams at 9,600 baud.
@@ -38,8 +38,8 @@ fn a_telegram_costs_no_more_than_before() {
     const ROOM_WORLD: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
          [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
 
-    /// Returns the values per telegram in ascending order. If two telegrams were complete before the hub read, it
-    /// sleeps once for both.
+    /// Returns the values per telegram in ascending order. If two telegrams were complete before the hub read them, the
+    /// hub sleeps once for both.
     fn sorted(costs: &[TelegramCost], value: fn(&TelegramCost) -> u64) -> Vec<u64> {
         let mut values: Vec<u64> = costs.iter().map(|cost| value(cost).div_ceil(cost.telegrams)).collect();
         values.sort_unstable();

@@ -39,8 +39,8 @@ fn reports_identity_without_changing_the_scanner() {
     assert_eq!(env.simulator_totals("front").1, 0);
 }
 
-/// The last line of the output is a command for a shell. `--toml` prints a section for a file. A hub streams with
-/// either.
+/// The last line of the output is a command for a shell. `--toml` prints a section for a file. A hub that uses the
+/// command or the section streams.
 #[test]
 fn printed_link_and_section_start_a_hub() {
     let families: [(&str, &[&str], &str); 3] = [
@@ -186,14 +186,14 @@ fn sends_only_search_requests_to_unknown_scanner() {
         ] {
             assert!(text.contains(part), "{part}: {outcome}");
         }
-        // Each family has four requests or rates per round, and there are two rounds.
+        // In each round, each family has four requests or rates. There are two rounds.
         let counts = count_requests(&sent);
         assert!(counts[0] >= 4 && counts[1] >= 4 && counts[2] >= 8 && counts[3] >= 8, "{counts:?}");
     }
 }
 
-/// Prints the requests that were sent. In virtual time a streaming scanner receives no byte at all. On a busy machine,
-/// its packets may have a gap in which the search continues.
+/// Prints the requests that the search sent. In virtual time, a streaming scanner receives no byte at all. On a busy
+/// machine, its packets may have a gap in which the search continues.
 #[test]
 fn finds_streaming_scanner_with_search_requests_only() {
     let env = TestEnv::new();

@@ -37,7 +37,7 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     let hub = env.hub(&[env.link("front")]);
     let topics = ["scan", "marks", "zones", "foreground"];
     let mut subscribers = topics.map(|topic| env.echo(&[&format!("front/{topic}")]));
-    // Before any scan, the verdict is unknown, and the radii are those of the configuration.
+    // Before any scan, the verdict is unknown, and the radii are the configured ones.
     let first = subscribers[2].await_line("the first sample", is_class("zones"));
     assert_eq!((&first["verdict"], number(&first, "topic_seq")), (&"unknown".into(), 0), "{first}");
     assert_eq!(
@@ -61,7 +61,7 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     assert!(marks.iter().any(|line| line["marks"].as_array().is_some_and(|marks| !marks.is_empty())));
     assert!(zones.iter().all(|line| number(line, "nearest_mm") > 0 && line["verdict"] != "unknown"));
     assert!(foregrounds.iter().all(|line| line["beams"].as_array().is_some_and(Vec::is_empty)));
-    // A late subscriber missed no samples, because no subscriber received earlier ones.
+    // For a late subscriber, earlier samples do not count as missed.
     let late = env.run(&["echo", "--json", "front/marks", "front/foreground", "-n", "20"]);
     ["marks", "foreground"].iter().for_each(|topic| drop(checked_topic_seqs(&late, topic)));
     for (subscriber, topic) in subscribers.into_iter().zip(topics) {
@@ -249,7 +249,7 @@ fn recording_has_zones_and_a_controllable_background() {
 fn the_scans_of_a_slow_recording_follow_each_other() {
     let env = TestEnv::new();
     let ranges = vec!["2.0"; 181].join(" ");
-    // Ten scans per second and one pause of 0.9 s. A live sensor would be silent after a twentieth of such a pause.
+    // Ten scans per second and one pause of 0.9 s. A live sensor would be silent after a twentieth of this pause.
     let at_s = |scan: usize| 10.0 + 0.1 * scan as f64 + if scan < 6 { 0.0 } else { 0.9 };
     let line = |at_s: f64| format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at_s} host {at_s}\n");
     let log: String = (0..12).map(at_s).map(line).collect();

@@ -47,7 +47,8 @@ impl TestPublisher {
     }
 }
 
-/// Returns a function for each language available on this machine. It returns the command that publishes under a name.
+/// Returns a function for each language available on this machine. Each function takes a name and returns the command
+/// of a program that publishes under this name.
 pub(crate) fn languages(env: &TestEnv) -> Vec<impl Fn(&str) -> Command + use<'_>> {
     let python = check_on(env, "publish").is_some().then_some(None);
     let c = InstalledLibrary::installed()
@@ -66,7 +67,7 @@ pub(crate) fn languages(env: &TestEnv) -> Vec<impl Fn(&str) -> Command + use<'_>
     starts.collect()
 }
 
-/// Takes the domain's place of a listener, so that the domain stays in use.
+/// Joins the domain as its listener, so that the domain stays in use.
 fn listener(env: &TestEnv) -> PublishSession {
     PublishSession::open(&env.domain(), &[Topic::Marks], TopicLimits::default()).expect("the only publisher")
 }
@@ -179,8 +180,8 @@ fn a_name_has_one_publisher_in_all_languages() {
     }
 }
 
-/// A publisher joins while it holds the lock that settles the prefix of shared memory. Another publisher that leaves at
-/// the same time therefore sees it and does not remove the prefix.
+/// While a publisher joins, it holds the lock for the prefix of shared memory. A publisher that leaves at the same time
+/// therefore sees the other publisher and does not remove the prefix.
 #[test]
 fn publisher_is_visible_while_another_one_leaves() {
     let env = TestEnv::new();

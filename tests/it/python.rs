@@ -1,5 +1,5 @@
 //! Tests of the Python package next to a hub. Python scripts check properties that are visible only in Python, and the
-//! tests compare their samples with those of `echo`. The tests skip if no Python has a package built from these
+//! tests compare their samples with the samples of `echo`. The tests skip if no Python has a package built from these
 //! sources.
 
 mod read;
@@ -182,7 +182,7 @@ fn wheel_installs_without_compiler_and_network() {
     assert!(line.ends_with(" m"), "{line}");
 }
 
-/// The stubs have all names and types of the module, and the examples use them as declared.
+/// The stubs have all names and types of the module. The examples use these names and types correctly.
 #[test]
 fn types_are_those_of_the_stubs() {
     if python("mypy").is_none() || client_python().is_none() {
@@ -326,8 +326,7 @@ fn a_subscription_outlives_several_hubs() {
     }
 }
 
-/// Compares the combined verdict while one sensor is switched off and then the hub is killed: it never stays clear
-/// without data.
+/// The combined verdict never stays clear without data. The test first switches off one sensor and then kills the hub.
 #[test]
 fn a_robot_is_as_unknown_as_its_worst_sensor() {
     let env = TestEnv::new();

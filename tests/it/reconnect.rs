@@ -93,7 +93,7 @@ fn a_port_that_comes_back_in_other_hands() {
     let port = env.path("front");
     let hub = env.hub(&[env.lms_link("front")]);
     env.await_info("front", |info| info["state"] == "absent");
-    // The test holds a lock on the device before it gets its name.
+    // The test holds a lock on the device before the device gets its name.
     let line = TestLine::create(&env.path("elsewhere"));
     let holder = std::fs::File::open(env.path("elsewhere")).expect("a tty");
     flock(&holder, FlockOperation::LockExclusive).expect("a lock");

@@ -215,8 +215,8 @@ fn counts_samples_dropped_because_of_a_slow_output() {
     let env = TestEnv::new();
     let stream: Vec<u8> = (0..40_000_u32).flat_map(|seed| scan((seed % 8000) as u16)).collect();
     env.file("stream", stream);
-    // A pipe without a reader, as the slowest possible disk. It is open for reading here, so that the shell can open it
-    // at once.
+    // A pipe that no program reads acts as the slowest possible disk. The test opens it for reading, so that the shell
+    // can open it for writing at once.
     let pipe = env.path("pipe");
     assert!(succeeds(Command::new("mkfifo").arg(&pipe)));
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
@@ -253,7 +253,7 @@ fn counts_samples_dropped_because_of_a_slow_output() {
 fn signals_that_come_together_are_one() {
     let env = TestEnv::new();
     let _others = sensor(&env);
-    // The pipe is so small that the recorder waits for its reader, even at its end.
+    // The pipe is so small that the recorder waits for its reader, even when the recorder ends.
     let pipe = env.path("pipe");
     assert!(succeeds(Command::new("mkfifo").arg(&pipe)));
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();

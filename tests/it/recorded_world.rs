@@ -17,14 +17,14 @@ use crate::testkit::TestEnv;
 /// Start of the world on the wall clock, in ns.
 pub(crate) const START_NS: u64 = 1_700_000_000_000_000_000;
 const TELEGRAM_NS: u64 = 14_640_000;
-/// Time from one sensor's telegram to that of the next sensor.
+/// Time from one sensor's telegram to the next sensor's telegram.
 const SENSOR_OFFSET_NS: u64 = 9_000_000;
 /// Status byte of a scanner without a fault.
 const STATUS_OK: u8 = 0x10;
 
-/// Writes a file with the telegrams of `sensors`, each on the port of `world` with its index, for this number of
-/// `seconds`: 361 beams in millimeters, at 500,000 baud. The angles of the first sensor's mount, if it has one, are in
-/// it as `mount/tilt`. Returns the path.
+/// Writes a recording with the telegrams of `sensors` and returns its path. It lasts `seconds`. The first sensor is on
+/// port 0 of `world`, the second one on port 1, and so on. Scans have 361 beams in millimeters, at 500,000 baud. If the
+/// first sensor has a mount, the recording also has the mount's angles as `mount/tilt`.
 pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], seconds: u64) -> String {
     let file = env.path_argument("world.mcap");
     let rooms: Vec<Room> = (0..sensors.len() as u64).map(|port| Room::of_port(world, 5, port)).collect();
@@ -65,7 +65,7 @@ pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], sec
         }
         let now_ns = 1_000_000_000 + seq * period;
         while let Some(report) = reports.next_if(|report| report.arrival_ns <= now_ns) {
-            // Stamps of telegrams are earlier than the end of their scans by this time, so shift the stamps of angles
+            // The stamp of a telegram is earlier than the end of its scan by this time, so shift the stamps of angles
             // as well.
             let stamp_ns = report.stamp_ns - TELEGRAM_NS;
             let header = Header {

@@ -9,8 +9,8 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use serde_json::Value;
 
-/// Publishes `file`, with `option` appended to its name, to a subscriber of `topics` that started earlier and therefore
-/// receives the very first sample. Returns the outcome of the subscriber and the link's final `info`.
+/// Publishes `file`, with `option` appended to its name, to a subscriber of `topics`. The subscriber starts earlier and
+/// therefore receives the very first sample. Returns its outcome and the link's final `info`.
 fn play(env: &TestEnv, file: &str, option: &str, topics: &[&str]) -> (Outcome, Value) {
     let before = env.hub(&["--link=a=/no/such/port"]);
     let mut subscriber = env.echo(topics);
@@ -154,7 +154,7 @@ fn the_reflectors_of_a_recording_are_marks() {
 #[test]
 fn as_fast_as_it_can_be_read() {
     let env = TestEnv::new();
-    // No more samples than a subscriber's buffer holds, because the hub does not wait for subscribers.
+    // Use no more samples than a subscriber's buffer holds, because the hub does not wait for subscribers.
     let (bytes, whole) = stream(14);
     let file = env.file("recording", &bytes);
     let (outcome, info) = play(&env, &file, "?rate=max", &["a/telegram", "a/status"]);

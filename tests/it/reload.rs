@@ -11,8 +11,8 @@ use crate::testkit::{
 use serde_json::Value;
 
 const STREAM_FLAGS: [&str; 2] = ["--seed=71", "--baud=500000"];
-/// Minimum time from the stamp of the last scan to that of the unknown zones that the hub sends in a silence, in ns. A
-/// verdict is valid for two periods of 26.6 ms and 20 ms.
+/// Minimum time from the stamp of the last scan to the stamp of the unknown zones that the hub sends in a silence, in
+/// ns. A verdict is valid for two periods of 26.6 ms and 20 ms.
 const MIN_SILENCE_NS: u64 = 70_000_000;
 
 /// Writes the configuration of one link with `settings` after it, and returns the flag for the file.
@@ -91,7 +91,7 @@ fn circles_change_in_a_stream_without_a_gap() {
     assert!(ended.stderr.contains("front: zones, marks, background changed as configured"), "{ended}");
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     assert_eq!(env.simulator_totals("front").1, 0, "EEPROM writes");
-    // Every scan between the first and the last one that was received was received.
+    // The subscriber received every scan between its first and its last one.
     let received = telegrams.of_class("telegram");
     let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED_VALUES).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();

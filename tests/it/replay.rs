@@ -148,8 +148,8 @@ fn hold_keeps_the_hub_running_and_pause_stops_it() {
     assert_eq!(number(&replay_summary(&player.end(TERM)), "telegrams"), 100);
 }
 
-/// Writes a recording of two runs of a hub. Each run has ten telegrams, and the sixth one reports how the values are
-/// encoded. `format_versions` gives the `seq` of each run from which marks were published.
+/// Writes a recording of two runs of a hub. Each run has ten telegrams. The sixth telegram reports how the values are
+/// encoded. `format_versions` has a `seq` for each run: the hub published marks from this telegram on.
 fn recording_of_two_runs(env: &TestEnv, format_versions: [u64; 2]) -> String {
     let file = std::fs::File::create(env.path("lives.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("a new recording");
@@ -232,7 +232,7 @@ fn missing_scans_are_not_reported_as_silence() {
 
 #[test]
 fn replay_has_no_scans_before_their_mode_was_known() {
-    // In each case, one of the two runs knew the encoding from its start, from the run before it.
+    // In each case, one of the two runs had the encoding at its start, from an earlier run.
     for understood in [[0, 6], [6, 0]] {
         let env = TestEnv::new();
         let player = start(&env, &[&recording_of_two_runs(&env, understood), "--paused"]);

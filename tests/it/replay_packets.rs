@@ -111,7 +111,7 @@ fn scans_are_those_that_were_recorded() {
         let file = env.path("replayed.mcap");
         let replayed = samples(&file, "front/telegram");
         let expected = samples(&env.path(name), "front/telegram");
-        // On a busy machine, the recorder of the replay may miss some.
+        // On a busy machine, the recorder of the replay may miss some scans.
         assert!(replayed.len() > expected.len() / 2, "{name}: {} of {}", replayed.len(), expected.len());
         for (header, bytes) in &replayed {
             let (recorded, recorded_bytes) = &expected[header.topic_seq as usize];
@@ -144,7 +144,7 @@ fn beams_are_those_that_were_recorded() {
     let recorded = samples(&env.path("all.mcap"), "front/scan");
     replay(&env, "all.mcap", &[]);
     check_scans(&recorded, &samples(&env.path("replayed.mcap"), "front/scan"));
-    // A recording with only telegrams does not have the number of beams, so the replay uses that of the model.
+    // A recording with only telegrams does not have the number of beams, so the replay uses the model's number.
     replay(&env, "telegrams.mcap", &["--rate=max"]);
     let replayed = samples(&env.path("replayed.mcap"), "front/scan");
     assert!(!replayed.is_empty() && replayed.iter().all(|(_, payload)| scan(payload).beams() == 2_160));

@@ -50,7 +50,7 @@ fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Ve
             telegrams
         },
     );
-    // Samples before the first telegram, and those of the silence after the end, belong to no telegram.
+    // Samples before the first telegram, and samples of the silence after the end, belong to no telegram.
     let is_around =
         |it: &PublishedSample| it.header.hub_time_ns().is_none() && [0, SCAN_COUNT].contains(&it.header.seq);
     published.iter_mut().for_each(|published| published.retain(|it| !is_around(it)));

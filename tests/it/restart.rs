@@ -48,7 +48,8 @@ fn subscribers_outlive_several_hubs() {
     let runs = split_by_boot(telegrams.of_class("telegram"));
     assert_eq!(runs.len(), 5);
     for run in &runs {
-        // A telegram that consists of parts of two could pass its checksum by chance, but it was never sent.
+        // Parts of two telegrams could together have a right checksum by chance, but the simulator never sent them as
+        // one.
         assert!(run.iter().all(|line| sent.contains(&hash(&bytes_of(line)))), "never sent");
         contiguous_numbers(run, "seq");
         contiguous_numbers(run, "topic_seq");
@@ -71,7 +72,7 @@ fn subscribers_outlive_several_hubs() {
     assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
 }
 
-/// Groups lines by the run of the hub from which they are, in their order.
+/// Groups `lines` by the run of the hub. Keeps their order.
 fn split_by_boot(lines: Vec<Value>) -> Vec<Vec<Value>> {
     let mut order = Vec::new();
     let mut runs = BTreeMap::<String, Vec<Value>>::new();

@@ -45,7 +45,7 @@ fn dead_sensor_or_hub_makes_the_robot_unknown() {
     assert!(line.get("stale").is_none() && line["nearest_mm"].is_u64(), "{line}");
 
     env.kill_port_simulator(rear, "rear");
-    // Either the hub or the client reports it first. The samples of `front` itself are not stale.
+    // Either the hub or the client reports the absence of `rear` first. The samples of `front` itself are not stale.
     echo.await_line("a clear front without the rear", |line| {
         verdicts(line) == ["unknown", "clear", "unknown"] && line.get("stale").is_none()
     });

@@ -38,7 +38,7 @@ fn identifies_scanner_and_publishes_its_revolutions() {
         ("rplidar", "a1", "streaming")
     );
     assert_eq!((number(&info, "baud"), text(&info, "last_error")), (115_200, ""), "{info}");
-    // On a busy machine, the simulator is late, and the hub counts the revolutions that it expected as lost.
+    // On a busy machine, the simulator is late, and the hub counts the missing revolutions as lost.
     assert_eq!(info["damaged"].as_f64(), Some(0.0), "{info}");
     let scans = scans.end(INT).of_class("scan");
     contiguous_numbers(&scans, "topic_seq");
@@ -175,8 +175,8 @@ fn a_stream_file_has_the_scans_that_were_recorded() {
     // The recorder of the default topics started later and ended later.
     let begin = recorded.iter().position(|scan| *scan == replayed[0]).expect("the first one was recorded");
     let both = (recorded.len() - begin).min(replayed.len());
-    // On a busy machine, a recorder may miss samples, and the line may be late or lose bytes. All of these are counted,
-    // and the scans of these revolutions differ.
+    // On a busy machine, a recorder may miss samples, and the line may be late or lose bytes. The scans then differ, so
+    // the test does not compare them.
     let has_lost = env.truth("front").iter().any(|sent| sent.fault.is_some());
     let is_unbroken = |name: &str, topic: &str| {
         let numbers: Vec<u64> =

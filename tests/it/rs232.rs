@@ -75,8 +75,8 @@ fn is_streaming_slowly(status: &Value) -> bool {
     status["state"] == "streaming" && status["baud"] == 38_400 && has_rs422_problem(status)
 }
 
-/// Asserts that the log has the reason and does not repeat it. On a busy machine, another reason may lie in between
-/// when a reply is late.
+/// Asserts that the log has the reason and does not repeat it. If a reply is late on a busy machine, the log may have
+/// another reason between.
 fn assert_single_warning(log: &str) {
     let warnings: Vec<_> = log.lines().filter(|line| line.contains(" WARN ")).collect();
     let is_reason = |line: &&str| line.contains(RS422_MESSAGE);

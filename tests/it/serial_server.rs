@@ -263,7 +263,7 @@ fn probe_and_doctor_ask_there_too() {
     let outcome = env.search(&["probe", &port, "--json"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let found = &outcome.lines()[0];
-    // The rate is set in the server. The scanner reports which one it is.
+    // The server sets the rate. The scanner reports its own rate.
     assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0x25), "{found}");
     let outcome = env.run(&["doctor", &port, "--no-system-config", "--json"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");

@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 const SHARING_PAGE: &str = include_str!("../../docs/sharing.md");
 /// Variable that is set when the test runs again inside the namespaces.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_SHARING";
-/// User IDs that the system need not know.
+/// User IDs. They need not exist on the system.
 const HUB_UID: u32 = 65531;
 const OTHER_UID: u32 = 65532;
 
@@ -72,7 +72,7 @@ fn arguments_on_page(begin: &str) -> Vec<&'static str> {
     line.unwrap_or_else(|| panic!("no line {begin:?}")).split(' ').skip(1).collect()
 }
 
-/// Like [`arguments_on_page`], with `--json` and with the ID `hub` in place of the one on the page.
+/// Like [`arguments_on_page`], with `--json`. The ID `hub` replaces the ID on the page.
 fn arguments_with_hub(begin: &str, hub: &str) -> Vec<String> {
     let words = arguments_on_page(begin).into_iter().map(|word| word.replace("5f3a12bc00d1e2f3", hub));
     words.chain(["--json".to_owned()]).collect()
@@ -203,7 +203,7 @@ fn reports_the_user_of_a_running_hub() {
         assert_suggestion_works(&root, OTHER_UID, &of_session);
         assert_eq!(of_session.end(TERM).exit_code, Some(0));
 
-        // Other users cannot read the variable, so they do not see the domain.
+        // Other users cannot read the variables of a process, so they do not see the domain in SCANHUB_DOMAIN.
         let mut command = scanhub(0, &run[..run.len() - 1]);
         command.env_remove("XDG_RUNTIME_DIR").env("SCANHUB_DOMAIN", "whose");
         let of_variable = Program::start(command).ready();

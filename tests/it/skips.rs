@@ -17,7 +17,7 @@ fn required_tool_may_not_be_skipped() {
         let message = skip_verdict(required, "tmux", "there is none").expect_err(required);
         assert_eq!(message, "tmux is required here by SCANHUB_REQUIRE: there is none");
     }
-    // A misspelled name would require nothing.
+    // If a misspelled name were accepted, it would require nothing.
     for (required, need) in [("tmuks", "tmux"), ("", "tmuks"), ("tmux,netn", "cc")] {
         let message = skip_verdict(required, need, "there is none").expect_err(required);
         assert!(message.contains("is not a requirement of tests; known are bash, cc, "), "{message}");

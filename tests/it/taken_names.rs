@@ -1,6 +1,6 @@
-//! Tests of names that are taken. Sensors, trackers and mounts share one name space per domain, and the first process
-//! that publishes under a name has it. A hub waits for a name that a program has. A program is refused a name that
-//! another process has.
+//! Tests of names that are taken. Sensors, trackers and mounts share one name space per domain. A name belongs to the
+//! first process that publishes under it. A hub waits for a name that a program has. A program gets an error for a name
+//! that another process has.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -21,8 +21,8 @@ fn name_taken_message(name: &str, holder: &Program) -> String {
     format!("the name {name} is published by process {} (scanhub)", holder.pid())
 }
 
-/// Asserts that a program was refused the name. Programs whose stdout only has the line `ready` report errors on
-/// stderr.
+/// Asserts that a program got the error for a name that is taken. Programs whose stdout only has the line `ready`
+/// report errors on stderr.
 fn assert_refused(outcome: &Outcome, message: &str) {
     let mut lines = outcome.stderr.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
     let error = lines.next_back().unwrap_or_default();

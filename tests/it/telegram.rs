@@ -226,7 +226,7 @@ fn the_telegrams_inside_a_recording_are_decoded() {
     let output = telegram(&["decode", "--json", golden], &[]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     let (decoded, summary) = (lines(&output), lines(&output).pop().expect("a summary"));
-    // Every byte belongs to a telegram: the framing of the file is not taken for one.
+    // Every byte belongs to a telegram: the program does not take the framing of the file for one.
     let inside: u64 = decoded.iter().filter_map(|line| line["length"].as_u64()).sum();
     assert!(inside > 0 && inside < bytes.len() as u64, "{summary}");
     assert_eq!((summary["bytes"].as_u64(), summary["other_bytes"].as_u64()), (Some(inside), Some(0)));

@@ -128,7 +128,7 @@ fn points_match_the_hall_and_the_post_is_an_obstacle() {
     let points: Vec<Vec<f64>> = points.collect();
     let mut off: Vec<f64> = points.iter().map(|point| distance_from_wall(point)).collect();
     off.sort_by(f64::total_cmp);
-    // A machine that stalls stamps scans late.
+    // If the machine stalls, the hub stamps scans late.
     assert!(off[off.len() * 9 / 10] < 0.08, "{:?}", [off[off.len() / 2], off[off.len() * 9 / 10]]);
     // A name that a link, a mount or another `tilt` has is refused.
     let again = hall.tilt(&["--as=hall"]).wait();
@@ -235,7 +235,7 @@ fn a_recording_has_three_dimensions() {
     assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     let angles = echo.await_lines(100, "angles", is_class("tilt"));
     for pair in angles.windows(2) {
-        // At rate 1, the times between stamps are those of the recording.
+        // At rate 1, the times between stamps are the same as in the recording.
         assert_eq!(number(&pair[1], "stamp_ns") - number(&pair[0], "stamp_ns"), 10_000_000, "{pair:?}");
         assert_eq!(number(&pair[1], "wall_ns") - number(&pair[0], "wall_ns"), 10_000_000, "{pair:?}");
     }

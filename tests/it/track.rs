@@ -148,9 +148,9 @@ fn await_tracker(env: &TestEnv) {
 /// Wall clocks and payloads of a tracker's samples.
 type PublishedSamples = Vec<(u64, Vec<u8>)>;
 
-/// Plays `file` to a tracker, with each telegram only when the tracker has nearly caught up, so that it misses nothing
-/// however busy the machine is. Returns the tracks and events that it published in the first twenty seconds of the
-/// world.
+/// Plays `file` to a tracker. Plays each telegram only when the tracker has nearly caught up, so that the tracker
+/// misses nothing however busy the machine is. Returns the tracks and events that the tracker published in the first
+/// twenty seconds of the world.
 fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [PublishedSamples; 2] {
     let sources = Sources { set: vec!["background.scans=100".to_owned()], ..Sources::default() };
     let play = PlaybackOptions { is_paused: true, ..PlaybackOptions::default() };
@@ -205,8 +205,9 @@ const DELAY_NS: u64 = 300_000_000;
 /// Lead of the played scans over the tracker's samples in ns: less than the tracker waits for other sensors, and more
 /// than the interval of its samples (40 ms).
 const LEAD_NS: u64 = 160_000_000;
-/// Lead before its first sample in ns, when no sample shows yet what it has received. With the delay, this is less than
-/// the 16 foregrounds that wait for it (426 ms), and enough for that sample.
+/// Lead before the tracker's first sample in ns, while no sample shows what the tracker has received. The sum of this
+/// lead and [`DELAY_NS`] is long enough for that sample. It is less than the 16 foregrounds that can wait for the
+/// tracker (426 ms).
 const FIRST_LEAD_NS: u64 = 100_000_000;
 /// End of the compared span, in ns from the start of the world.
 const END_NS: u64 = 20_000_000_000;

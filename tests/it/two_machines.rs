@@ -56,8 +56,8 @@ fn announced_names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
     log.iter().filter_map(announce).collect()
 }
 
-/// Computes the counters for a listener that received `log`, as docs/datagram.md defines them, from the whole log with
-/// sets.
+/// Computes the counters of a listener that received `log`, as docs/datagram.md defines them. Unlike a listener, it
+/// uses the whole log and sets.
 fn expected_counters(log: &[Vec<u8>]) -> BTreeMap<StreamKey, [u64; 4]> {
     #[derive(Default)]
     struct StreamLog {

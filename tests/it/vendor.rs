@@ -77,7 +77,7 @@ fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
             None => {
                 let expected = if unread.is_empty() { PollFlags::IN } else { PollFlags::IN | PollFlags::OUT };
                 let mut line = [PollFd::from_borrowed_fd(pty.wait_fd(), expected)];
-                // An interrupted wait only is a short one.
+                // An interrupted wait is only a shorter wait.
                 let _ = poll(&mut line, Some(&Timespec::try_from(POLL_INTERVAL).expect("a valid time")));
             }
         }

@@ -139,7 +139,7 @@ fn the_terminal_is_given_back_however_it_ends() {
         watch.press(key);
         assert_eq!(watch.finish(), (Some(0), String::new(), true), "{key:?}");
     }
-    // As for all such verbs, a bounded run needs a hub.
+    // As for all verbs that subscribe, a run with a time limit needs a hub.
     let (code, below, is_whole) = start_session(&env, &["--for=5s"]).finish();
     assert!(code == Some(3) && below.contains("scanhub: no hub in domain") && is_whole, "{code:?} {below:?}");
     let _hub = env.hub(&[env.link("front")]);

@@ -91,7 +91,7 @@ pub(crate) fn channels<const N: usize>(viewer: &mut WebSocket<TcpStream>, topics
     topics.map(|topic| of(&advertised, topic).expect("an advertised channel"))
 }
 
-/// Subscribes to the channels with these IDs, with these numbers of subscriptions.
+/// Subscribes to channels. Each item of `requested` has the ID of the new subscription and the ID of the channel.
 pub(crate) fn subscribe(viewer: &mut WebSocket<TcpStream>, requested: &[(u32, &Value)]) {
     let expected: Vec<_> =
         requested.iter().map(|(number, id)| json!({ "id": number, "channelId": id })).collect();

@@ -155,8 +155,8 @@ fn by_stamp(lines: &Outcome, class: &str) -> HashMap<u64, Value> {
     lines.filter_map(|line| Some((line["wall_ns"].as_u64()?, line))).collect()
 }
 
-/// Asserts that most messages have a line, and that each of these equals its line by `is_same`. A reader may miss some
-/// samples.
+/// Asserts that most messages have a line, and that `is_same` returns true for each of these messages and its line. A
+/// reader may miss some samples.
 fn check_each_equals_a_line(
     topic: &str,
     messages: &[ChannelMessage],

@@ -1,6 +1,7 @@
-//! Tests of the server of `web` with many, slow and hostile viewers: it serves well-behaved viewers, its memory and CPU
-//! time stay small, and it waits and reports it when the system is short of something. `clients/viewer/tests/crowd.rs`
-//! tests that no viewer misses a message because of others, because messages can be counted there.
+//! Tests of the server of `web` with many, slow and hostile viewers: it serves well-behaved viewers, and its memory and
+//! CPU time stay small. When a resource of the system runs out, the server reports this and waits.
+//! `clients/viewer/tests/crowd.rs` tests that no viewer misses a message because of others, because messages can be
+//! counted there.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -32,7 +33,7 @@ impl Drop for SetOnDrop<'_> {
     }
 }
 
-/// Waits for this number of messages, for each up to the timeout.
+/// Waits for `count` messages. For each message, it waits at most until the timeout.
 fn await_messages(viewer: &mut WebSocket<TcpStream>, count: u32) {
     for number in 1..=count {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
@@ -70,7 +71,7 @@ fn slow_viewer_and_full_server_do_not_block_others() {
     let idle: Vec<_> = (0..148).map(|_| connect(&host)).collect();
     let mut read = 0;
     for _ in 0..8 {
-        // Read 1 kB for every 12 messages, which are 15 kB.
+        // Read 1 kB for every 12 messages (15 kB).
         await_messages(&mut reader, 12);
         read += slow.get_mut().read(&mut [0; 1000]).expect("an open connection");
     }

@@ -229,7 +229,7 @@ fn curve(name: &str) -> String {
     )
 }
 
-/// Checks the page as in the pictures of the pages. `SCANHUB_PICTURES=docs cargo test --test it
+/// Checks the page in the states that the pictures of the documents show. `SCANHUB_PICTURES=docs cargo test --test it
 /// the_picture_of_the_documents` creates these pictures again, each after a minute. They show a recording, because a
 /// simulator on a busy machine loses bytes.
 #[test]

@@ -154,8 +154,8 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     page.await_true("scanhub.obstacles > 0 && scanhub.beams > 100");
     page.await_true(&format!("{SIDE_BUTTON}.offsetHeight >= 40"));
     assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
-    // In two dimensions, the floor is in front of the background, whose beams had another angle. It is not shown as
-    // foreground.
+    // In two dimensions, the floor would be foreground, because the beams of the background had another angle. The page
+    // does not show it.
     page.await_true("scanhub.sweeps[0].sweep !== undefined && scanhub.foreground === 0");
     let script = "new Promise((done) => {
         const until = scanhub.scans.front + 40;
@@ -279,7 +279,7 @@ fn the_picture_of_the_documents_from_the_side() {
                     && scanhub.sweeps[0].obstacles.filter((one) => one.near === 'true').length >= 2 \
                     && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
                     && document.querySelector('#news').innerText === ''";
-        // The text follows a moment after its sweep.
+        // The page shows the text a moment after the sweep.
         let is_told = format!("{SWEPT_TEXT} === `hall: ${{scanhub.sweeps[0].words}}`");
         page.await_true(&format!(
             "{condition} && {is_told} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"

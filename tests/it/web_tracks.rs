@@ -1,4 +1,4 @@
-//! Tests of people on the web page: those of `track --as`, with number, trail and room, in the map of the site.
+//! Tests of people on the web page: the people of `track --as`, with number, trail and room, in the map of the site.
 
 use serde_json::Value;
 

@@ -231,8 +231,8 @@ impl Boxes {
         }
     }
 
-    /// Returns three percentages of beams: those of box 1 that are foreground N scans after it was put down, and those
-    /// of box 2 that are background N and 2N scans after it was taken away.
+    /// Returns three percentages: of the beams of box 1, the share that is foreground N scans after it was put down,
+    /// and of the beams of box 2, the shares that are background N and 2N scans after it was taken away.
     pub(crate) fn percents(&self) -> [f64; 3] {
         [self.new_box.percent(), self.removed_box[0].percent(), self.removed_box[1].percent()]
     }

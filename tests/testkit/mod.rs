@@ -78,7 +78,7 @@ pub(crate) const PROGRAM_PATH_VARIABLE: &str = "SCANHUB_TEST_PROGRAM";
 pub(crate) struct TestEnv {
     directory: TempDir,
     domain: String,
-    /// Network namespace in which its programs run; `None` for that of the test.
+    /// Network namespace in which its programs run; `None` for the test's own namespace.
     network: Option<PathBuf>,
 }
 

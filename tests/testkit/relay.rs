@@ -145,8 +145,8 @@ impl RelayState {
     }
 }
 
-/// Number of bytes queued at a socket from which the relay waits. It is a fraction of the smallest receive buffer of a
-/// listener.
+/// Number of queued bytes at a socket at which the relay starts to wait. It is a fraction of the smallest receive
+/// buffer of a listener.
 const MAX_QUEUED_BYTES: u64 = 64 << 10;
 
 /// Returns the largest number of bytes that are queued at one of the UDP sockets in the file `sockets` (proc(5),

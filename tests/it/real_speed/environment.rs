@@ -31,8 +31,8 @@ pub(super) struct RealSpeedEnvironment {
     killed_at: Option<Instant>,
 }
 
-/// Time after which the hub has cleaned up after a killed subscriber: it does so every five seconds. A hub that ends
-/// earlier leaves the cleanup to the next one.
+/// Maximum time until the hub has cleaned up after a killed subscriber. The hub cleans up every five seconds. A hub
+/// that ends earlier leaves the cleanup to the next hub.
 const CLEANUP_INTERVAL: Duration = Duration::from_secs(9);
 
 /// A task that follows from an action.
@@ -147,7 +147,7 @@ impl RealSpeedEnvironment {
 
     fn start_hub(&mut self) {
         if self.hub.is_none() {
-            // A bad configuration is only for a reload, because a hub does not start with it.
+            // A hub does not start with a bad configuration, so only a reload may use one.
             self.edition = self.edition.min(1);
             self.hub = Some(self.env.hub(&[self.configuration(), "--no-system-config".to_owned()]));
         }
@@ -211,7 +211,7 @@ impl RealSpeedEnvironment {
         }
         for (number, name) in SENSORS.into_iter().enumerate() {
             self.clear_line_faults(number);
-            // The last request may have been to pause.
+            // The last request may have paused the sensor.
             let outcome = self.env.run(&["control", name, "resume", "--json"]);
             assert_eq!(outcome.exit_code, Some(0), "{outcome}");
             self.env.await_info(name, |info| info["state"] == "streaming");

@@ -24,8 +24,8 @@ pub(super) fn all_samples_are_counted(received: &[Value], outcome: &Outcome) {
     for run in received.chunk_by(|one, next| one["boot"] == next["boot"]) {
         let numbers: Vec<u64> = run.iter().map(|line| number(line, "topic_seq")).collect();
         assert!(numbers.windows(2).all(|pair| pair[0] < pair[1]), "out of order: {numbers:?}");
-        // The subscriber receives every sample of a hub from the first one on, except of the first hub, which started
-        // earlier.
+        // The subscriber receives every sample of a hub from the first one on. Only the first hub started before the
+        // subscriber.
         let first = if published == 0 { numbers[0] } else { 0 };
         published += numbers[numbers.len() - 1] - first + 1;
     }
