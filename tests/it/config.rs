@@ -175,8 +175,8 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     }
 }
 
-/// Returns the completions of bash after `words`, the last of which is incomplete. Returns `None` and skips the rest of
-/// the test if there is no bash.
+/// Returns the completions of bash after `words`. The last of the words is incomplete. Returns `None` and skips the
+/// rest of the test if there is no bash.
 fn complete_words(env: &TestEnv, words: &[&str]) -> Option<Vec<String>> {
     let program = Path::new(env!("CARGO_BIN_EXE_scanhub"));
     let script = env.file("completion", print_config(env, &["completions", "bash"]));

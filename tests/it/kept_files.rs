@@ -27,7 +27,8 @@ fn next_hub_begins_its_search_at_the_saved_rate() {
     let outcome = search(&env, &line, env.lms_link("front"));
     assert!(outcome.stderr.contains("the search begins at 19200 baud"), "{outcome}");
 
-    // The saved rate is ignored for a link with the same name at another port, and if other users can write the file.
+    // The hub ignores the saved rate for a link with the same name at another port, and if other users can write the
+    // file.
     let other = TestLine::create(&env.path("other"));
     let outcome = search(&env, &other, format!("--link=front={},family=lms", env.path_argument("other")));
     assert!(!outcome.stderr.contains("the search begins at"), "{outcome}");

@@ -74,8 +74,8 @@ fn listener_with_key_accepts_only_its_gateway() {
                 let topic = Topic::of_number(decode_datagram(bytes).head.topic);
                 sender.send_to_group(topic.map_or(Announce::GROUP, group), bytes);
             }
-            // Short datagrams in each group that the listener has joined mark the end: once they are counted, all
-            // datagrams before them were processed.
+            // A short datagram in each group that the listener has joined marks the end. Once the listener has counted
+            // these, it has processed all datagrams before them.
             let groups = [Announce::GROUP, group(Topic::Zones), group(Topic::Scan)];
             groups.iter().for_each(|&group| sender.send_to_group(group, b"the end"));
             while number(&request_statistics(&mut program, "lan_refused"), "short") < groups.len() as u64 {}

@@ -1,5 +1,5 @@
-//! Tests of `scanhub record`: the file has everything that the hub published meanwhile, however the recorder was ended,
-//! and other readers can read it.
+//! Tests of `scanhub record`: the file has everything that the hub published during the recording, however the recorder
+//! ended, and other readers can read the file.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::Path;

@@ -73,7 +73,7 @@ fn splits_a_recording_and_keeps_the_last_files() {
     assert_eq!(files[0], env.path("walk-0001.mcap"));
     let (removed, stay) = files.split_at(files.len() - 3);
     assert!(removed.iter().all(|file| !file.exists()), "{files:?}");
-    // A recorder that a busy machine delays writes everything that has arrived as one chunk.
+    // On a busy machine, a delayed recorder writes everything that has arrived as one chunk.
     let lengths: Vec<_> = stay.iter().map(|file| fs::metadata(file).unwrap().len()).collect();
     assert!(lengths.iter().all(|length| *length <= 160 << 10), "{lengths:?}");
     assert!(lengths.iter().filter(|length| **length <= 128 << 10).count() > 1, "{lengths:?}");
@@ -125,7 +125,7 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
     let all = ["walk-0000.mcap", "walk-0001.mcap", "walk-0003.mcap", "walk-0004.mcap"];
     assert_eq!(names(), all);
     files(&other.end(INT));
-    // A run that records no samples removes no files, and neither does one that is refused.
+    // Neither a run that records no samples nor a refused run removes files.
     assert_eq!(hub.end(INT).exit_code, Some(0));
     assert_eq!(env.run(&[&words[..], &["-n", "50"]].concat()).exit_code, Some(3));
     assert_eq!(env.run(&["record", "--split=1h", "--keep=2", "-o", &file]).exit_code, Some(73));

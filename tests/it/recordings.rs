@@ -181,7 +181,7 @@ fn in_the_pace_of_the_sensor() {
             (Some(u64::from(first & 0x1FFF)), &1000.into())
         );
     }
-    // At least 59 periods of 26.64 ms. A busy machine takes longer.
+    // The stream lasts at least 59 periods of 26.64 ms. A busy machine takes longer.
     let stamps: Vec<_> = scans.iter().map(|scan| number(scan, "stamp_ns")).collect();
     let span_ms = (stamps[stamps.len() - 1] - stamps[0]) / 1_000_000;
     assert!(span_ms > 1_200, "{span_ms} ms");

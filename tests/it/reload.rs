@@ -69,7 +69,7 @@ fn circles_change_in_a_stream_without_a_gap() {
         contiguous_numbers(&lines, "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["missed"], 0, "{class}");
     }
-    // A line that arrived too late here is stale and has no zones.
+    // A line that the client received too late is stale and has no zones.
     let mut verdicts = zones.of_class("zones");
     verdicts.retain(|line| line["topic_seq"].is_u64() && line["stale"] != true);
     // On a busy machine, scans may be missing for so long that the hub sends unknown zones, already with the new radii.

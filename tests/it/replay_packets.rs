@@ -161,7 +161,7 @@ fn a_part_of_it_and_again() {
     assert!((8..=12).contains(&replayed.len()), "{} scans in a second", replayed.len());
     let ranges_of = |(_, payload): &(Header, Vec<u8>)| scan(payload).ranges().to_vec();
     let expected: Vec<_> = recorded.iter().map(ranges_of).collect();
-    // The first and the last scan may be of a part of a revolution.
+    // The first and the last scan may contain only a part of a revolution.
     let inner = &replayed[1..replayed.len() - 1];
     let positions: Vec<_> =
         inner.iter().map(|scan| expected.iter().position(|ranges| *ranges == ranges_of(scan))).collect();
@@ -170,7 +170,7 @@ fn a_part_of_it_and_again() {
         !found.is_empty() && found.is_sorted_by(|a, b| a < b),
         "other scans, or another order: {positions:?}"
     );
-    // On a busy machine, the recorder may have missed scans, which the replay computes from the telegrams.
+    // On a busy machine, the recorder may have missed scans. The replay computes these scans from the telegrams.
     let is_complete = recorded.windows(2).all(|pair| pair[1].0.topic_seq == pair[0].0.topic_seq + 1);
     assert!(!is_complete || found.len() == inner.len(), "other scans: {positions:?}");
     assert!(replayed.windows(2).all(|pair| pair[0].0.stamp_first_ns < pair[1].0.stamp_first_ns));

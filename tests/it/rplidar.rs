@@ -147,7 +147,7 @@ fn a_model_that_is_not_known_is_shown_with_its_number() {
 }
 
 /// A recorder that attaches to a running stream misses the replies that the scanner sent before. A converted stream
-/// file has them.
+/// file has these replies.
 #[test]
 fn a_stream_file_has_the_scans_that_were_recorded() {
     let env = TestEnv::new();

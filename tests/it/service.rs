@@ -52,7 +52,7 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
         runs.entry(line["boot"].as_str().unwrap_or_default()).or_default().push(line.clone());
     }
     assert_eq!(runs.len(), KILL_COUNT + 2);
-    // The client reports what it misses on a busy machine.
+    // The client reports the samples that it misses on a busy machine.
     let notices = got.of_class("notice");
     let notices = notices.iter().filter(|line| line["kind"] == "missed");
     let missed: u64 = notices.map(|line| number(line, "missed")).sum();
@@ -99,7 +99,8 @@ fn kill_between_telegrams(env: &TestEnv, hub: Program, simulator: &Program, tele
     simulator.signal(Signal::CONT);
 }
 
-/// Waits for telegrams of a run that is not in `boots`, and adds it. Lines of earlier runs may still arrive first.
+/// Waits for telegrams of a run that is not in `boots`, and adds this run to `boots`. Lines of earlier runs may still
+/// arrive first.
 fn await_next_run(telegrams: &mut Program, boots: &mut HashSet<String>) {
     let boot = |line: &Value| line["boot"].as_str().unwrap_or_default().to_owned();
     let is_new = |line: &Value| line["command"] == MEASURED_VALUES && !boots.contains(&boot(line));
@@ -126,7 +127,7 @@ fn scans_resume_with_first_telegram_of_the_next_hub() {
         let first = samples
             .await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED_VALUES);
         let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
-        // A client on a busy machine may miss the first samples, which it reports.
+        // A client on a busy machine may miss the first samples. It then reports this.
         let has_missed = samples.has_printed(|line| line["kind"] == "missed");
         if has_missed || scan["seq"] == first["seq"] {
             break (first, scan);

@@ -48,8 +48,8 @@ fn create_directory_of(user: u32, path: &str) {
     chown(path, Some(user), Some(user)).expect("permission of root");
 }
 
-/// Returns the program with the environment of a login session of `user`. The user of the hub also has that of its
-/// service.
+/// Returns the program with the environment of a login session of `user`. The hub's user also has the environment of
+/// the hub's service.
 fn scanhub(user: u32, arguments: &[&str]) -> Command {
     let mut command = Command::new("/mnt/scanhub");
     command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").current_dir("/");

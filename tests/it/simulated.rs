@@ -105,7 +105,7 @@ fn rplidar_streams_in_the_requested_mode_and_replies() {
     let is_packet = |packet: &[u8]| packet[0] >> 4 == 0xA && packet[1] >> 4 == 5 && packet[132] >> 4 == 0xA;
     read("a stream", &mut port, &|bytes| bytes.windows(133).any(is_packet));
     port.write_all(&[0xA5, 0x25]).expect("a written request");
-    // A request for the recommended mode (parameter 7Ch), whose reply is the number of the mode.
+    // A request for the recommended mode (parameter 7Ch). Its reply is the number of the mode.
     port.write_all(&[0xA5, 0x84, 4, 0x7C, 0, 0, 0, 0xA5 ^ 0x84 ^ 4 ^ 0x7C]).expect("a written request");
     let answer = [0xA5, 0x5A, 6, 0, 0, 0, 0x20, 0x7C, 0, 0, 0, 4, 0];
     read("an answer", &mut port, &|bytes| bytes.ends_with(&answer));

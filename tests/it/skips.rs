@@ -5,7 +5,7 @@ use std::process::{Command, Output};
 
 use crate::testkit::{output, own_program, single_test_args, skip, skip_verdict};
 
-/// Variable that is set when the test runs again in order to skip itself.
+/// Variable that is set in the process in which the test skips itself.
 const RERUN_VARIABLE: &str = "SCANHUB_TEST_SKIP";
 
 #[test]

@@ -97,7 +97,7 @@ fn verbs_agree_on_rate_state_and_counters() {
     assert_eq!(topics, expected.each_ref().map(|(name, payload): &(Value, Value)| (name, payload)));
     assert_eq!(number(&listed[0], "subscribers"), 1, "{listed:?}");
     let info = env.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 0.0));
-    // Two measurements of the same stream. Neither is exact on a busy machine.
+    // These are two measurements of the same stream. Neither is exact on a busy machine.
     let hz_of_info = info["hz"].as_f64().unwrap_or_default();
     assert!((hz_of_info / hz - 1.0).abs() < 0.3, "info says {hz_of_info}, hz {hz}");
     let facts = ["state", "baud", "mode", "unit_mm", "angle_deg", "last_error"].map(|key| info[key].clone());

@@ -49,22 +49,22 @@ fn a_hub_that_was_stopped() {
 
     let stamps: Vec<u64> = lines.iter().map(|line| number(line, "stamp_ns")).collect();
     assert!(stamps.is_sorted(), "stamps run backwards: {stamps:?}");
-    // The stamp of a telegram that waited is not too new, or it is marked as estimated. The latter occurs if the
-    // kernel's own threads have to wait for a processor, so that the line is silent before the hub has read the whole
-    // backlog.
+    // A telegram that waited has a stamp that is not too new, or a stamp that is marked as estimated. The hub estimates
+    // the stamp if the kernel's own threads have to wait for a processor. The line is then silent before the hub has
+    // read the whole backlog.
     let is_estimate = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
     let sample = |n: usize| (truth[places[n]].sent_ns, stamps[n], is_estimate(&lines[n]));
     let all: Vec<(u64, u64, bool)> = (0..places.len()).map(sample).collect();
     let waited: Vec<_> = all.iter().filter(|(sent, ..)| (stopped..continued).contains(sent)).collect();
     let are_right = waited.iter().all(|(sent, stamp, is_estimate)| stamp < sent || *is_estimate);
     assert!(waited.len() > 10 && are_right, "{waited:?}");
-    // The hub reads the first of them at once, so its stamp is wrong only if the host was late before it was stopped:
-    // stamps continue with the period of the earlier scans.
+    // The hub reads the first of these telegrams at once. Its stamp is wrong only if the host was late before the hub
+    // was stopped: stamps continue with the period of the earlier scans.
     let was_late = all.iter().any(|(sent, stamp, _)| *sent < stopped && stamp >= sent);
     assert!(was_late || waited.first().is_some_and(|(sent, stamp, _)| stamp < sent), "{all:?}");
 
-    // Each scan has a verdict. Additional samples of `zones` report a silence, and there are no such samples between
-    // the scans that waited.
+    // Each scan has a verdict. Additional samples of `zones` report a silence. No silence is reported between the scans
+    // that waited.
     let scans = outcome.of_class("scan");
     let ahead = outcome.of_class("zones").into_iter().filter_map(|line| {
         let scan = scans.iter().find(|scan| scan["seq"] == line["seq"])?;

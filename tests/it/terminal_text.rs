@@ -26,7 +26,7 @@ fn a_configuration_commands_no_terminal() {
         "sound.toml",
         format!("[[link]]\nname = \"a\"\nport = \"{port}\"\n[gateway]\ninterface = \"{quoted}\"\n"),
     );
-    // Bytes that TOML does not allow, in a key, and C1 characters, which it allows, in a value and a key.
+    // A key with bytes that TOML does not allow, and a value and a key with C1 characters, which TOML allows.
     let raw = env.file("raw.toml", "[[link]]\nname = \"a\"\npo\u{1b}[2Jrt = 1\n");
     let value = env.file("value.toml", "[[link]]\nname = \"\u{9b}31m\"\nport = \"x\"\n");
     let key = env.file("key.toml", "[[link]]\n\"\u{9b}31m\\u001b\" = 1\n");
@@ -52,7 +52,7 @@ fn a_configuration_commands_no_terminal() {
     // JSON has the exact value.
     let outcome = env.run(&["config", "check", &sound, "--json"]);
     assert_eq!(outcome.lines()[0]["links"][0]["port"], format!("/dev/{CONTROL_CHARACTERS}"), "{outcome}");
-    // The log of a hub, its status, and verbs that print it.
+    // Check the log of a hub, its status, and verbs that print the status.
     let hub = env.hub(&["--config", &sound]);
     for verb in
         [&["info", "a"][..], &["info", "a", "--json"], &["list"], &["echo", "a/status", "-n1", "--json"]]

@@ -14,8 +14,8 @@ use crate::recorded_world::{START_NS, recorded_world};
 use crate::testkit::{INT, Outcome, Program, TestEnv, is_class, number};
 use crate::tilted::TiltedPublisher;
 
-/// World with a hall, a post ahead of the sensor, and a mount that tilts slowly, so that late stamps of a busy machine
-/// move points little.
+/// World with a hall, a post ahead of the sensor, and a mount that tilts slowly. The late stamps of a busy machine
+/// therefore move points little.
 const TILT_WORLD: &str = "
 [[sensor]]
 pose = [0, 0, 90]

@@ -26,7 +26,7 @@ pub(crate) struct TiltedPublisher {
     pub(crate) round_count: u32,
 }
 
-/// Points per sample: as many as the maximum number of beams of an LMS, so that a sample does not fit into one
+/// Number of points per sample. It equals the maximum number of beams of an LMS, so a sample does not fit into one
 /// datagram.
 const POINT_COUNT: u16 = 401;
 
@@ -82,8 +82,8 @@ impl TiltedPublisher {
         self.round_count += 1;
     }
 
-    /// Publishes until each of `programs` has printed lines of every class from rounds after all of them had printed
-    /// some.
+    /// Publishes rounds until each of `programs` has printed lines of every class. Then publishes more rounds until
+    /// each of `programs` has printed lines of every class from these rounds.
     fn publish_until_received(&mut self, programs: &mut [&mut Program]) {
         for since in [0, 1] {
             let since = since * u64::from(self.round_count);

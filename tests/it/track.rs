@@ -202,8 +202,8 @@ fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [Publish
 
 /// Time that the tracker waits for scans of other sensors, in ns.
 const DELAY_NS: u64 = 300_000_000;
-/// Lead of the played scans over the tracker's samples in ns: less than the tracker waits for other sensors, and more
-/// than the interval of its samples (40 ms).
+/// Lead of the played scans over the tracker's samples in ns. It is less than [`DELAY_NS`] and more than the interval
+/// of the tracker's samples (40 ms).
 const LEAD_NS: u64 = 160_000_000;
 /// Lead before the tracker's first sample in ns, while no sample shows what the tracker has received. The sum of this
 /// lead and [`DELAY_NS`] is long enough for that sample. It is less than the 16 foregrounds that can wait for the

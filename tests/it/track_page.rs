@@ -34,7 +34,7 @@ speed_mm_s = 1000
 from_s = 12
 "#;
 
-/// Replays the recording of one sensor, as the hub of the robot or of the machine in the kitchen.
+/// Replays the recording of `sensor`. The replay acts as the hub of the robot or of the machine in the kitchen.
 fn play(env: &TestEnv, file: &str, sensor: &str) -> Program {
     let flags = ["--json", "--paused", "--hold"];
     env.start(&[&["replay", file, "--sensor", sensor][..], &flags].concat()).ready()
@@ -51,7 +51,8 @@ fn commands_of_the_page_print_its_output() {
         let world = World::of_toml("world.toml", WORLD).expect("a world");
         let file = recorded_world(&robot, &world, &["front", "rear"], 30);
         let _played = [play(&robot, &file, "front"), play(&kitchen, &file, "rear")];
-        // With a key, the sensor is published before it sends samples: the recordings are still paused.
+        // The recordings are still paused, so the sensor sends no samples. With a key, the listener publishes the
+        // sensor anyway.
         let made = robot.run(&["key", "new", &robot.path_argument("key")]);
         assert_eq!(made.exit_code, Some(0), "{made}");
         let key = format!("--key-file={}", robot.path_argument("key"));

@@ -105,7 +105,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.press("R");
     watch.wait_for_text("front: background is learned again");
 
-    // Two runs of the hub. While the picture is held, the verdict is still current.
+    // There are two runs of the hub. While the picture is held, the verdict is still current.
     watch.press(" ");
     watch.wait_for_text(" STOP  HELD  front");
     drop(hub.end(KILL));

@@ -234,8 +234,8 @@ fn list<'a>(line: &'a Value, key: &str) -> impl Iterator<Item = &'a Value> {
     line[key].as_array().expect("a list").iter()
 }
 
-/// Compares messages that show the latest state. Each relevant message must equal some line of `class`, or at least
-/// half of them if `echo` missed samples.
+/// Compares messages that show the latest state. Each relevant message must equal some line of `class`. If `echo`
+/// missed samples, at least half of the relevant messages must.
 fn check_each_equals_some_line(
     class: &str,
     messages: &[ChannelMessage],
@@ -407,7 +407,7 @@ fn every_channel_equals_the_output_of_echo() {
         viewer.receive_messages(5);
         viewer
     });
-    // The lines of the samples that the viewers received precede these.
+    // Wait for lines of later samples. `echo` has then printed the samples that the viewers received.
     let now = wall_ns();
     for class in ["scan", "foreground", "marks", "zones", "lines"] {
         echo.await_line(class, |line| line["class"] == class && line["wall_ns"].as_u64() > Some(now));

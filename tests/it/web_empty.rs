@@ -1,4 +1,4 @@
-//! Tests of pages without data: the page states the reason and the remedy, and its colors show how serious the state
+//! Tests of pages without data: the page states the reason and the remedy, and its colors show how serious the reason
 //! is.
 
 use serde_json::Value;

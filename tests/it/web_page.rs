@@ -135,7 +135,7 @@ fn page_drops_sensors_of_previous_server() {
     page.press(" ");
     page.await_true(&format!("{titles} === '1  rear' && {states} === 'streaming' && scanhub.beams > 100"));
 
-    // Without a frozen picture, the sensors are dropped as soon as the page has connected.
+    // If the picture is not frozen, the page drops the sensors as soon as it has connected.
     assert_eq!(server.end(INT).exit_code, Some(0));
     page.await_true("/No connection/.test(scanhub.reason)");
     let (server, _) = web(&first, &address);

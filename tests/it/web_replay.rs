@@ -14,7 +14,7 @@ fn start_web(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
     (web, url)
 }
 
-/// Scans of a log that plays for two minutes, which is longer than a page takes to load.
+/// Number of scans of a log that plays for two minutes. This is longer than a page takes to load.
 const SCAN_COUNT: u64 = 600;
 
 /// Writes a CARMEN log of a wall that is nearer in every scan, at five scans per second.

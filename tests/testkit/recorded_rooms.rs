@@ -21,7 +21,7 @@ use scanhub_sim::world::World;
 
 /// Names of the sensors, and their worlds.
 pub(crate) const SENSORS: [(&str, &str); 2] = [("front", "fig8"), ("rear", "demo")];
-/// Setting with which the background is learned after 40 scans, within the recording.
+/// Setting with which the hub learns the background after 40 scans, within the recording.
 pub(crate) const SHORT_LEARNING: &str = "background.scans=40";
 
 /// Returns the time from one scan to the next.

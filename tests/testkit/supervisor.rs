@@ -21,7 +21,7 @@ pub(crate) struct Supervisor {
     stored_descriptor: Option<(String, OwnedFd)>,
     /// Lines of all notifications from all hubs.
     pub(crate) messages: Vec<String>,
-    /// Lines of the last hub for which the test has not waited yet. Threads of the hub notify in no particular order.
+    /// Lines of the last hub that the test has not waited for yet. Threads of the hub notify in no particular order.
     unread_messages: Vec<String>,
 }
 

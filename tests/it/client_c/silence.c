@@ -34,7 +34,7 @@ static void print_names(const char *key, int (*list)(const char *, char *, size_
     print_text(key, names);
 }
 
-/* Waits for a sample or for the time of one line. Returns the number of wake-ups without a sample. */
+/* Waits for a sample, at most for the time between two lines. Returns the number of wake-ups without a sample. */
 static int wait_for_line(struct scanhub_attachment *scans, int is_event)
 {
     struct scanhub_sample sample;

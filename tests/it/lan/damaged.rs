@@ -34,14 +34,14 @@ pub(crate) fn expected(bytes: &[u8]) -> Value {
     }
 }
 
-/// Changes a few bytes of header and payload, or the length of the payload. Bytes of texts and of other values that are
-/// not numbers are not changed, because languages show them differently.
+/// Changes a few bytes of header and payload, or the length of the payload. Does not change texts and other values that
+/// are not numbers, because languages show them differently.
 fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
     let mut payload = datagram.payload.to_vec();
     let is_spared = |at: usize| match Topic::of_number(datagram.head.topic) {
         Some(Topic::Status) => (24..336).contains(&at) || at >= 560,
         None => (40..64).contains(&at),
-        // The positions of texts depend on the counts, so those are not changed, either.
+        // The positions of texts depend on the counts, so do not change the counts, either.
         Some(Topic::Tracks) => {
             at < 2 || !(8..8 + 80 * usize::from(datagram.payload[0])).contains(&at) || at % 80 >= 56
         }

@@ -100,9 +100,9 @@ impl PublishedSamples {
     }
 }
 
-/// Returns `samples` sorted by sensor, topic and `topic_seq`. Drops statuses and the zones before the first telegram,
-/// for which a subscriber of a replay attaches too late. Without `has_stamps`, the times come from the clock of the run
-/// and are replaced by null.
+/// Returns `samples` sorted by sensor, topic and `topic_seq`. Drops statuses, and drops the zones before the first
+/// telegram, because a subscriber of a replay attaches too late for them. Without `has_stamps`, the times come from the
+/// clock of the run and are replaced by null.
 fn sorted(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
     let mut samples: Vec<Value> = samples
         .into_iter()
@@ -115,8 +115,8 @@ fn sorted(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
     samples
 }
 
-/// Asserts that a replay of `file` with the settings in `config` publishes the samples that [`RecordingReader`] and, if
-/// `read` is given, `scanhub.read` return.
+/// Asserts that a replay of `file` with the settings in `config` publishes the samples that [`RecordingReader`]
+/// returns. If `read` is given, `scanhub.read` must return the same samples.
 fn compare(
     env: &TestEnv,
     read: Option<&Command>,
