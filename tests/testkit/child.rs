@@ -38,9 +38,10 @@ const SINCE_VARIABLE: &str = "SCANHUB_TEST_SINCE";
 
 /// Time that a program has to exit after TERM before it is killed.
 const TERM_TIMEOUT: Duration = Duration::from_secs(2);
-/// Time in which the kernel ends killed processes, even on a busy machine.
+/// Maximum time in which the kernel ends killed processes, even on a busy machine.
 const KILL_TIMEOUT: Duration = Duration::from_secs(60);
-/// Time that a process has to load its program. It is short, because the environment of some processes stays empty.
+/// Maximum time in which a process loads its program. It is short, because the environment of some processes stays
+/// empty.
 const EXEC_TIMEOUT: Duration = Duration::from_millis(200);
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
@@ -179,15 +180,15 @@ impl Child {
         }
     }
 
-    /// Returns the command lines of its running descendants, and its own if it is running.
+    /// Returns the command lines of the running descendants, and of the child itself if it is running.
     pub(crate) fn living_command_lines(&self) -> Vec<String> {
         let text = |pid| fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
         let line = |pid| String::from_utf8_lossy(&text(pid)).trim_end_matches('\0').replace('\0', " ");
         self.living_pids(false).into_iter().map(line).collect()
     }
 
-    /// Returns the process IDs of its running descendants, and its own if it is running. The members of its process
-    /// group count as descendants if `is_group_ours`.
+    /// Returns the process IDs of the running descendants, and of the child itself if it is running. The members of its
+    /// process group count as descendants if `is_group_ours`.
     fn living_pids(&self, is_group_ours: bool) -> Vec<i32> {
         let id = self.process.id() as i32;
         // The kernel assigns ascending process IDs until it reaches the maximum. A descendant therefore has a higher

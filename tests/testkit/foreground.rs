@@ -113,7 +113,7 @@ impl Detector for HubDetector {
     }
 }
 
-/// Numbers of beams, counted by correct answer and by the answer of the method.
+/// Numbers of beams. Each beam is counted by its correct answer and by the answer of the method.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Score {
     scans: u64,
@@ -173,10 +173,10 @@ const LEARNING_SCANS: usize = 375;
 /// away. N is [`LEARNING_SCANS`].
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Boxes {
-    /// Beams that meet box 1, N scans after it was put down, and how many of them are still foreground.
+    /// Beams that meet box 1, N scans after it was put down. The second number counts those that are still foreground.
     new_box: Share,
-    /// Beams that met box 2, N and 2N scans after it was taken away, and how many of them would not be foreground if it
-    /// were put back.
+    /// Beams that met box 2, N and 2N scans after it was taken away. The second number counts those that would not be
+    /// foreground if the box were put back.
     removed_box: [Share; 2],
 }
 

@@ -103,7 +103,7 @@ impl TestEnv {
         env
     }
 
-    /// Returns the domain of its hub, for subscribers in the test process.
+    /// Returns the domain of this environment, for subscribers in the test process.
     pub(crate) fn domain(&self) -> Domain {
         Domain::at(&self.domain, self.directory.path()).unwrap_or_else(|failure| panic!("{failure}"))
     }
@@ -296,7 +296,7 @@ impl TestEnv {
         line.clone()
     }
 
-    /// Runs `info` until its line for `sensor` is as `is_expected`, and returns the line.
+    /// Runs `info` until `is_expected` accepts its line about `sensor`, and returns this line.
     pub(crate) fn await_info(&self, sensor: &str, is_expected: impl Fn(&Value) -> bool) -> Value {
         let mut last = Value::Null;
         wait_until("info has the expected status", || {
@@ -387,14 +387,14 @@ pub(crate) fn wait_until(description: &str, mut is_true: impl FnMut() -> bool) {
         }
         let elapsed = started.elapsed();
         assert!(Instant::now() < give_up_at, "timeout while waiting for: {description}");
-        // A check that starts a program may take at most a third of the time, so that other programs get the processor.
+        // A check that starts a program may take at most a third of the time. Other programs then get the processor.
         thread::sleep(pause.max(2 * elapsed).min(Duration::from_millis(100)));
         pause = (2 * pause).min(Duration::from_millis(20));
     }
 }
 
-/// Waits for at least `span`, for a program that must notice by its own clock that this time has passed. A test must
-/// not fail if the wait takes longer.
+/// Waits for at least `span`, so that a program notices by its own clock that this time has passed. A test must not
+/// fail if the wait takes longer.
 pub(crate) fn wait_at_least(span: Duration) {
     thread::sleep(span);
 }

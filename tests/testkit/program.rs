@@ -19,11 +19,11 @@ pub(crate) const KILL: Signal = Signal::KILL;
 pub(crate) const HUP: Signal = Signal::HUP;
 pub(crate) const USR1: Signal = Signal::USR1;
 
-/// Running program. Dropping it ends it.
+/// Running program. Dropping this value ends the program.
 pub(crate) struct Program {
     name: String,
     process: Child,
-    /// Lines of its stdout that have not been processed yet. The last one may lack its line feed.
+    /// Lines of stdout that have not been processed yet. The last one may lack its line feed.
     received_lines: Receiver<Vec<u8>>,
     /// Bytes of all lines that were taken from `received_lines`.
     stdout: Vec<u8>,
@@ -34,11 +34,11 @@ pub(crate) struct Program {
 pub(crate) struct Outcome {
     /// Exit code; `None` if a signal ended the program.
     pub(crate) exit_code: Option<i32>,
-    /// All of its stdout.
+    /// Complete stdout of the program.
     pub(crate) stdout: Vec<u8>,
-    /// All of its stderr.
+    /// Complete stderr of the program.
     pub(crate) stderr: String,
-    /// Command lines of the descendants that were still running when it exited. They have been ended since.
+    /// Command lines of the descendants that were still running when the program exited. They have been ended since.
     pub(crate) leftover_processes: Vec<String>,
     name: String,
 }
@@ -75,40 +75,41 @@ impl Program {
         Program { name, process, received_lines, stdout: Vec::new(), errors: Some(errors) }
     }
 
-    /// Waits for its line of class `ready`.
+    /// Waits for the program's line of class `ready`.
     pub(crate) fn ready(mut self) -> Program {
         self.await_line("ready", |line| line["class"] == "ready");
         self
     }
 
-    /// Returns its process ID.
+    /// Returns the process ID of the program.
     pub(crate) fn pid(&self) -> u32 {
         self.process.id()
     }
 
-    /// Returns whether it has ended.
+    /// Returns whether the program has ended.
     pub(crate) fn has_ended(&self) -> bool {
         matches!(self.state(), None | Some('Z' | 'X'))
     }
 
-    /// Returns whether a signal has stopped it.
+    /// Returns whether a signal has stopped the program.
     pub(crate) fn is_stopped(&self) -> bool {
         self.state() == Some('T')
     }
 
-    /// Returns the state of its process as the letter of proc_pid_stat(5), or `None` if the process does not exist.
+    /// Returns the state of the process as the letter of proc_pid_stat(5), or `None` if the process does not exist.
     fn state(&self) -> Option<char> {
         let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).ok()?;
         // The state follows the name in brackets.
         status.rsplit_once(')')?.1.trim_start().chars().next()
     }
 
-    /// Waits for its next line or its end, and returns whether it ended without another line on stdout.
+    /// Waits for the next line or the end of the program. Returns whether the program ended without another line on
+    /// stdout.
     pub(crate) fn ends_without_output(&mut self) -> bool {
         self.receive(Instant::now() + WAIT_TIMEOUT) == Err(RecvTimeoutError::Disconnected)
     }
 
-    /// Waits for the next line that is `is_expected`, and returns it.
+    /// Waits for the next line that `is_expected` accepts, and returns this line.
     pub(crate) fn await_line(&mut self, description: &str, is_expected: impl Fn(&Value) -> bool) -> Value {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         loop {
@@ -119,33 +120,34 @@ impl Program {
         }
     }
 
-    /// Returns whether one of the lines received so far is `is_expected`. Does not receive more lines.
+    /// Returns whether `is_expected` accepts one of the lines received so far. Does not receive more lines.
     pub(crate) fn has_printed(&self, is_expected: impl Fn(&Value) -> bool) -> bool {
         let lines = self.stdout.split(|byte| *byte == b'\n');
         lines.filter_map(|line| serde_json::from_slice(line).ok()).any(|line| is_expected(&line))
     }
 
-    /// Receives the lines that it has written by now, and returns whether one of all its lines is `is_expected`.
+    /// Receives the lines that the program has written by now. Returns whether `is_expected` accepts one of all
+    /// received lines.
     pub(crate) fn prints(&mut self, is_expected: impl Fn(&Value) -> bool) -> bool {
         while self.receive(Instant::now()).is_ok() {}
         self.has_printed(is_expected)
     }
 
-    /// Returns the first line that is `is_expected` among all that it has printed so far.
+    /// Returns the first line that `is_expected` accepts, among all lines that the program has printed so far.
     pub(crate) fn printed(&mut self, is_expected: impl Fn(&Value) -> bool) -> Option<Value> {
         while self.receive(Instant::now()).is_ok() {}
         let lines = self.stdout.split(|byte| *byte == b'\n');
         lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| is_expected(line))
     }
 
-    /// Returns the last line that is `is_expected` among all that it has printed so far.
+    /// Returns the last line that `is_expected` accepts, among all lines that the program has printed so far.
     pub(crate) fn last_printed(&mut self, is_expected: impl Fn(&Value) -> bool) -> Option<Value> {
         while self.receive(Instant::now()).is_ok() {}
         let lines = self.stdout.split(|byte| *byte == b'\n').rev();
         lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| is_expected(line))
     }
 
-    /// Waits for the next `count` lines that are `is_expected`, and returns them.
+    /// Waits for the next `count` lines that `is_expected` accepts, and returns these lines.
     pub(crate) fn await_lines(
         &mut self,
         count: usize,
@@ -174,7 +176,7 @@ impl Program {
         String::from_utf8_lossy(&self.stdout[begin..]).trim_end().to_owned()
     }
 
-    /// Waits until it has written more than `len` bytes to stdout in total.
+    /// Waits until the program has written more than `len` bytes to stdout in total.
     pub(crate) fn await_bytes(&mut self, len: usize) {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while self.stdout.len() <= len {
@@ -189,13 +191,13 @@ impl Program {
             .unwrap_or_else(|error| panic!("{}: cannot send {signal:?}: {error}", self.name));
     }
 
-    /// Sends a signal and waits until it exits.
+    /// Sends a signal and waits until the program exits.
     pub(crate) fn end(self, signal: Signal) -> Outcome {
         self.signal(signal);
         self.wait()
     }
 
-    /// Waits until it exits.
+    /// Waits until the program exits.
     pub(crate) fn wait(mut self) -> Outcome {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         let why = loop {
@@ -231,7 +233,7 @@ impl Program {
     }
 
     fn fail_wait(&mut self, description: &str, why: RecvTimeoutError) -> ! {
-        // Ends its descendants, too, because any of them keeps stderr open.
+        // End the descendants too, because any of them keeps stderr open.
         self.process.end();
         let errors = self.errors.take().and_then(|errors| errors.join().ok()).unwrap_or_default();
         let out = String::from_utf8_lossy(&self.stdout);
@@ -244,8 +246,8 @@ impl Program {
 }
 
 impl Drop for Program {
-    /// Ends it. If the test has failed, prints the state of the program, its last lines and its stderr, because they
-    /// may show the reason.
+    /// Ends the program. If the test has failed, prints the state of the program, its last lines and its stderr,
+    /// because they may show the reason.
     fn drop(&mut self) {
         let Some(errors) = self.errors.take().filter(|_| thread::panicking()) else { return };
         let status = self.process.try_wait().ok().flatten();
@@ -260,7 +262,7 @@ impl Drop for Program {
 }
 
 impl Outcome {
-    /// Parses its stdout as lines of JSON.
+    /// Parses stdout as lines of JSON.
     pub(crate) fn lines(&self) -> Vec<Value> {
         let text = String::from_utf8_lossy(&self.stdout);
         assert!(text.is_empty() || text.ends_with('\n'), "the last line is incomplete: {self}");
@@ -269,7 +271,7 @@ impl Outcome {
             .collect()
     }
 
-    /// Returns its lines of `class`.
+    /// Returns the lines of `class`.
     pub(crate) fn of_class(&self, class: &str) -> Vec<Value> {
         self.lines().into_iter().filter(|line| line["class"] == class).collect()
     }

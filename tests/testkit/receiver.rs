@@ -68,8 +68,8 @@ impl Receiver {
         self.datagrams.lock().expect("no thread has panicked").clone()
     }
 
-    /// Waits until `count` datagrams that are `is_expected` have arrived after this call. Panics if any new datagram is
-    /// invalid.
+    /// Waits until `count` datagrams that `is_expected` accepts have arrived after this call. Panics if any new
+    /// datagram is invalid.
     pub(crate) fn wait_for_datagrams(&self, count: usize, is_expected: impl Fn(&Datagram<'_>) -> bool) {
         let before = self.datagrams().len();
         wait_until("the expected datagrams arrive", || {

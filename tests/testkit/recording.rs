@@ -80,7 +80,7 @@ impl Recording {
 }
 
 impl RecordedMessage {
-    /// Returns the `seq` of the header: the number of the telegram from which the sample was computed.
+    /// Returns the `seq` of the header: the number of the telegram from which the hub computed the sample.
     pub(crate) fn seq(&self) -> u64 {
         self.u64_at(0)
     }

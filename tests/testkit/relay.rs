@@ -30,7 +30,7 @@ struct RelayState {
     received: Vec<Vec<u8>>,
     /// All datagrams that were forwarded, in the order in which they were sent.
     forwarded: Vec<Vec<u8>>,
-    /// Datagrams that are forwarded later, each with the number of datagrams that must arrive before.
+    /// Datagrams that are forwarded later. The number is the count of datagrams that must arrive before.
     delayed: Vec<(usize, Vec<u8>)>,
     rng: fastrand::Rng,
     is_faulty: bool,
@@ -42,7 +42,8 @@ const LOSS_PERCENT: u8 = 5;
 const DELAY_PERCENT: u8 = 5;
 /// Percentage of the arriving datagrams that are forwarded at once and again later.
 const DUPLICATE_PERCENT: u8 = 2;
-/// Maximum delay of a datagram, in datagrams that arrive meanwhile. It corresponds to several scans.
+/// Maximum delay of a datagram, as the number of datagrams that arrive during the delay. It corresponds to several
+/// scans.
 const MAX_DELAY_DATAGRAMS: usize = 80;
 
 impl Relay {

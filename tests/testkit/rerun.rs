@@ -38,7 +38,7 @@ pub(crate) fn rerun_test(name: &str, mut command: Command) {
 }
 
 /// Runs `test`, whose name is `name`, in a separate process. This is for a test that depends on descriptor numbers or
-/// on the number of open descriptors, and for one whose descriptors children of other tests must not inherit.
+/// on the number of open descriptors. It is also for a test whose descriptors children of other tests must not inherit.
 ///
 /// # Panics
 ///

@@ -119,8 +119,8 @@ impl TestGateway {
         datagram
     }
 
-    /// Sends a status of another sensor of the same gateway, which is never announced. A listener that receives such
-    /// samples for a second concludes that the network works and that the sensor under test is silent.
+    /// Sends a status of another sensor of the same gateway. The other sensor is never announced. A listener that
+    /// receives these samples for a second concludes that the network works and that the sensor under test is silent.
     pub(crate) fn prove_delivery(&mut self) {
         let status = usize::from(Topic::Status.number());
         let sensor = std::mem::replace(&mut self.sensor, UNANNOUNCED_SENSOR);

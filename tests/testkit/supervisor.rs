@@ -41,7 +41,7 @@ impl Supervisor {
     /// Returns the command that starts `hub` as a service, and the stdin that passes the stored descriptor to it.
     /// `watchdog` is the watchdog interval.
     pub(crate) fn service(&mut self, hub: &Command, watchdog: Option<Duration>) -> (Command, Stdio) {
-        // Messages that the previous hub sent last must not count as messages of the new one.
+        // Messages that the previous hub sent at its end must not count as messages of the new hub.
         self.socket.set_nonblocking(true).expect("a socket");
         while self.receive().is_ok() {}
         self.socket.set_nonblocking(false).expect("a socket");

@@ -55,8 +55,8 @@ pub(crate) struct TerminalSession {
 }
 
 impl TerminalSession {
-    /// Starts `command` in a new terminal of `size` (columns and rows), which is the controlling terminal of a new
-    /// session.
+    /// Starts `command` in a new terminal of `size` (columns and rows). The terminal is the controlling terminal of a
+    /// new session.
     pub(crate) fn start(command: &Command, size: (u16, u16)) -> TerminalSession {
         TerminalSession::begin(command, size, &["-c"], None)
     }
@@ -121,7 +121,7 @@ impl TerminalSession {
         }
     }
 
-    /// Returns its process ID.
+    /// Returns the process ID of the program.
     pub(crate) fn pid(&self) -> u32 {
         self.process.id()
     }
@@ -131,7 +131,7 @@ impl TerminalSession {
         String::from_utf8_lossy(&self.output.lock().unwrap()).into_owned()
     }
 
-    /// Returns the rows of its screen.
+    /// Returns the rows of the screen.
     pub(crate) fn rows(&self) -> Vec<String> {
         screen_rows(&self.text(), self.size.0.into(), self.size.1.into())
     }
@@ -141,7 +141,7 @@ impl TerminalSession {
         self.await_rows(words, |rows| rows.iter().any(|row| row.contains(words)));
     }
 
-    /// Waits until the rows are as `is_expected`.
+    /// Waits until `is_expected` accepts the rows.
     pub(crate) fn await_rows(&self, description: &str, is_expected: impl Fn(&[String]) -> bool) {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while !is_expected(&self.rows()) {

@@ -43,7 +43,7 @@ impl Tmux {
         self.run_tmux(&["resize-window", "-x", &columns.to_string(), "-y", &rows.to_string()]);
     }
 
-    /// Waits until the rows of the window are as `is_expected`, and returns them.
+    /// Waits until `is_expected` accepts the rows of the window, and returns the rows.
     pub(crate) fn await_rows(
         &self,
         description: &str,
