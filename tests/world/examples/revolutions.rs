@@ -6,8 +6,8 @@
 //! - a hundred hubs whose process stops for half a second at a time,
 //! - the time until a scanner streams, whatever its state was when the hub started.
 //!
-//! Run it with `cargo run --release -p scanhub-world --example turns`. Arguments after `--` select the tables whose
-//! names start with one of them.
+//! Run it with `cargo run --release -p scanhub-world --example revolutions`. Each argument after `--` is a prefix; the
+//! tables whose names start with one of the prefixes are selected.
 
 use std::fmt::Write as _;
 
@@ -28,7 +28,7 @@ const RPLIDAR_MODELS: [(&str, &[&str]); 8] = [
 /// One model and mode for each packet format.
 const PACKET_KINDS: [&str; 5] = ["a1:standard", "a1:express", "a1:boost", "s1:denseboost", "s3:ultradense"];
 
-/// Selected tables; all if empty.
+/// Prefixes of the names of the selected tables. If it is empty, all tables are selected.
 struct Tables(Vec<String>);
 
 impl Tables {

@@ -14,15 +14,15 @@ use crate::topics::Sample;
 /// An event. Its time is passed separately.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Event<'a> {
-    /// Hub number `run` has started, with the boot ID `boot`.
+    /// The hub has started with the boot ID `boot`, as run number `run`.
     HubStarted { run: u64, boot: u64 },
-    /// The hub was killed or ended in order.
+    /// The hub was killed, or it ended in an orderly way.
     HubEnded { run: u64, killed: bool },
     /// The process of the hub is stopped until this time.
     Stalled { until: Nanos },
     /// The hub has opened the line to a sensor. The `offset` bytes that the port had received before are lost.
     PortOpened { sensor: usize, offset: u64 },
-    /// The line has no owner any more.
+    /// No hub has the line open any more.
     PortClosed { sensor: usize },
     /// Another scanner is connected to the line.
     ScannerExchanged { sensor: usize },
@@ -30,19 +30,20 @@ pub(crate) enum Event<'a> {
     Measured { sensor: usize, points: &'a [TruePoint] },
     /// The last byte of a telegram has arrived at the port, or was lost on the way.
     Sent { sensor: usize, telegram: &'a Telegram<'a> },
-    /// The port has discarded the bytes of its buffer, from position `from` up to position `to`.
+    /// The port has discarded the bytes in its buffer from position `from` up to position `to`.
     Flushed { sensor: usize, from: u64, to: u64 },
-    /// The hub has changed the rate of the port, which invalidates what a session has derived from earlier bytes.
+    /// The hub has changed the rate of the port. Results that a session has derived from earlier bytes are no longer
+    /// valid.
     RateChanged { sensor: usize },
     /// Another process has set the port to another rate.
     RateAltered { sensor: usize },
     /// The hub has written bytes to the port.
     Written { sensor: usize },
-    /// The hub has read `len` bytes. The position after the last one is `to`.
+    /// The hub has read `len` bytes. `to` is the position after the last of them.
     Read { sensor: usize, len: usize, to: u64 },
     /// A sample was sent to all attached subscribers.
     Published { sensor: usize, sample: &'a Sample },
-    /// The hub rang the doorbell of a sensor for subscribers of this word.
+    /// The hub rang the doorbell of a sensor for the subscribers of the word `ring`.
     Rung { sensor: usize, ring: DoorbellWord },
     /// The hub sent the event of a sensor, which wakes its listeners.
     Notified { sensor: usize },
@@ -50,11 +51,11 @@ pub(crate) enum Event<'a> {
     OutOfMemory { sensor: usize, topic: Topic },
     /// A subscriber has attached.
     Attached { subscriber: SubscriberId, sensor: usize, topic: Topic, is_prompt: bool, is_listener: bool },
-    /// A subscriber took a sample. By the sequence number, it missed `missed` samples before.
+    /// A subscriber took a sample. The sequence number shows that the subscriber missed `missed` samples before it.
     Taken { subscriber: SubscriberId, sample: &'a Sample, missed: u64 },
     /// A sample was dropped from the full queue of a subscriber.
     Dropped { subscriber: SubscriberId, sample: &'a Sample },
-    /// A subscriber has left or was killed. `is_drained` means that it had taken all samples before.
+    /// A subscriber has left or was killed. If `is_drained`, it had taken all samples before.
     Detached { subscriber: SubscriberId, is_drained: bool },
     /// A robot accepts this verdict on a sensor's zones from now on.
     VerdictAccepted { sensor: usize, verdict: Verdict },
@@ -64,14 +65,14 @@ pub(crate) enum Event<'a> {
     GatewayEnded { epoch: u32, is_killed: bool },
     /// A gateway sent a datagram. Its sockets accepted the datagram if `is_taken`.
     Transmitted { datagram: &'a Datagram<'a>, bytes: &'a [u8], is_taken: bool },
-    /// A row of the counters of a gateway that ends. The row of announcements has no topic.
+    /// A row of the counters of a gateway that ends. The row that counts announcements has no topic.
     GatewayCounters { sensor: usize, topic: Option<Topic>, row: &'a outgoing::TopicStats },
     /// Another sender sent these bytes.
     Forged { forgery: Forgery, bytes: &'a [u8] },
     /// A listener has started.
     ListenerStarted { run: u64 },
-    /// A listener took a message that had arrived at its machine at `arrived_at`. `datagram` is `None` if it is not a
-    /// datagram.
+    /// A listener took a message that had arrived at its machine at `arrived_at`. `datagram` is `None` if the message
+    /// is not a datagram.
     Arrived {
         arrived_at: Nanos,
         datagram: Option<&'a Datagram<'a>>,
@@ -84,12 +85,12 @@ pub(crate) enum Event<'a> {
     RemoteVerdictAccepted { sensor: usize, verdict: Verdict },
     /// A row of the counters of a listener that ends.
     ListenerCounters { row: &'a StreamCounters },
-    /// A listener has ended, with the number of datagrams that it refused, of runs of gateways that it evicted, and of
-    /// sensors that it published.
+    /// A listener has ended. It refused `refused` datagrams, evicted `evicted` runs of gateways and published `sensors`
+    /// sensors.
     ListenerEnded { run: u64, refused: u64, evicted: u64, sensors: usize },
     /// An action, as text.
     ActionTaken { text: &'a str },
-    /// All faults are cleared, and no further ones follow.
+    /// All faults are cleared, and no further faults follow.
     FaultsCleared,
     /// The world is at its end, and its last hub has ended.
     WorldEnded { eeprom_writes: u64, handles: usize, loans: usize, held: usize },
@@ -102,7 +103,7 @@ pub(crate) enum DatagramOutcome {
     Refused(DatagramError),
     /// A part of a sample that is not complete yet.
     Part,
-    /// The datagram arrived before, or is an announcement that is older than another one.
+    /// The datagram has arrived before, or it is an announcement and a newer announcement has arrived.
     Duplicate,
     /// An announcement.
     Announcement,
@@ -115,7 +116,7 @@ pub(crate) enum DatagramOutcome {
 pub(crate) struct Telegram<'a> {
     /// The bytes as the scanner sent them.
     pub(crate) bytes: &'a [u8],
-    /// Position of the first byte, and the one after the last byte, among all bytes that arrived at the port.
+    /// Position of the first byte and position after the last byte, counted over all bytes that arrived at the port.
     pub(crate) span: (u64, u64),
     /// Time at which the first bytes arrived at the port, and baud rate.
     pub(crate) first_at: Nanos,
@@ -144,26 +145,26 @@ pub enum Detail {
 pub struct RevolutionFigures {
     /// Number of scans.
     pub scans: u64,
-    /// Number of scans that were marked because packets are missing.
+    /// Number of scans that the hub marked as incomplete because packets are missing.
     pub incomplete: u64,
-    /// Number of points that were found among the measured ones.
+    /// Number of reported points for which a measured point was found.
     pub points: u64,
     /// Largest error of an angle, in degrees.
     pub angle_deg: f64,
     /// Largest error of a range, in millimeters.
     pub range_mm: f64,
-    /// Largest error of the stamp of a scan. Only scans whose stamps must be right count.
+    /// Largest error of a scan's stamp. Only scans whose stamps must be right count.
     pub stamp_ns: Nanos,
-    /// Largest error of the time between two consecutive scans, by their stamps.
+    /// Largest error of the time between two consecutive scans, calculated from their stamps.
     pub uneven_ns: Nanos,
-    /// Number of points in scans without any mark that are more than 5 cm from every measured point.
+    /// Number of points that are more than 5 cm from every measured point, in scans without any mark.
     pub wrong: u64,
     /// Number of packets that the hub counted as lost on the line.
     pub lost: u64,
-    /// Time until the hub had the first packet of measured values, without the time in which the scanner waited for its
-    /// motor.
+    /// Time until the hub had the first packet of measured values. The time for which the scanner waited for its motor
+    /// does not count.
     pub data_ns: Nanos,
-    /// Time until the hub published the first scan, without the time in which the scanner waited for its motor.
+    /// Time until the hub published the first scan. The time for which the scanner waited for its motor does not count.
     pub scan_ns: Nanos,
 }
 
@@ -204,7 +205,7 @@ impl std::fmt::Display for Violation {
 impl Event<'_> {
     /// Adds the event to the history hash.
     pub(crate) fn hash(&self, at: Nanos, history: &mut HistoryHash) {
-        // The replies of the scanner are in the hash.
+        // Not needed in the hash, because the hash contains the scanner's replies.
         if matches!(self, Event::Written { .. }) {
             return;
         }
@@ -231,7 +232,7 @@ impl Event<'_> {
                 history.add_bytes(bytemuck::bytes_of(&Header { hub_pid: 0, ..sample.header }));
                 history.add_bytes(&sample.bytes);
             }
-            // The packets with these points are in the hash.
+            // Not needed in the hash, because the hash contains the packets with these points.
             Event::Measured { .. } | Event::Written { .. } => {}
             Event::Rung { sensor, ring } => numbers(&[29, sensor as u64, ring as u64]),
             Event::Notified { sensor } => numbers(&[32, sensor as u64]),
@@ -278,7 +279,7 @@ impl Event<'_> {
                 numbers(&[27, row.epoch.into(), row.sensor.into(), row.topic.into()]);
                 numbers(&[row.received, row.lost(), row.duplicate, row.reordered]);
             }
-            // The counters follow from events that are in the hash.
+            // Not needed in the hash, because the counters follow from events in the hash.
             Event::GatewayCounters { .. } => {}
             Event::ListenerEnded { run, refused, evicted: given_up, sensors } => {
                 numbers(&[28, run, refused, given_up, sensors as u64]);
@@ -286,7 +287,7 @@ impl Event<'_> {
         }
     }
 
-    /// Returns the line to print for the event, or `None` if `detail` leaves it out.
+    /// Returns the line to print for the event, or `None` if `detail` excludes the event.
     pub(crate) fn describe(&self, detail: Detail) -> Option<String> {
         match self {
             Event::Sent {
@@ -336,7 +337,7 @@ impl Event<'_> {
     }
 }
 
-/// Returns enough of the bytes to recognize a telegram.
+/// Returns a prefix of the bytes that is long enough to recognize a telegram.
 fn prefix(bytes: &[u8]) -> &[u8] {
     &bytes[..bytes.len().min(8)]
 }

@@ -1,5 +1,5 @@
-//! Scanner families of a world, one file each. A family defines in which state a scanner is found, the configuration of
-//! its link, and what its bytes mean to invariants. The rest of the world does not depend on the family.
+//! Scanner families of a world, one file each. A family defines the scanner's state at the start, the configuration of
+//! its link, and what the scanner's bytes mean to invariants. The rest of the world does not depend on the family.
 
 mod either;
 mod ld;
@@ -21,7 +21,7 @@ use scanhub_sim::world::World as Scene;
 
 use crate::scenario::Action;
 
-/// A scanner of a world with its link, as drawn from the seed.
+/// A scanner of a world together with its link, drawn from the seed.
 pub(crate) trait Family {
     /// Returns the configuration keys of the link, as `KEY=VALUE`.
     fn keys(&self) -> Vec<String>;
@@ -29,17 +29,17 @@ pub(crate) trait Family {
     /// Returns this scanner with a link that has no family and no key that implies one.
     fn auto(&self) -> Rc<dyn Family>;
 
-    /// Returns the family, or both families of a scanner that is exchanged for a scanner of another family.
+    /// Returns the family. Returns both families if an exchange replaces the scanner with one of another family.
     fn families(&self) -> Vec<scanhub_schema::Family>;
 
     /// Returns the rates that the line may have, in bits per second.
     fn baud_rates(&self) -> Vec<u32>;
 
-    /// Returns the longest time between two scans, and the longest time from a measurement until the scan that contains
-    /// it has been sent.
+    /// Returns two maximum times. The first one is the time between two scans. The second one is the time from a
+    /// measurement until the hub has sent the scan that contains it.
     fn scan_times(&self) -> (Nanos, Nanos);
 
-    /// Returns the scanner as the hub finds it. Its scene changes by `changes`.
+    /// Returns the scanner in the state in which the hub finds it. `changes` are the changes of its scene.
     fn initial_scanner(&self, changes: Changes) -> Box<dyn Scanner>;
 
     /// Splits a sample of topic `telegram` into the telegrams or packets that the scanner sent.
@@ -51,14 +51,14 @@ pub(crate) trait Family {
     /// Returns whether `unit` contains measured values and is not a reply.
     fn is_data(&self, unit: &[u8]) -> bool;
 
-    /// Returns whether `scan` has the values of `sample`, for families with one telegram per scan.
+    /// Returns whether `scan` has the values of `sample`. Only families with one telegram per scan use it.
     fn is_scan_of(&self, scan: &Scan, sample: &[u8]) -> bool;
 
-    /// Returns whether the line may have made `got` from a recently `damaged` unit in such a way that the checksum is
-    /// valid by chance. The hub cannot detect this.
+    /// Returns whether the line may have changed a recently `damaged` unit into `got` so that the checksum is valid by
+    /// chance. The hub cannot detect this.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool;
 
-    /// Returns whether this is a rotating scanner, whose points the simulation records.
+    /// Returns whether this is a rotating scanner. The simulation records the points of rotating scanners.
     fn is_rotating(&self) -> bool {
         false
     }
@@ -82,11 +82,11 @@ pub(crate) struct FirstPoint {
     pub(crate) clockwise_deg: f64,
     /// Number of consecutive points.
     pub(crate) points: usize,
-    /// Time for which the packet is on the line after the last point.
+    /// Time that the packet still needs on the line after the measurement of its last point.
     pub(crate) line_time: Nanos,
 }
 
-/// Accuracy of the points of a packet, and what may be missing from a scan that is not marked.
+/// Accuracy of the points of a packet, and the limit of what may be missing from a scan without a mark.
 #[derive(Clone, Copy)]
 pub(crate) struct PointAccuracy {
     pub(crate) angle_deg: f64,
@@ -95,8 +95,9 @@ pub(crate) struct PointAccuracy {
     pub(crate) no_return_deg: f64,
     /// Number of points of a revolution that may be missing without a mark.
     pub(crate) points: usize,
-    /// Number of packets before and after damaged bytes that may be lost with them. If packets have a checksum, it is
-    /// only the packet before them, and only where the following packet is needed to decode the points.
+    /// Number of packets before and after damaged bytes that may be lost with these bytes. If packets have a checksum,
+    /// only the packet before the damaged bytes may be lost, and only if its points cannot be decoded without the
+    /// following packet.
     pub(crate) neighbors: usize,
     /// Whether packets contain a timestamp. Without one, the session needs a while to estimate the scanner's clock, and
     /// cannot determine the number of packets that are missing in a long gap.
@@ -126,8 +127,8 @@ pub(crate) trait Scanner {
     /// Returns the simulated device, to advance it or send it bytes.
     fn device_mut(&mut self) -> &mut dyn Device;
 
-    /// Replaces the scanner at `now` as `action` says. Returns the bytes that another host has just sent to the new
-    /// scanner.
+    /// Replaces the scanner at `now` as `action` specifies. Returns the bytes that another host has just sent to the
+    /// new scanner.
     fn exchange(&mut self, action: &Action, now: Nanos) -> Vec<u8>;
 
     /// Makes the supply voltage dip at `now`.
@@ -135,7 +136,7 @@ pub(crate) trait Scanner {
         self.device_mut().brown_out(now);
     }
 
-    /// Starts the misbehavior of `action`, or ends it with `None`.
+    /// Starts the misbehavior that `action` specifies. With `None`, ends it.
     fn misbehave(&mut self, action: Option<&Action>);
 
     /// Injects a fault that only some scanners can have.
@@ -179,8 +180,8 @@ pub(crate) fn draw(random: &mut fastrand::Rng) -> Vec<Rc<dyn Family>> {
     (0..count).map(|_| one(random)).collect()
 }
 
-/// Returns `first` together with a rotating scanner of another family, for which it is exchanged. Returns `first` alone
-/// if it does not rotate.
+/// Returns `first` together with a rotating scanner of another family that replaces it at an exchange. Returns `first`
+/// alone if it does not rotate.
 pub(crate) fn either(first: Rc<dyn Family>, random: &mut fastrand::Rng) -> Rc<dyn Family> {
     let second: Rc<dyn Family> = match first.families()[..] {
         [scanhub_schema::Family::Ld] => Rc::new(rplidar::Rplidar::draw(random)),
@@ -205,7 +206,7 @@ pub(crate) fn from_name(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn
     }
 }
 
-/// Returns the faulty behavior that `action` requests. Shares in an action are in percent.
+/// Returns the protocol faults that `action` specifies. Shares in an action are in percent.
 fn quirks(action: &Action) -> ProtocolQuirks {
     let share = |name| action.value(name) as f64 / 1e2;
     ProtocolQuirks {
@@ -218,7 +219,7 @@ fn quirks(action: &Action) -> ProtocolQuirks {
     }
 }
 
-/// Returns the rooms without noise, computed once for all worlds. No LMS uses them.
+/// Returns the scenes without noise, computed once for all worlds. Only rotating scanners use them.
 fn still_rooms() -> Arc<PrecomputedScans> {
     static SCANS: LazyLock<Arc<PrecomputedScans>> = LazyLock::new(|| {
         let rooms = rooms(|scene| scene.with_noise(NoiseModel::NONE));
@@ -232,8 +233,8 @@ const MIN_SPEED: f64 = 0.6;
 /// Maximum change of speed per second, as a share of the usual speed.
 const MAX_SPEED_CHANGE: f64 = 0.4;
 
-/// Returns the scenes of all worlds: a room without near objects, the same room with a post 0.8 m ahead, and with a
-/// post 0.4 m ahead.
+/// Returns the scenes of all worlds: a room without near objects, this room with a post 0.8 m ahead, and this room with
+/// a post 0.4 m ahead.
 fn rooms(layers: impl Fn(Scene) -> Scene) -> Vec<Room> {
     let rooms = [None, Some(800), Some(400)].map(|ahead_mm: Option<u32>| {
         let post =

@@ -1,6 +1,5 @@
-//! A run of the hub in a world: its links, each a state machine that returns what it waits for, and the saver of
-//! learned state. The supervision of [`daemon`] works with threads and descriptors; here, virtual time takes their
-//! place.
+//! A run of the hub in a world: its links and the saver of learned state. Each link is a state machine that returns
+//! what it waits for. The supervision in [`daemon`] uses threads and descriptors; a world uses virtual time instead.
 
 use std::rc::Rc;
 
@@ -14,7 +13,7 @@ use crate::shared::SharedState;
 use crate::sim_platform::SimPlatform;
 use crate::world::{HubEnding, World};
 
-/// Runs a hub from its start to its end. `world` then has the time at which the next one starts.
+/// Runs a hub from its start to its end. Afterward, `world` has the time at which the next hub starts.
 pub(crate) fn run_hub(world: &mut World) {
     let shared = world.shared.clone();
     let (run, now) = (world.run, world.now());
@@ -59,7 +58,7 @@ fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEn
     }
     let mut writes_at = world.now();
     world.poll_all_subscribers();
-    // A stall applied to the process of the previous hub.
+    // A stall of the previous hub's process does not affect this hub.
     world.stalled_until = 0;
     let ending = loop {
         world.deliver_wakeups();
@@ -120,7 +119,8 @@ fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEn
 struct RunningLink<'a> {
     link: LiveLink<'a, SimPlatform<'a>>,
     platform: &'a SimPlatform<'a>,
-    /// The device that the thread polls, and whether it waits for bytes or only for the loss of the port.
+    /// The device that the thread polls. The flag is true if the thread waits for bytes, and false if it waits only for
+    /// the loss of the port.
     watched: Option<(u64, bool)>,
     due_at: Nanos,
     /// Time at which the thread runs because the device is ready.
@@ -134,7 +134,7 @@ impl<'a> RunningLink<'a> {
         RunningLink { link, platform, watched: None, due_at: 0, ready_at: None, is_requested: false }
     }
 
-    /// Returns the time at which the link has something to do, or its scanner may send something.
+    /// Returns the time at which the link next has something to do, or at which its scanner may next send something.
     fn next_ns(&self) -> Nanos {
         let SimPlatform { shared, number, clock, .. } = self.platform;
         let due = match (self.is_requested, self.ready_at, self.watched) {

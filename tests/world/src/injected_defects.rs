@@ -1,5 +1,5 @@
-//! Injected defects: bugs in the models around the hub and its network, to prove that invariants find them. None is in
-//! the hub's own code, so the hub is not compiled twice.
+//! Injected defects: bugs that tests build in to prove that invariants find them. The bugs are in the models around the
+//! hub and its network. None is in the hub's own code, so the hub is not compiled twice.
 
 use std::cell::Cell;
 
@@ -11,7 +11,7 @@ use scanhub_schema::{Counter, Family, Flags, Header, Scan, ScanHead, Status, Top
 pub enum Defect {
     /// Some rings of the doorbell are lost.
     LostWake,
-    /// Subscribers to zones are woken only after all samples of a scan have been sent.
+    /// The hub wakes subscribers to zones only after it has sent all samples of a scan.
     OneRing,
     /// The last byte of some reads is lost.
     LostByte,
@@ -23,7 +23,7 @@ pub enum Defect {
     UnreleasedHandle,
     /// Some samples are sent twice.
     SentTwice,
-    /// Some samples have the sequence number of the one before.
+    /// Some samples have the sequence number of the previous sample.
     Renumbered,
     /// Some telegrams are not sent.
     UnsentTelegram,
@@ -33,7 +33,7 @@ pub enum Defect {
     EepromWrite,
     /// The hub is not notified of a hang-up of the line.
     SwallowedHangUp,
-    /// Some samples are sent only with the next one.
+    /// Some samples are sent only together with the next sample.
     Delayed,
     /// Some pairs of samples arrive in the wrong order.
     Reordered,
@@ -49,7 +49,7 @@ pub enum Defect {
     UncountedLoss,
     /// A byte of some remote samples is changed.
     RemoteAltered,
-    /// A listener takes some parts for complete samples.
+    /// A listener treats some parts as complete samples.
     RemoteHalf,
     /// A listener accepts some datagrams twice.
     RemoteCountedTwice,
@@ -91,7 +91,7 @@ pub enum Defect {
     NeedlessByte,
     /// The hub is not notified of a new subscriber.
     UnnoticedSubscriber,
-    /// Some rings of the doorbell follow although no subscriber has a new sample.
+    /// The hub rings the doorbell sometimes although no subscriber has a new sample.
     NeedlessRing,
     /// Some events are not sent.
     UnsentEvent,
@@ -163,7 +163,8 @@ impl InjectedDefect {
         self.defect == Some(defect)
     }
 
-    /// Counts an opportunity, and returns whether `defect` shows: once in every `of` opportunities.
+    /// Counts an opportunity, and returns whether `defect` takes effect. The defect takes effect once in every `of`
+    /// opportunities.
     pub(crate) fn triggers(&self, defect: Defect, of: u64) -> bool {
         if !self.is_active(defect) {
             return false;
@@ -176,12 +177,12 @@ impl InjectedDefect {
 /// Applies those [`Defect`]s that change published samples.
 #[derive(Debug, Default)]
 pub(crate) struct SampleCorrupter {
-    /// The last scan, before it was changed.
+    /// The last scan as it was before a change.
     last_scan: Option<Box<Scan>>,
 }
 
 impl SampleCorrupter {
-    /// Changes a sample of `topic` that is sent at `now`, if the injected defect requires it.
+    /// Changes a sample of `topic` that is sent at `now`, if the injected defect requires a change.
     pub(crate) fn corrupt(
         &mut self,
         defect: &InjectedDefect,
@@ -261,10 +262,10 @@ impl SampleCorrupter {
     }
 }
 
-/// Age from which a sample counts as backlogged.
+/// Minimum age at which a sample counts as backlogged, in ns.
 const BACKLOG_AGE_NS: u64 = 100_000_000;
 
-/// Returns a request that writes the EEPROM: 66h, which sets the baud rate after power-on.
+/// Returns a request that writes the EEPROM. The request is 66h, which sets the baud rate after power-on.
 pub(crate) fn eeprom_request() -> Vec<u8> {
     Writer::new(0, 0x66).byte(0x42).finish().bytes().to_vec()
 }

@@ -15,7 +15,7 @@ pub(super) const KILL_HUB: ActionKind = ActionKind {
     act: |world, action| end_hub(world, action, true),
 };
 
-/// Ends the hub in order. Another one starts after `away_ms`.
+/// Ends the hub in an orderly way. Another one starts after `away_ms`.
 pub(super) const END_HUB: ActionKind = ActionKind {
     name: "end_hub",
     per_minute: 1.5,

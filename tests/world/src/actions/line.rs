@@ -102,7 +102,7 @@ pub(super) fn telegram_faults(action: &Action) -> Faults {
     }
 }
 
-/// Drops all bytes for `span_ms`, or delays them.
+/// Drops all bytes for `span_ms`, or delays all bytes in this time.
 pub(super) const SILENCE: ActionKind = ActionKind {
     name: "silence",
     per_minute: 4.0,
@@ -142,7 +142,7 @@ fn unplug(world: &mut World, action: &Action) {
     });
 }
 
-/// Unplugs the adapter, plugs it in under another name, and after `span_ms` under its own.
+/// Unplugs the adapter, and plugs it in again under another name. After `span_ms`, the adapter gets its own name back.
 pub(super) const REPLUG_ELSEWHERE: ActionKind = ActionKind {
     name: "replug_elsewhere",
     per_minute: 1.5,
@@ -186,7 +186,7 @@ fn deny_port(world: &mut World, action: &Action) {
     });
 }
 
-/// Sets the port to another rate, like another process that opened the port before the hub.
+/// Sets the port to another rate, as a process that opened the port before the hub could do.
 pub(super) const RATE_ALTERED: ActionKind = ActionKind {
     name: "altered",
     per_minute: 2.0,

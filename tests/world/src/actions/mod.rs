@@ -1,5 +1,5 @@
-//! Actions of a scenario: faults and other events, each with its name, its keys and its effect. All kinds of actions
-//! are drawn, printed and parsed in the same way. An action undoes its effect after a while, or when all faults are
+//! Actions of a scenario: faults and other events. Each action has a name, keys and an effect. All kinds of actions are
+//! drawn, printed and parsed in the same way. An action undoes its effect after some time, or when all faults are
 //! cleared.
 
 mod hub;
@@ -89,12 +89,13 @@ pub(crate) fn have_key(actions: &[Action]) -> bool {
     actions.iter().any(|action| action.name() == network::KEY_ERRORS.name)
 }
 
-/// Returns whether these actions need bridges with a router between them in place of gateway and listener.
+/// Returns whether these actions need two bridges and a router instead of a gateway and a listener.
 pub(crate) fn are_bridges(actions: &[Action]) -> bool {
     !have_key(actions) && actions.iter().any(|action| action.name() == network::ROUTER_KILLED.name)
 }
 
-/// Returns the topics that have no permanent subscriber in a world with these actions. No invariant needs one on them.
+/// Returns the topics that have no permanent subscriber in a world with these actions. No invariant needs a permanent
+/// subscriber on these topics.
 pub(crate) fn topics_without_constant_subscriber(actions: &[Action], seed: u64) -> Vec<Topic> {
     if actions.iter().all(|action| action.name() != subscribers::ATTACH_BETWEEN_SAMPLES.name) {
         return Vec::new();

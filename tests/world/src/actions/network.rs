@@ -101,9 +101,9 @@ fn kill_listener(world: &mut World, action: &Action) {
     world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_listener(&world.shared));
 }
 
-/// Kills the router between two bridges, with everything that it holds. Another one starts after `away_ms`. A scenario
-/// with this action has bridges in place of gateway and listener, unless they have a key. In that case there is no
-/// router, and the network is cut instead.
+/// Kills the router between two bridges. The router loses everything that it holds. Another router starts after
+/// `away_ms`. A scenario with this action has bridges instead of a gateway and a listener, unless another action needs
+/// a key. In that case there is no router, and the action cuts the network instead.
 pub(super) const ROUTER_KILLED: ActionKind = ActionKind {
     name: "router_killed",
     per_minute: 4.0,
@@ -117,11 +117,11 @@ fn kill_router(world: &mut World, action: &Action) {
     world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_router(&world.shared));
 }
 
-/// Sends datagrams from a machine that does not have the key, or sets the clocks of both machines apart for `span_ms`.
-/// A scenario with this action has a gateway and a listener with a key.
+/// Sends datagrams from a machine that does not have the key, or makes the clocks of both machines differ for
+/// `span_ms`. A scenario with this action has a gateway and a listener with a key.
 ///
 /// Values of `what`: 0 no MAC, 1 another key, 2 the MAC of another datagram, 3 recorded datagrams that are sent again,
-/// 4 clocks that are apart.
+/// 4 clocks that differ.
 pub(super) const KEY_ERRORS: ActionKind = ActionKind {
     name: "key_errors",
     per_minute: 6.0,

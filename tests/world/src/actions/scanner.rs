@@ -72,8 +72,8 @@ fn misbehave(world: &mut World, action: &Action) {
     });
 }
 
-/// Makes the head of a scanner rotate slower or faster for `span_ms`. The speed changes gradually, as that of a motor
-/// does, and is given in percent of the usual one. Scanners without full revolutions ignore the action.
+/// Makes the head of a scanner rotate slower or faster for `span_ms`. The speed is given in percent of the usual speed.
+/// It changes gradually, like the speed of a motor. Scanners without full revolutions ignore the action.
 pub(super) const HEAD_SPEED: ActionKind = ActionKind {
     name: "pace",
     per_minute: 3.0,
@@ -107,8 +107,8 @@ fn hold_head(world: &mut World, action: &Action) {
     world.inject_scanner_fault(action, ScannerFault::HeadHeld { span });
 }
 
-/// Makes a scanner report a warning (1) or an error (2) as its health status for `span_ms`. A `stubborn` one still
-/// reports it after it has booted. Scanners without a health status ignore the action.
+/// Makes a scanner report a warning (1) or an error (2) as its health status for `span_ms`. A `stubborn` scanner still
+/// reports the status after it has restarted. Scanners without a health status ignore the action.
 pub(super) const UNHEALTHY: ActionKind = ActionKind {
     name: "unwell",
     per_minute: 1.0,
@@ -141,8 +141,8 @@ fn ignore_requests(world: &mut World, action: &Action) {
     world.inject_scanner_fault_later(action, ScannerFault::IgnoresRequests(false));
 }
 
-/// Puts an object into a zone for `span_ms`: a post ahead of a sensor, inside the larger zone or inside both. The scans
-/// are computed before the world starts, so the action has no effect of its own at its time.
+/// Puts a post ahead of a sensor for `span_ms`, inside the larger zone or inside both zones. The world computes its
+/// scans before it starts, so the action does nothing when it is run.
 pub(crate) const OBJECT_INSIDE: ActionKind = ActionKind {
     name: "object",
     per_minute: 12.0,
@@ -150,8 +150,8 @@ pub(crate) const OBJECT_INSIDE: ActionKind = ActionKind {
     act: |_, _| (),
 };
 
-/// Returns the time spans in which an object is inside a zone of `sensor`, and whether it is in both zones. The world
-/// has `sensors` sensors.
+/// Returns the time spans in which an object is inside a zone of `sensor`, and for each span whether the object is in
+/// both zones. The world has `sensors` sensors.
 fn object_spans(scenario: &Scenario, sensor: usize, sensors: usize) -> Vec<(Nanos, Nanos, bool)> {
     let is_its = |action: &&Action| {
         action.name() == OBJECT_INSIDE.name && action.value("sensor") as usize % sensors == sensor
@@ -175,7 +175,8 @@ pub(crate) fn objects_inside(scenario: &Scenario, sensor: usize, sensors: usize)
     joined
 }
 
-/// Returns the changes of the scene of `sensor`: room 1 has the post inside the larger zone, room 2 inside both zones.
+/// Returns the changes of the scene of `sensor`. The post is inside the larger zone in room 1, and inside both zones in
+/// room 2.
 pub(crate) fn scene_changes(scenario: &Scenario, sensor: usize, sensors: usize) -> Changes {
     let spans = object_spans(scenario, sensor, sensors);
     let mut times: Vec<Nanos> = spans.iter().flat_map(|&(from, until, _)| [from, until]).collect();

@@ -42,8 +42,8 @@ pub(super) const ATTACH_AND_KILL: ActionKind = ActionKind {
     act: |world, action| attach_subscriber(world, action, true),
 };
 
-/// Attaches a subscriber between two samples of a scan. It leaves between two others. In a world with such actions,
-/// some topics have no other subscribers.
+/// Attaches a subscriber between two samples of a scan. The subscriber leaves between two samples of a later scan. In a
+/// world with such actions, some topics have no other subscribers.
 pub(super) const ATTACH_BETWEEN_SAMPLES: ActionKind = ActionKind {
     name: "consumer_amid",
     per_minute: 20.0,
@@ -80,7 +80,7 @@ pub(super) const STALL_SUBSCRIBER: ActionKind = ActionKind {
     act: stall_subscriber,
 };
 
-/// Attaches a subscriber. It is prompt if `every_ms` is 0 or 1.
+/// Attaches a subscriber. The subscriber is prompt if `every_ms` is 0 or 1.
 fn attach_subscriber(world: &mut World, action: &Action, is_killed: bool) {
     let topic = Topic::OF_LINKS[action.value("topic") as usize % Topic::OF_LINKS.len()];
     let behavior = match action.value("every_ms") {

@@ -11,7 +11,7 @@ use scanhub_sim::room::Changes;
 use super::{Family, FirstPoint, PointAccuracy, Scanner, ScannerFault, is_ld_packet};
 use crate::scenario::Action;
 
-/// The two scanners. The link has the keys of the first one.
+/// The two scanners. The link has the keys of `first`.
 pub(super) struct TwoFamilies {
     /// The scanner that is connected at the start.
     pub(super) first: Rc<dyn Family>,
@@ -90,7 +90,7 @@ impl Family for TwoFamilies {
     }
 }
 
-/// The scanner that is connected, and the one that replaces it at the next exchange.
+/// The connected scanner, and the scanner that replaces it at the next exchange.
 struct ConnectedScanners {
     connected: Box<dyn Scanner>,
     other: Box<dyn Scanner>,

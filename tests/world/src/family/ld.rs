@@ -65,8 +65,8 @@ impl Family for Ld {
         vec![self.settings.model.baud()]
     }
 
-    /// An object that appears just after the head has passed it is measured one revolution later, and published when
-    /// that revolution is complete.
+    /// If an object appears just after the head has passed it, the scanner measures the object one revolution later.
+    /// The hub publishes that revolution when it is complete.
     fn scan_times(&self) -> (Nanos, Nanos) {
         let LdSettings { revolutions_per_second: turns_per_second, speed_variation: wander, .. } =
             self.settings;
@@ -145,9 +145,9 @@ impl Scanner for LdScanner {
         &mut self.head
     }
 
-    /// Does nothing. After a restart, the scanner's clock starts at zero. If that equals the time that a running clock
-    /// would show, no session can distinguish the restart from a stall, and stamps are off until the next revolutions.
-    /// The session's own tests cover restarts.
+    /// Does nothing. After a restart, the scanner's clock starts at zero. A running clock can show zero at the same
+    /// time by chance. Then no session can distinguish the restart from a stall, and stamps are wrong until the next
+    /// revolutions. The session's own tests cover restarts.
     fn brown_out(&mut self, _: Nanos) {}
 
     /// Replaces the scanner with a new one, whose power is turned on at `now`.

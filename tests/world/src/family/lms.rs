@@ -1,4 +1,4 @@
-//! SICK LMS 2xx scanners, which are found at any rate and in any state, with links that configure any variant. Their
+//! SICK LMS 2xx scanners. At the start, a scanner has any rate and any state, and its link configures any variant. The
 //! scans are computed once for all worlds.
 
 use std::rc::Rc;
@@ -69,7 +69,7 @@ impl Family for Lms {
         ]
     }
 
-    /// A link without keys has an LMS that streams in the usual variant at 500,000 baud.
+    /// An LMS at a link without keys streams in the usual variant at 500,000 baud.
     fn auto(&self) -> Rc<dyn Family> {
         Rc::new(Lms { is_auto: true, variant: Variant::HALF, baud: Baud::B500000, ..self.clone() })
     }
@@ -82,7 +82,7 @@ impl Family for Lms {
         Baud::ALL.map(Baud::rate).to_vec()
     }
 
-    /// Calculated for the rate that the link configures.
+    /// Returns the times at the rate that the link configures.
     fn scan_times(&self) -> (Nanos, Nanos) {
         let len = 2 * self.variant.beams() + 10;
         let rate = self.baud.rate();
@@ -128,7 +128,7 @@ impl Family for Lms {
             };
             let last = sent.iter().zip(got).rposition(|(sent, got)| sent != got).unwrap_or(first);
             let (sent, got) = (&sent[first..=last], &got[first..=last]);
-            // An inserted byte and a lost byte shift all bytes between them.
+            // If one byte is inserted and another one is lost, all bytes between them are shifted.
             let shifted = [others(&sent[1..], got), others(sent, &got[1..])];
             others(sent, got).min(shifted[0]).min(shifted[1]) <= MAX_CHANGED_BYTES
         })
@@ -196,6 +196,6 @@ fn measured(variant: Variant) -> Arc<PrecomputedScans> {
 
 /// Number of different scans of each room, so that processors do not receive the same scan all the time.
 const SCANS_PER_ROOM: usize = 12;
-/// Maximum number of changed bytes in a telegram that still looks intact. A line that changes more damages the
-/// neighboring telegrams, too, and then the telegram is suspect.
+/// Maximum number of changed bytes in a telegram that still looks intact. If the line changes more bytes, it also
+/// damages the neighboring telegrams, and the hub marks the telegram as suspect.
 const MAX_CHANGED_BYTES: usize = 32;

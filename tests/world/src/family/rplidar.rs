@@ -78,7 +78,8 @@ impl Rplidar {
         words.next().is_none().then_some(named)
     }
 
-    /// Returns the packet format of these bytes, by their first bytes. A wrong checksum does not change the format.
+    /// Returns the packet format, derived from the first bytes of `sample`. A wrong checksum does not change the
+    /// format.
     fn kind(&self, sample: &[u8]) -> Option<PacketFormat> {
         let is_of = |kind: &PacketFormat| {
             let begins = |packet: &[u8]| packet[0] >> 4 == 0xA && packet[1] >> 4 == 0x5;
@@ -114,8 +115,8 @@ impl Family for Rplidar {
         models_alike(self.settings.model).iter().map(|model| model.baud()).collect()
     }
 
-    /// Like those of other rotating scanners. The session detects the end of a revolution only when the head is well
-    /// past it.
+    /// Returns times like those for other rotating scanners. The session detects the end of a revolution only when the
+    /// head is well past it.
     fn scan_times(&self) -> (Nanos, Nanos) {
         let slowest = models_alike(self.settings.model).iter().map(|model| model.revolutions_per_second());
         let slowest =
@@ -182,7 +183,7 @@ impl Family for Rplidar {
     fn point_accuracy(&self, unit: &[u8]) -> PointAccuracy {
         let plain = PointAccuracy { no_return_deg: 9.0, has_clock: false, ..PointAccuracy::default() };
         match self.kind(unit) {
-            // Angles are in steps of an eighth of a degree, up to 63.
+            // Angle offsets are in steps of an eighth of a degree, at most 63 steps.
             Some(PacketFormat::Express) => PointAccuracy { angle_deg: 0.25, points: 12, ..plain },
             // Angles are derived from ranges, whose steps grow with the range.
             Some(PacketFormat::Ultra) => PointAccuracy { angle_deg: 0.4, range_mm: 6.0, points: 16, ..plain },
@@ -313,8 +314,8 @@ impl Scanner for RplidarScanner {
     }
 }
 
-/// Returns the models that measure in the same way. Each of them may send what another one sends, and none has packets
-/// that look like those of the other group.
+/// Returns the models that measure in the same way as `model`. Each of them may send what another one of them sends. No
+/// model outside this group has packets that look like theirs.
 fn models_alike(model: Model) -> &'static [Model] {
     if is_triangulating(model) {
         &[Model::A1, Model::A2m8, Model::A2m12, Model::A3]
@@ -327,7 +328,7 @@ fn is_triangulating(model: Model) -> bool {
     matches!(model, Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)
 }
 
-/// Returns whether the mode has few enough packets per second to check in many worlds.
+/// Returns whether the mode has so few packets per second that many worlds can check it.
 fn is_moderate(mode: &scanhub_sim::rplidar::Mode) -> bool {
     mode.form != scanhub_sim::rplidar::PacketFormat::Standard || mode.sample_us > 150.0
 }
@@ -357,7 +358,7 @@ fn line_time(unit: &[u8], model: Model) -> Nanos {
     scanhub_schema::line_time(unit.len(), model.baud())
 }
 
-/// Models to draw from. Fast ones are rare, because their points take long to compute.
+/// Models from which a seed draws. Fast models are rare, because their points take long to compute.
 const DRAWN_MODELS: [Model; 13] = [
     Model::A1,
     Model::A1,
@@ -373,6 +374,6 @@ const DRAWN_MODELS: [Model; 13] = [
     Model::S2,
     Model::S3,
 ];
-/// Maximum time from the end of a revolution until its scan: the head must be ten degrees and two packets past the end,
-/// and the last packet is still on the line.
+/// Maximum time from the end of a revolution until its scan is published. The head must be ten degrees and two packets
+/// past the end, and the hub must receive the last packet.
 const EDGE_DELAY: Nanos = 90 * MILLIS;

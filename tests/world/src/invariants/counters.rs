@@ -11,9 +11,9 @@ use crate::remote::{FIRST_NUMBER, LinkSettings};
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// Invariant: the counters of each subscriber are right. Its taken samples and its missed samples, which it detects by
-/// their sequence numbers, are together the published ones. No sample arrives twice or out of order, and each sample
-/// that was sent to a subscriber was taken or dropped from its queue.
+/// Invariant: the counters of each subscriber are right. A subscriber detects missed samples by their sequence numbers.
+/// The samples that it took and the samples that it missed are together the published ones. No sample arrives twice or
+/// out of order. Each sample that was sent to a subscriber was taken, or was dropped from the subscriber's queue.
 #[derive(Default)]
 pub(crate) struct SubscriberCounters {
     subscribers: BTreeMap<SubscriberId, SubscriberState>,
@@ -29,7 +29,7 @@ struct SubscriberState {
 
 struct RunCounters {
     boot: u64,
-    /// Sequence number from which samples count, and index of the first sample.
+    /// Sequence number of the first sample that counts, and index of this sample.
     first: u64,
     first_index: u64,
     taken: u64,
@@ -92,7 +92,7 @@ impl SubscriberState {
         let number = header.topic_seq;
         let is_new = self.run.as_ref().is_none_or(|run| run.boot != header.boot);
         if is_new {
-            // A subscriber that was attached before the hub started gets all of its samples.
+            // A subscriber that was attached before the hub started gets all samples of this hub.
             let (first, first_index) = if self.run.is_some() { (0, 0) } else { (number, *index) };
             let dropped = index - first_index;
             let boot = header.boot;
@@ -111,7 +111,7 @@ impl SubscriberState {
     }
 
     fn drop(&mut self, sample: &Sample) {
-        // Samples that were dropped before the first one was taken are counted by the index of that one.
+        // If samples were dropped before the first taken sample, the index of the first taken sample shows how many.
         if let Some(run) = self.run.as_mut().filter(|run| run.boot == sample.header.boot) {
             run.dropped += 1;
         }
@@ -141,9 +141,9 @@ impl Invariant for Resources {
 type StreamKey = (u32, u8, u8);
 
 /// Invariant: the counters of each listener are right (`docs/datagram.md`). In each row, `received` counts datagrams
-/// that arrived, `duplicate` those that arrived again, and `lost` the sequence numbers between the first and the last
-/// known one that did not arrive. If the faults are cleared at the end and the last announcement arrived, the listener
-/// knows every number that the gateway sent. The counters belong to the running listener.
+/// that arrived, and `duplicate` counts those that arrived again. `lost` counts the sequence numbers between the first
+/// and the last known one that did not arrive. If the faults are cleared at the end and the last announcement arrived,
+/// the listener knows every sequence number that the gateway sent. The counters belong to the running listener.
 #[derive(Default)]
 pub(crate) struct ListenerCounters {
     /// Next sequence number of each stream.
@@ -163,7 +163,7 @@ struct ExpectedRow {
     taken: BTreeSet<u32>,
     duplicates: u64,
     late: u64,
-    /// First known sequence number, and the one after the last known one.
+    /// First known sequence number, and last known sequence number plus 1.
     first: u32,
     after_last: u32,
 }
@@ -299,8 +299,8 @@ fn announce(datagram: &Datagram<'_>) -> Option<Announce> {
 }
 
 /// Invariant: the counters of a bridge are right (`docs/bridge.md`). Each sample that the bridge took is sent once,
-/// counted as replaced, or still queued. Announcements report the replaced samples, and all of them if the faults are
-/// cleared at the end.
+/// counted as replaced, or still queued. Announcements report replaced samples. If the faults are cleared at the end,
+/// the announcements report all of them.
 pub(crate) struct BridgeCounters {
     are_bridges: bool,
     /// Whether every sample of scans, telegrams and foregrounds is sent.
@@ -312,12 +312,12 @@ pub(crate) struct BridgeCounters {
 
 #[derive(Default)]
 struct TopicCounters {
-    /// Samples that the bridge took from the hub, samples that it sent, and sent samples that the router did not
-    /// accept.
+    /// Three numbers of samples: those that the bridge took from the hub, those that it sent, and those that it sent
+    /// but the router did not accept.
     taken: u64,
     sent: u64,
     failed: u64,
-    /// Replaced samples in the last announcement, and in the bridge's counters.
+    /// Number of replaced samples that the last announcement reports, and number in the bridge's counters.
     reported_replaced: u64,
     replaced: u64,
 }
@@ -381,7 +381,7 @@ impl Invariant for BridgeCounters {
             }
             Event::FaultsCleared => self.is_over = true,
             Event::GatewayCounters { sensor, topic, row } => {
-                // Announcements, backgrounds and silences are sent without a sample of the hub, too.
+                // Announcements, backgrounds and silences are also sent without a sample from the hub.
                 let is_counted = matches!(topic, Some(Topic::Scan | Topic::Telegram | Topic::Foreground));
                 let all_go_out = self.sends_all && is_counted;
                 let of = self.topic_counters(sensor, topic);
@@ -395,7 +395,7 @@ impl Invariant for BridgeCounters {
                 }
                 of.replaced = row.replaced;
             }
-            // The last announcement has arrived. Announcements do not count themselves.
+            // The last announcement has arrived. An announcement does not count itself.
             Event::ListenerEnded { .. } if self.is_over => {
                 let topics = self
                     .topics

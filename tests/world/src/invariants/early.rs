@@ -1,7 +1,7 @@
 //! Invariant on early warnings, which are verdicts from partial scans. An early warning is slow or stop, never clear.
-//! It is confirmed by zones that are at least as bad, or withdrawn before the next zones whose `seq` is not smaller.
-//! While nothing is wrong, no warning is withdrawn, and no zones are stop without a warning that was sent when at most
-//! three quarters of the scan had arrived.
+//! It is confirmed by zones that are at least as bad, or withdrawn before the next zones with the same or a greater
+//! `seq`. While nothing is wrong, two more rules hold. No warning is withdrawn. Zones are stop only after a warning,
+//! and that warning was sent when at most three quarters of the scan had arrived.
 
 use std::collections::BTreeMap;
 
@@ -23,7 +23,7 @@ pub(crate) struct EarlyWarnings {
 struct Warning {
     seq: u64,
     verdict: Verdict,
-    /// Whether the scan has exactly the `seq` of the warning. Otherwise its `seq` may be greater.
+    /// Whether the scan must have exactly the `seq` of the warning. Otherwise the scan's `seq` may be greater.
     is_of_telegram: bool,
     /// Number of beams that had arrived.
     beams_seen: u16,
@@ -31,15 +31,15 @@ struct Warning {
 
 #[derive(Default)]
 struct SensorWarnings {
-    /// The warning that is neither confirmed nor withdrawn.
+    /// The warning that is not yet confirmed or withdrawn.
     current: Option<Warning>,
     /// The `seq` of the last zones.
     zones: Option<u64>,
-    /// Whether there was no memory for a sample, so that the current warning is not known.
+    /// Whether the current warning is unknown because there was no memory for a sample.
     is_unknown: bool,
     /// Whether a warning was withdrawn although nothing was wrong.
     is_needless: bool,
-    /// Number of scans since the hub found the scanner, and number of beams of the last one.
+    /// Number of scans since the hub found the scanner, and number of beams in the last scan.
     scans: usize,
     beams: usize,
 }
@@ -58,7 +58,7 @@ impl Invariant for EarlyWarnings {
                 let wrong = match sample.topic {
                     Topic::Scan => {
                         let before = std::mem::replace(&mut of.beams, Scan::of_bytes(&sample.bytes).beams());
-                        // With another number of beams, the session starts to learn revolutions again.
+                        // With another number of beams, the session estimates the scan period again.
                         of.scans = if before == of.beams { of.scans + 1 } else { 0 };
                         None
                     }
@@ -87,7 +87,7 @@ impl Invariant for EarlyWarnings {
 }
 
 impl SensorWarnings {
-    /// Returns the error of a warning, or of its withdrawal.
+    /// Returns a description of the error in a warning, or in its withdrawal.
     fn check_warning(
         &mut self,
         seq: u64,
@@ -119,11 +119,12 @@ impl SensorWarnings {
             .map(|before| format!("{warning:?} follows {before:?}, and is not worse"))
     }
 
-    /// Returns the error of the current or missing warning for these `zones`. Nothing is wrong if `is_faultless`.
+    /// Returns a description of the error in the current warning for these `zones`, or of its absence. If
+    /// `is_faultless`, nothing is wrong in the world.
     fn check_zones(&mut self, seq: u64, zones: &Zones, is_faultless: bool) -> Option<String> {
         self.zones = Some(seq);
-        // A hub that ends withdraws its warning, and sends no zones after that. A scan is published before its zones.
-        // If the number of beams changes, the announced scan is never completed.
+        // A hub that ends withdraws its warning, and sends no zones after that. The hub publishes a scan before the
+        // zones of the scan. If the number of beams changes, the scan that the warning belongs to is never completed.
         if std::mem::take(&mut self.is_needless) && self.scans > 0 {
             return Some("a warning was withdrawn although nothing went wrong".to_owned());
         }
@@ -143,7 +144,7 @@ impl SensorWarnings {
     }
 }
 
-/// Time after the last fault from which on no effect of a fault is expected.
+/// Time after the last fault until no fault has an effect any more.
 const RECOVERY_TIME: Nanos = 3_000 * MILLIS;
-/// Number of scans in a stream after which the session has estimated the scan period.
+/// Number of consecutive scans after which the session has estimated the scan period.
 const LEARNING_SCANS: usize = 20;

@@ -12,8 +12,8 @@ use crate::family::Family;
 use crate::remote::LinkSettings;
 use crate::topics::Sample;
 
-/// Invariant: headers are consistent. Sequence numbers increase, stamps are neither in the future nor decrease, and
-/// every sample that is derived from a telegram has its `seq`, stamps and quality.
+/// Invariant: headers are consistent. Sequence numbers increase. Stamps are never in the future and never decrease. A
+/// sample that is derived from a telegram has the `seq`, the stamps and the quality of that telegram.
 pub(crate) struct HeaderConsistency {
     /// For each sensor, the topic from which all samples with a hub time are derived.
     sources: Vec<Topic>,
@@ -22,7 +22,7 @@ pub(crate) struct HeaderConsistency {
 
 impl HeaderConsistency {
     pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> HeaderConsistency {
-        // A revolution consists of several packets, so results have the header of its scan.
+        // A revolution consists of several packets, so results have the header of the revolution's scan.
         let source =
             |family: &Rc<dyn Family>| if family.is_rotating() { Topic::Scan } else { Topic::Telegram };
         HeaderConsistency { sources: sensors.iter().map(source).collect(), last: BTreeMap::new() }
@@ -76,9 +76,9 @@ impl Invariant for HeaderConsistency {
 }
 
 /// Invariant: a listener publishes the sequence numbers, stamps and periods that `docs/topics.md` describes. The
-/// sequence number is the datagram's and continues over runs of the gateway. Both stamps are the time of arrival. The
-/// period is the median of the last five intervals between two samples as sent. Once a topic exists, every sample that
-/// arrived in time is published.
+/// sequence number comes from the datagram and continues over runs of the gateway. Both stamps are the time of arrival.
+/// The period is the median of the last five intervals between two samples as sent. Once a topic exists, the listener
+/// publishes every sample that arrived in time.
 pub(crate) struct RemoteHeaders {
     terms: LinkSettings,
     topics: BTreeMap<(usize, Topic), TopicHeaders>,
@@ -86,9 +86,9 @@ pub(crate) struct RemoteHeaders {
 
 #[derive(Default)]
 struct TopicHeaders {
-    /// Datagrams that arrived in time and are not published yet: time of arrival and header.
+    /// Datagrams that arrived in time and are not published yet. Each has its time of arrival and its header.
     unpublished: VecDeque<(Nanos, Head)>,
-    /// The last of them that was published.
+    /// The last published datagram that arrived in time.
     last: Option<(Nanos, Head)>,
     /// Last sequence number of the republished topic.
     number: Option<u64>,
@@ -176,8 +176,8 @@ impl TopicHeaders {
         let mut known: Vec<_> = self.intervals_ns.iter().copied().collect();
         known.sort_unstable();
         let period_us = known.get(known.len().saturating_sub(1) / 2).map_or(0, |period_ns| period_ns / 1000);
-        // The first sequence number of a run of the listener is the datagram's. Missing datagrams of another gateway
-        // count, too.
+        // The first sequence number of a run of the listener comes from the datagram. Datagrams of another gateway that
+        // are missing also count.
         let due = match (before, steps) {
             (Some(before), Some(steps)) => before + u64::from(steps),
             (Some(before), None) => before + 1 + u64::from(head.sequence),
@@ -195,6 +195,7 @@ impl TopicHeaders {
     }
 }
 
-/// Number of intervals between samples that define the period, and the longest interval that counts.
+/// Number of intervals between samples from which the period is calculated, and maximum length of an interval that
+/// counts.
 const PERIOD_INTERVALS: usize = 5;
 const MAX_INTERVAL: Nanos = 2_500 * MILLIS;

@@ -1,5 +1,4 @@
-//! Invariants against invented data: each sample was sent by a scanner, and each remote sample was published by the
-//! hub.
+//! Invariants against invented data. A scanner has sent each sample, and the hub has published each remote sample.
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
@@ -15,22 +14,22 @@ use crate::family::Family;
 use crate::hash::HistoryHash;
 use crate::remote::{Forgery, LinkSettings, PayloadBuffer};
 
-/// Invariant: the hub delivers nothing that no scanner sent, unless it marks it as suspect. Each telegram is compared
-/// byte by byte and is published at most as often as it was sent. Each scan is compared value by value.
+/// Invariant: the hub delivers only what a scanner sent, except for data that the hub marks as suspect. Each telegram
+/// is compared byte by byte. It is published at most as often as it was sent. Each scan is compared value by value.
 pub(crate) struct NothingInvented {
     sensors: Vec<SensorTelegrams>,
 }
 
 struct SensorTelegrams {
     family: Rc<dyn Family>,
-    /// Number of times that a telegram was sent and not published, by its hash.
+    /// For the hash of each telegram: how often the telegram was sent and not yet published.
     unpublished: HashMap<u64, u32>,
-    /// Published units that were not sent. The next telegram decides whether foreign bytes arrived before it, because
-    /// more bytes were read than the known telegrams have.
+    /// Published units that no scanner sent. The next telegram decides whether foreign bytes arrived before it: in that
+    /// case, more bytes were read than the known telegrams contain.
     foreign: Vec<Vec<u8>>,
     /// Position after the last byte that was read.
     read_end: u64,
-    /// Last telegrams that the line damaged. An empty one stands for foreign bytes between two telegrams.
+    /// Last telegrams that the line damaged. An empty entry represents foreign bytes between two telegrams.
     damaged: VecDeque<Vec<u8>>,
     /// Position after the last telegram.
     sent_end: u64,
@@ -108,7 +107,7 @@ impl Invariant for NothingInvented {
 }
 
 impl SensorTelegrams {
-    /// Reports foreign units that are not a mixture of damaged telegrams.
+    /// Reports the foreign units, except those that are a mixture of damaged telegrams.
     fn check_foreign(&mut self, sensor: usize, reporter: &mut ViolationReporter<'_>) {
         for unit in std::mem::take(&mut self.foreign) {
             if !self.family.is_collision(&unit, &mut self.damaged.iter().map(Vec::as_slice)) {
@@ -123,7 +122,7 @@ impl SensorTelegrams {
         self.damaged.push_front(telegram.to_vec());
     }
 
-    /// Removes a telegram that was sent and not published. Returns whether there was one.
+    /// Removes a telegram that was sent and not yet published. Returns whether the telegram existed.
     fn take(&mut self, key: u64) -> bool {
         let Entry::Occupied(mut entry) = self.unpublished.entry(key) else { return false };
         *entry.get_mut() -= 1;
@@ -137,14 +136,14 @@ impl SensorTelegrams {
 /// Number of damaged telegrams that are kept.
 const MAX_DAMAGED: usize = 4;
 
-/// Invariant: the network delivers nothing that the hub did not publish. The listener accepts no datagram that was not
-/// sent with the same bits. It accepts every datagram that was, except after the end of its gateway's run, or with a
-/// key if the datagram is not known to be new. A listener publishes samples of the hub with sequence number, time and
-/// quality, and never a part of one.
+/// Invariant: the network delivers nothing that the hub did not publish. The listener accepts only datagrams that were
+/// sent with the same bits. It accepts every datagram that was sent, with two exceptions: the run of the gateway has
+/// ended, or the listener has a key and cannot decide whether the datagram is new. A listener publishes samples of the
+/// hub with sequence number, time and quality, and never only a part of a sample.
 ///
-/// Two samples have no source (`docs/topics.md`): unknown zones, because no sample arrived, and a silent sensor after 3
-/// s of silence. A late listener may report a silence of the past, so its stamp counts: no sample arrived in the 3 s
-/// before it.
+/// Two samples have no source (`docs/topics.md`). The first one is unknown zones, which the listener publishes because
+/// no sample arrived. The second one is a silent sensor after 3 s of silence. A late listener may report a past
+/// silence, so the stamp counts: no sample arrived in the 3 s before the stamp.
 pub(crate) struct RemoteNothingInvented {
     published: HashSet<u64>,
     /// Boot IDs of the hub's runs.
@@ -153,19 +152,20 @@ pub(crate) struct RemoteNothingInvented {
     sent: BTreeMap<(u32, u8, u8, u32, u8), u64>,
     /// Highest epoch that the listener accepted.
     epoch: u32,
-    /// Epoch and sensor of the announcements that the listener accepted. The sensor of a sample is unknown before.
+    /// Epoch and sensor of each announcement that the listener accepted. Before the announcement, the sensor of a
+    /// sample is unknown.
     announced: HashSet<(u32, u8)>,
-    /// Times at which samples of each sensor arrived that the listener accepted, could assign to a sensor, and did not
-    /// mark as late.
+    /// Sensor and time of arrival of each sample that the listener accepted, assigned to a sensor and did not mark as
+    /// late.
     arrived_at: BTreeSet<(usize, Nanos)>,
-    /// With a key, for each epoch, sensor and topic: the first sequence number that was announced to the listener, and
-    /// the highest that it accepted.
+    /// With a key, two sequence numbers for each epoch, sensor and topic: the first one that was announced to the
+    /// listener, and the highest one that the listener accepted.
     numbers: BTreeMap<(u32, u8, u8), (u32, u32)>,
     has_key: bool,
     /// `CLOCK_MONOTONIC` of the listener's machine when the world began.
     clock_offset: Nanos,
     packet: PayloadBuffer,
-    /// Payload of the unknown zones, which a listener may publish without a source.
+    /// Payload of unknown zones. A listener may publish unknown zones without a source.
     unknown: Vec<u8>,
 }
 
@@ -191,8 +191,9 @@ impl RemoteNothingInvented {
 }
 
 impl RemoteNothingInvented {
-    /// Returns whether a listener with a key is right to refuse a datagram. The datagram arrived before its sensor's
-    /// announcement, or it is older than that or than the window of sequence numbers, like a recorded one.
+    /// Returns whether a listener with a key is right to refuse a datagram. It is right if the datagram arrived before
+    /// the announcement of its sensor. It is also right if the datagram is older than the announcement or than the
+    /// window of sequence numbers, as a recorded datagram is.
     fn is_rightly_refused(&self, head: &Head, reason: DatagramError) -> bool {
         let known = self.numbers.get(&(head.epoch, head.sensor, head.topic));
         match (reason, known) {
@@ -300,8 +301,8 @@ impl Invariant for RemoteNothingInvented {
     }
 }
 
-/// Returns a hash of everything in a sample that a network must not change. The stamps of a status may change: it is
-/// stamped when it is sent, and its state starts when the listener first receives it.
+/// Returns a hash of everything in a sample that a network must not change. A network may change the stamps of a
+/// status: the status gets its stamp when it is sent, and its state starts when the listener first receives the state.
 fn key(sensor: usize, topic: Topic, header: &Header, payload: &[u8]) -> u64 {
     let flags = header.flags & (Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED);
     let is_suspect = header.quality() == Quality::Suspect;
@@ -333,14 +334,14 @@ fn part_key(datagram: &Datagram<'_>) -> (u32, u8, u8, u32, u8) {
 /// Time without a sample after which a sensor is silent.
 const SILENCE_TIMEOUT: Nanos = 3_000 * MILLIS;
 
-/// Invariant: with a key, a listener refuses every forged datagram for the right reason, and never accepts a recorded
-/// datagram as new. Other invariants check that it counts all refusals and always accepts the right gateway.
+/// Invariant: a listener with a key refuses every forged datagram for the right reason, and never accepts a recorded
+/// datagram as new. Other invariants check that the listener counts all refusals and always accepts the right gateway.
 #[derive(Default)]
 pub(crate) struct RemoteKeys {
     forged: HashMap<u64, Forgery>,
-    /// Datagrams that were recorded and sent again.
+    /// Hashes of the datagrams that were recorded and sent again.
     replayed: HashSet<u64>,
-    /// Datagrams that the running listener accepted.
+    /// Hashes of the datagrams that the running listener accepted.
     accepted: HashSet<u64>,
 }
 

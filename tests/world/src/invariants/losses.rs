@@ -10,8 +10,8 @@ use super::{Invariant, ViolationReporter};
 use crate::event::{Event, RevolutionFigures, Telegram};
 use crate::family::Family;
 
-/// Invariant: no byte disappears. The bytes that a status reports as read are those that the port returned to the
-/// running hub, and each of them is in a telegram, in an acknowledgement, discarded, or still in the buffer.
+/// Invariant: no byte disappears. A status reports exactly the number of bytes that the port returned to the running
+/// hub. Each of these bytes is in a telegram, in an acknowledgement, discarded, or still in the buffer.
 pub(crate) struct ByteCounters(Vec<u64>);
 
 impl ByteCounters {
@@ -53,8 +53,8 @@ impl Invariant for ByteCounters {
 }
 
 /// Invariant: a running hub loses no intact telegram. A telegram is due if the port returned all its bytes as they were
-/// sent, while the hub reported that it streams. The hub publishes it once and in order, unless there was no memory for
-/// it.
+/// sent, while the hub reported that it streams. The hub publishes each due telegram once and in order, unless there
+/// was no memory for it.
 pub(crate) struct NothingLost {
     sensors: Vec<SensorTelegrams>,
 }
@@ -62,21 +62,22 @@ pub(crate) struct NothingLost {
 struct SensorTelegrams {
     family: Rc<dyn Family>,
     sent: VecDeque<SentTelegram>,
-    /// Position of the first byte that the session on the line can have received.
+    /// Position of the first byte that the current session can have received.
     valid_from: u64,
     /// Position after the last byte that the hub had read when it reported that it streams, or `None` if it does not
     /// stream.
     streams_from: Option<u64>,
     read_end: u64,
-    /// Number of exchanged scanners before this one, and whether the hub has not yet received a scan of this one. The
-    /// session accepts a scanner with other scans only after a silence.
+    /// Number of earlier scanners on this line, and whether the hub has not yet received a scan from the current one.
+    /// The session accepts a scanner with different scans only after a silence.
     exchanged: u32,
     is_other: bool,
     /// Time until which bytes of the previous scanner may still be on the line.
     mixed_until: Nanos,
     /// Number of telegrams for which there was no memory.
     lacked_memory: usize,
-    /// Position after the last telegram, and number of next telegrams that may be lost with damaged bytes before them.
+    /// Position after the last telegram, and number of the next telegrams that may be lost together with damaged bytes
+    /// before them.
     sent_end: u64,
     allowed_losses: usize,
     /// The last published unit, if no scanner sent it.
@@ -88,13 +89,13 @@ struct SensorTelegrams {
 struct SentTelegram {
     bytes: Vec<u8>,
     span: (u64, u64),
-    /// Number of exchanges before the scanner that sent it.
+    /// Number of exchanges before the scanner that sent the telegram was connected.
     exchanged: u32,
     is_whole: bool,
-    /// Whether all of its bytes arrived as they were sent.
+    /// Whether all bytes of the telegram arrived as they were sent.
     is_intact: bool,
     is_read: bool,
-    /// Time at which the hub had read all of it, if it has to be published.
+    /// Time at which the hub had read the whole telegram, or `None` if the hub need not publish it.
     due_at: Option<Nanos>,
 }
 
@@ -200,7 +201,7 @@ impl SensorTelegrams {
         let Telegram { bytes, span, damage, aborted, .. } = *telegram;
         let is_intact = damage.is_none() && !aborted;
         let near = self.family.point_accuracy(bytes).neighbors;
-        // The session of a rotating scanner repeats a request until it gets a reply, so a lost reply is not an error.
+        // The session of a rotating scanner repeats a request until a reply arrives, so a lost reply is not an error.
         let is_promised = !self.family.is_rotating() || self.family.is_data(bytes);
         let is_plain = span.1 - span.0 == bytes.len() as u64 && span.0 <= self.sent_end;
         self.sent_end = span.1;
@@ -246,7 +247,7 @@ impl SensorTelegrams {
         }
     }
 
-    /// Ends the stream. The session may still have held back the last telegrams, to see what follows them.
+    /// Ends the stream. The session may have held back the last telegrams until it can examine the bytes after them.
     fn end_stream(&mut self, at: Nanos) {
         let at = if self.stall.1 >= at { self.stall.0 } else { at };
         for sent in
@@ -254,7 +255,7 @@ impl SensorTelegrams {
         {
             sent.due_at = None;
         }
-        // If only the next packet confirms a packet, the last one is never confirmed.
+        // If the session confirms a packet only by the next packet, it never confirms the last one.
         if let Some(last) = self.sent.iter_mut().rfind(|sent| sent.is_read)
             && self.family.point_accuracy(&last.bytes).neighbors > 0
         {
@@ -262,8 +263,8 @@ impl SensorTelegrams {
         }
     }
 
-    /// Returns whether damaged bytes arrived before `unit`, which has a checksum and is published now. In that case, it
-    /// must be marked.
+    /// Returns whether damaged bytes arrived before `unit`, which has a checksum and is published now. If they did, the
+    /// hub must mark `unit`.
     fn is_after_damage(&self, unit: &[u8]) -> bool {
         let exactness = self.family.point_accuracy(unit);
         if !self.foreign.is_empty()
@@ -286,13 +287,13 @@ impl SensorTelegrams {
     /// Handles the publication of a telegram. Returns a description of the telegrams that were lost before it.
     fn publish(&mut self, at: Nanos, bytes: &[u8]) -> Option<String> {
         let is_it = |sent: &SentTelegram| sent.is_read && sent.bytes == bytes;
-        // Replies are often identical, and standard packets sometimes are. Among identical units, choose one that is
-        // due, or an intact one.
+        // Replies are often identical, and standard packets sometimes are. Among identical units, choose a due one if
+        // there is one, and otherwise an intact one.
         let due = self.sent.iter().position(|sent| sent.due_at.is_some() && is_it(sent));
         let whole = due.or_else(|| self.sent.iter().position(|sent| sent.is_whole && is_it(sent)));
         let first = self.sent.iter().position(is_it);
-        // Choose the first of two identical units if choosing the other would mean that something between them was
-        // lost. A real loss is detected later.
+        // Of two identical units, choose the first one if choosing the other would mean that a unit between them was
+        // lost. A later check detects a real loss.
         let is_due = |sent: &SentTelegram| sent.due_at.is_some();
         let skips = whole.is_some_and(|whole| self.sent.range(first.unwrap_or(0)..whole).any(is_due));
         let found = if skips { first } else { whole.or(first) };
@@ -303,13 +304,13 @@ impl SensorTelegrams {
         };
         let is_of_this = self.family.is_data(bytes) && self.sent[found].exchanged == self.exchanged;
         self.is_other &= !is_of_this || at < self.mixed_until;
-        // A unit that lost its first byte is intact again with the last byte of the unit before it, if these bytes are
-        // the same. Either unit may be the published one.
+        // A unit that lost its first byte may be intact again together with the last byte of the previous unit, if both
+        // bytes have the same value. Either unit may be the published one.
         let is_lent = !self.sent[found].is_whole;
         let passed = self.sent.drain(..=found).take(found);
         let mut lost: Vec<SentTelegram> = passed.filter(|sent| sent.due_at.is_some()).collect();
-        // A checksum of one byte is valid by chance in 1 of 256 cases. A unit that damage made from two packets
-        // contains a part of the intact one.
+        // A checksum of one byte is valid by chance in 1 of 256 cases. If damage combines two packets into one unit,
+        // the unit contains a part of the intact packet.
         if let Some(torn) = lost.iter().position(|sent| overlaps(&foreign, &sent.bytes)) {
             lost.remove(torn);
         }
@@ -325,13 +326,14 @@ impl SensorTelegrams {
     }
 }
 
-/// Returns whether one unit ends with a start of the other, at least with its header.
+/// Returns whether one unit ends with the same bytes with which the other unit starts. At least the header must be the
+/// same.
 fn overlaps(foreign: &[u8], sent: &[u8]) -> bool {
     let is_end = |len: usize| foreign.ends_with(&sent[..len]) || sent.ends_with(&foreign[..len]);
     (MIN_HEADER_LEN..foreign.len().min(sent.len())).any(is_end)
 }
 
-/// Number of bytes by which a packet with a checksum is recognized.
+/// Number of bytes in the header of a packet with a checksum.
 const MIN_HEADER_LEN: usize = 2;
 /// Maximum time for which a session holds back a telegram.
 const MAX_HOLD_TIME: Nanos = 100 * MILLIS;
@@ -341,36 +343,36 @@ const MAX_LINE_DELAY: Nanos = 4_000 * MILLIS;
 const MAX_REMEMBERED: usize = 64;
 
 /// Invariant: the hub counts packets that a scanner sent and the hub did not receive. Packets have no sequence number,
-/// so the hub counts as many as are missing between two packets that arrived, as exactly as their times and angles
-/// permit.
+/// so the hub derives the number of missing packets from the times and angles of the packets around a gap. The count
+/// must be as exact as these times and angles permit.
 pub(crate) struct LostOnLine {
     sensors: Vec<PacketCounters>,
 }
 
 struct PacketCounters {
     family: Rc<dyn Family>,
-    /// Packets that were sent and not published yet, in order. An empty one marks a power cycle or an exchange.
+    /// Packets that were sent and not published yet, in order. An empty packet marks a power cycle or an exchange.
     sent: VecDeque<Vec<u8>>,
     /// The last published packet.
     last: Vec<u8>,
-    /// Count in the last status of this hub. The other fields apply since the last time at which the counts agreed:
-    /// lost packets as reported by the hub, packets that are missing, and the allowed difference between both.
+    /// Count in the last status of this hub. The other fields apply to the time since the counts last agreed: lost
+    /// packets that the hub reported, packets that are missing, and the allowed difference between both numbers.
     counted: Option<u64>,
     reported: u64,
     missing: u64,
     allowed_difference: u64,
     /// Sum of reported and missing packets at the last status.
     total_at_last_status: u64,
-    /// Whether the counts disagreed then. After a stall of the hub, and for points without a checksum, the hub detects
-    /// the number of missing packets later.
+    /// Whether the counts disagreed at the last status. The hub detects the number of missing packets later after a
+    /// stall, and for points without a checksum.
     disagreed: bool,
-    /// Number of the next statuses that are not checked, after something that cannot be counted: another session, or a
-    /// packet that was not sent.
+    /// Number of the next statuses that are not checked. It is set after an event that cannot be counted: a new
+    /// session, or a packet that no scanner sent.
     unchecked_statuses: u8,
-    /// Whether packets were not published for lack of memory.
+    /// Whether packets were not published because of a lack of memory.
     lacked_memory: bool,
     measured_at: Nanos,
-    /// Total count of all statuses.
+    /// Sum of the counts that all statuses report.
     reported_total: u64,
 }
 
@@ -485,14 +487,14 @@ impl PacketCounters {
             self.unchecked_statuses = UNCHECKED_STATUSES;
         }
         self.missing += missing;
-        // The number of packets that fit between two packets is rounded, and the speed of a head may change between
-        // them.
+        // The hub rounds the number of packets that fit between two packets. The speed of a head may change between the
+        // two packets.
         let exactness = self.family.point_accuracy(unit);
         let unmarked = if exactness.neighbors > 0 { MAX_UNMARKED_DIFFERENCE + missing / 10 } else { 1 };
         self.allowed_difference += if missing > 0 { unmarked + missing / 20 } else { 0 };
     }
 
-    /// Checks the count in `status`.
+    /// Checks the count of lost packets in `status`.
     ///
     /// # Errors
     ///
@@ -524,15 +526,15 @@ impl PacketCounters {
     }
 }
 
-/// The status after something that cannot be counted, and the next one, which may contain losses that the hub detected
-/// later.
+/// Number of statuses that are not checked after an event that cannot be counted: the next status, and the one after
+/// it, which may contain losses that the hub detected later.
 const UNCHECKED_STATUSES: u8 = 2;
-/// Allowed difference if only the number of points per revolution reveals a loss.
+/// Maximum difference of the counts if only the number of points per revolution reveals a loss, in packets.
 const MAX_UNMARKED_DIFFERENCE: u64 = 30;
-/// Number of stored packets: as many as a tty buffers for the fastest scanner.
+/// Maximum number of stored packets. A tty buffers no more packets of the fastest scanner.
 const MAX_SENT: usize = 20_000;
-/// Longest countable gap, in packets: 1.5 s of the slowest scanner. In a longer one, the scanner may have been
-/// exchanged, and its clock with it.
+/// Maximum countable gap, in packets. It corresponds to 1.5 s of the slowest scanner. In a longer gap, another scanner
+/// with another clock may have been connected.
 const MAX_GAP_PACKETS: u64 = 400;
 /// Minimum duration of a power cycle.
 const MIN_POWER_OFF: Nanos = 50 * MILLIS;
