@@ -1,9 +1,9 @@
-//! Simulation of a whole hub in one thread and in virtual time: simulated scanners, lines with faults, ttys, the hub's
-//! core, topics in memory, and subscribers. It includes another machine with a gateway, a network, a listener and a
-//! robot. A seed determines the faults and their times, and invariants check every event. A failure can be repeated
-//! with its seed, and shrinks to the few actions that cause it.
+//! Simulation of a whole hub in one thread and in virtual time. The simulation includes scanners, lines with faults,
+//! ttys, the hub's core, topics in memory, and subscribers. It also includes another machine with a gateway, a network,
+//! a listener and a robot. A seed determines the faults and their times, and invariants check every event. A user can
+//! repeat a failure with its seed. The simulation shortens the scenario to the few actions that cause the failure.
 //!
-//! A [`Scenario`] is the list of a world's actions, [`run`] runs it, and [`Outcome`] is the result with its violations.
+//! A [`Scenario`] lists the actions of a world, [`run`] runs it, and [`Outcome`] is the result with its violations.
 
 mod actions;
 mod event;

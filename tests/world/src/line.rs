@@ -13,7 +13,8 @@ use crate::event::Event;
 use crate::injected_defects::{Defect, eeprom_request};
 use crate::shared::SharedState;
 
-/// The clock of one link. The link's thread may be ahead of the others while it writes a request byte by byte.
+/// The clock of one link. While the link's thread writes a request byte by byte, its clock may be ahead of the other
+/// clocks.
 #[derive(Default)]
 pub(crate) struct LinkClock(Cell<Nanos>);
 
@@ -29,7 +30,7 @@ impl LinkClock {
         self.0.get()
     }
 
-    /// Advances the clock to `time`, unless it is later already.
+    /// Advances the clock to `time`. If the clock is later than `time`, it does not change.
     pub(crate) fn advance_to(&self, time: Nanos) {
         self.0.set(self.0.get().max(time));
     }
@@ -38,7 +39,7 @@ impl LinkClock {
 /// Time that a read of the clock takes.
 const CLOCK_READ_TIME: Nanos = 40;
 
-/// An open descriptor of a port; the port is closed with the last one.
+/// An open descriptor of a port. The port is closed when the last descriptor is dropped.
 pub(crate) struct Handle {
     pub(crate) shared: Rc<SharedState>,
     pub(crate) port: usize,
@@ -64,7 +65,7 @@ impl OpenLine {
     ///
     /// # Errors
     ///
-    /// Returns an error like that of the kernel if it is not connected.
+    /// Returns the same error as the kernel if the device is not connected.
     fn check(&self, is_connected: bool) -> io::Result<bool> {
         let is_told = !self.handle.shared.defect.is_active(Defect::SwallowedHangUp);
         if is_connected || !is_told {
@@ -103,7 +104,7 @@ impl PortIo for OpenLine {
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
         let is_deaf = shared.defect.is_active(Defect::IgnoredRequests) && tty.sensor.is_streaming();
-        // A part of a request has no effect.
+        // An incomplete request has no effect.
         let cuts = shared.defect.is_active(Defect::UnstartedMotor);
         let is_cut = |byte: &&u8| cuts && matches!(byte, 0xF0 | 0xA8);
         if self.check(tty.is_plugged_in(*device))? && !is_deaf {

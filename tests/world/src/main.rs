@@ -1,5 +1,5 @@
-//! Command-line program that runs worlds: `cargo run --release -p scanhub-world -- --seeds 0..200`. It prints a
-//! violation with its seed and the shortest list of actions that still causes it.
+//! Command-line program that runs worlds: `cargo run --release -p scanhub-world -- --seeds 0..200`. For each violation,
+//! it prints the seed and the shortest list of actions found that still causes the violation.
 
 use std::io::{IsTerminal, Write};
 use std::process::{Command, ExitCode};

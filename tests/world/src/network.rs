@@ -21,15 +21,15 @@ pub(crate) struct Faults {
     pub(crate) delay_ns: Nanos,
     /// Maximum additional delay. It is drawn for each datagram, so datagrams overtake each other.
     pub(crate) jitter_ns: Nanos,
-    /// Maximum duration of the partitions, which start every few seconds. With 0 there are none.
+    /// Maximum duration of a partition. Partitions start every few seconds. With 0, there are none.
     pub(crate) partition_ns: Nanos,
 }
 
-/// The datagrams that are on their way.
+/// A network with the datagrams in transit.
 pub(crate) struct Network {
     rng: Rng,
     faults: Faults,
-    /// Datagrams by time of arrival and a number that makes the key unique.
+    /// Datagrams in transit. The key is the time of arrival, with a number that makes it unique.
     queue: BTreeMap<(Nanos, u64), Vec<u8>>,
     number: u64,
     /// Start and end of the current or next partition.

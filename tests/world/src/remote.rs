@@ -1,5 +1,5 @@
-//! The other machine of a world, which receives the topics of the hub: a gateway, a network, a listener that publishes,
-//! and a robot. Each of them starts and ends independently.
+//! The other machine of a world, which receives the hub's topics. This module has a gateway, a network, a listener that
+//! publishes, and a robot. Each of them starts and ends independently of the others.
 
 mod forger;
 mod gateway;
@@ -35,17 +35,17 @@ use topics::TopicMemory;
 /// Settings of gateway, network and listener, drawn from the seed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LinkSettings {
-    /// Interval at which samples that follow from a scan are sent, in samples.
+    /// Interval at which the gateway sends samples that are derived from a scan, in samples.
     pub(crate) send_interval: NonZeroU64,
-    /// Whether telegrams are sent, too.
+    /// Whether the gateway also sends telegrams.
     sends_telegrams: bool,
     /// Maximum length of a datagram, in bytes.
     max_datagram_len: usize,
-    /// Interval at which the background is sent again.
+    /// Interval at which the gateway sends the background again.
     background_interval: Option<Duration>,
     /// Minimum delay of the network.
     pub(crate) delay_ns: Nanos,
-    /// Clocks of the listener's machine when the world begins.
+    /// Time of the listener's clocks when the world begins.
     pub(crate) initial_clocks: WallTimestamp,
     /// Whether gateway and listener have a key.
     pub(crate) has_key: bool,
@@ -53,7 +53,8 @@ pub(crate) struct LinkSettings {
     pub(crate) are_bridges: bool,
     /// Topics that the gateway does not send.
     without_subscribers: [bool; Topic::ALL.len()],
-    /// With a key: time by which the wall clock of the listener's machine is ahead of the hub's, in nanoseconds.
+    /// With a key: time by which the wall clock of the listener's machine is ahead of the hub's wall clock, in
+    /// nanoseconds.
     clock_offset_ns: i64,
 }
 
@@ -83,8 +84,8 @@ impl LinkSettings {
         }
     }
 
-    /// Returns the interval at which samples of `topic` are sent, in samples, or `None` if the gateway does not send
-    /// them.
+    /// Returns the interval at which the gateway sends samples of `topic`, in samples. Returns `None` if the gateway
+    /// does not send them.
     pub(crate) fn send_interval(&self, topic: Topic) -> Option<NonZeroU64> {
         match topic {
             Topic::Telegram if !self.sends_telegrams => None,
@@ -94,7 +95,7 @@ impl LinkSettings {
         }
     }
 
-    /// Returns the clocks of the listener's machine at `now`.
+    /// Returns the time of the listener's clocks at `now`.
     fn stamp(&self, now: Nanos) -> WallTimestamp {
         let WallTimestamp { monotonic_ns, wall_ns } = self.initial_clocks;
         WallTimestamp { monotonic_ns: monotonic_ns + now, wall_ns: wall_ns + now }
@@ -112,14 +113,14 @@ impl LinkSettings {
     }
 }
 
-/// Everything after the hub: gateway, network or router, listener and robot.
+/// All machines and networks after the hub: gateway, network or router, listener and robot.
 pub(crate) struct RemoteMachines {
     terms: LinkSettings,
     sensors: usize,
     gateway: Option<Gateway>,
     /// Number of gateways that have been started.
     gateways: u32,
-    /// Times until which the process of the gateway and that of the listener are stalled.
+    /// Times until which two processes are stalled: the gateway and the listener.
     gateway_stalled_until: Nanos,
     listener_stalled_until: Nanos,
     network: Network,
@@ -136,9 +137,9 @@ pub(crate) struct RemoteMachines {
     memory: TopicMemory,
     robot: RemoteRobot,
     forger: Forger,
-    /// Additional difference of the wall clocks at present, in nanoseconds.
+    /// Additional difference of the wall clocks that an action has set, in nanoseconds.
     extra_clock_offset_ns: i64,
-    /// Highest epoch of each hub, as saved by the listeners.
+    /// Highest epoch of each hub that listeners have saved.
     epochs: HashMap<u64, u32>,
 }
 
@@ -178,7 +179,7 @@ impl RemoteMachines {
         }
     }
 
-    /// Kills the gateway, or ends it in order. In that case it sends a final announcement.
+    /// Kills the gateway, or ends it in an orderly way. In an orderly end, the gateway sends a final announcement.
     pub(crate) fn end_gateway(&mut self, shared: &SharedState, is_killed: bool) {
         let Some(mut gateway) = self.gateway.take() else { return };
         let now = shared.clock.get();
@@ -199,7 +200,7 @@ impl RemoteMachines {
         }
     }
 
-    /// Kills the listener. Datagrams that wait in its sockets are lost.
+    /// Kills the listener. The datagrams in its sockets are lost.
     pub(crate) fn kill_listener(&mut self, shared: &SharedState) {
         if let Some(listener) = self.listener.take() {
             listener.end(shared, shared.clock.get());
@@ -218,7 +219,7 @@ impl RemoteMachines {
         (self.gateway_stalled_until, self.listener_stalled_until) = (0, 0);
     }
 
-    /// Sets the time by which the wall clock of the listener's machine is further ahead, in nanoseconds.
+    /// Sets the additional time by which the wall clock of the listener's machine is ahead, in nanoseconds.
     pub(crate) fn set_extra_clock_offset(&mut self, offset_ns: i64) {
         self.extra_clock_offset_ns = offset_ns;
     }
@@ -232,8 +233,8 @@ impl RemoteMachines {
         }
     }
 
-    /// Returns the wall clock of the listener's machine at `now`, for a world with a key. It differs from the hub's as
-    /// clocks do that are set by the same server, apart from an injected offset.
+    /// Returns the wall clock of the listener's machine at `now`, for a world with a key. Without an additional offset
+    /// from an action, its difference from the hub's clock is as small as for clocks that the same server sets.
     fn wall_ns(&self, shared: &SharedState, now: Nanos) -> Nanos {
         (now + shared.wall_offset.get())
             .saturating_add_signed(self.terms.clock_offset_ns + self.extra_clock_offset_ns)
@@ -261,7 +262,7 @@ impl RemoteMachines {
         self.network.set_faults(Faults { loss, ..self.faults }, now);
     }
 
-    /// Kills the router, with everything that it holds.
+    /// Kills the router. The router loses everything that it holds.
     pub(crate) fn kill_router(&mut self, now: Nanos) {
         match &mut self.router {
             Some(router) => router.kill(now),
@@ -289,14 +290,14 @@ impl RemoteMachines {
         }
     }
 
-    /// Wakes the gateway. The hub has woken the subscribers of a sensor at `at`.
+    /// Wakes the gateway, because the hub woke the subscribers of a sensor at `at`.
     pub(crate) fn wake(&mut self, at: Nanos) {
         if let Some(gateway) = &mut self.gateway {
             gateway.wake(at);
         }
     }
 
-    /// Returns the time at which the next thing happens.
+    /// Returns the time of the next event.
     pub(crate) fn next_ns(&self, now: Nanos) -> Nanos {
         let room_at = self.router.as_ref().map_or(Nanos::MAX, Router::next_room_at);
         let gateway = self.gateway.as_ref().map(|gateway| {
@@ -350,7 +351,7 @@ impl RemoteMachines {
         }
     }
 
-    /// Delivers everything that is queued or on its way, and ends all processes.
+    /// Delivers everything that is queued or in transit, and ends all processes.
     pub(crate) fn close(&mut self, shared: &SharedState) {
         let mut now = shared.clock.get();
         if let Some(mut gateway) = self.gateway.take() {
@@ -389,7 +390,7 @@ impl RemoteMachines {
     }
 }
 
-/// Time from a datagram or a ring to a running process.
+/// Delay of a process that a datagram or a ring of the doorbell wakes.
 const WAKE_DELAY: Nanos = 60 * MICROS;
 /// Maximum interval between the checks of a listener.
 const MAX_SLEEP: Nanos = 100 * MILLIS;

@@ -16,7 +16,7 @@ use crate::world::{Outcome, run};
 pub struct Runner {
     /// Scenarios of the worlds.
     pub scenarios: Vec<Scenario>,
-    /// Number of worlds, from the first one, that are run twice and must have the same hash both times.
+    /// Number of worlds that are run twice, counted from the first world. Both runs must have the same hash.
     pub run_twice: usize,
     /// Number of worlds that run at the same time.
     pub threads: usize,
@@ -27,18 +27,19 @@ pub struct Runner {
 pub struct Totals {
     /// Number of worlds. A world that was run twice counts once.
     pub worlds: usize,
-    /// Virtual seconds times sensors.
+    /// Virtual seconds, multiplied by the number of sensors.
     pub sensor_seconds: u64,
     /// Number of samples that hubs published.
     pub samples: u64,
     /// CPU time of all threads.
     pub busy: Duration,
-    /// Scenarios that ended with violations, or with another hash the second time. The flag is false in that case.
+    /// Scenarios that ended with violations or whose second run had another hash. The flag is false if the hashes
+    /// differ.
     pub failed: Vec<(Scenario, Outcome, bool)>,
 }
 
 impl Runner {
-    /// Runs all worlds until `is_over`. Calls `progress` after each one.
+    /// Runs all worlds until `is_over` is true. Calls `progress` after each world.
     pub fn run(&self, is_over: &AtomicBool, mut progress: impl FnMut(&Totals)) -> Totals {
         let next = AtomicU64::new(0);
         let mut totals = Totals::default();

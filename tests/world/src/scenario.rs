@@ -1,6 +1,6 @@
-//! The scenario of a world as data: a seed, a duration, and a list of timed actions. The list is drawn from the seed.
-//! It can be printed, parsed and shortened, so that a failure can be repeated with fewer actions. `actions` defines
-//! their effects.
+//! The scenario of a world as data: a seed, a duration, and a list of timed actions. The list is drawn from the seed. A
+//! scenario can be printed, parsed and shortened, so a failure can be repeated with fewer actions. `actions` defines
+//! the effects of actions.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,18 +11,18 @@ use scanhub_sim::fault::Faults;
 use crate::actions::{self, ACTION_KINDS, ActionKind};
 use crate::family;
 
-/// The actions of a world. Everything else follows from the seed: the number of sensors, their rates, the subscribers.
+/// The actions of a world. Everything else follows from the seed: number of sensors, rates, and subscribers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scenario {
     /// Seed of all random numbers.
     pub seed: u64,
     /// Duration, in virtual seconds.
     pub seconds: u64,
-    /// Model of the only sensor, for some models with its mode and its state at the start. Without it, one or two
-    /// sensors are drawn.
+    /// Model of the only sensor. For some models, it includes the mode and the state at the start. If it is `None`, one
+    /// or two sensors are drawn.
     pub model: Option<String>,
-    /// Whether half of the links have no family, so that the hub searches for their scanners. The link of an only
-    /// sensor has none.
+    /// Whether half of the links have no family, so that the hub searches for their scanners. If there is only one
+    /// sensor, its link has no family.
     pub is_auto: bool,
     /// Actions in order of time.
     pub actions: Vec<Action>,
@@ -39,14 +39,15 @@ pub struct Action {
 }
 
 impl Scenario {
-    /// Draws a scenario of `seconds` seconds. It has about half of the kinds of actions (swarm testing, because many
-    /// faults hide each other), each of them one or more times, and no actions in the last 12 seconds.
+    /// Draws a scenario of `seconds` seconds. It contains about half of the kinds of actions, each of them one or more
+    /// times. This is swarm testing: some kinds are left out because many faults hide each other. The last 12 seconds
+    /// contain no actions.
     pub fn from_seed(seed: u64, seconds: u64) -> Scenario {
         let mut random = fastrand::Rng::with_seed(seed ^ 0x5EED_0F1A_C710_0000);
         let end_ms = (seconds * 1_000).saturating_sub(RECOVERY_TIME / MILLIS);
         let mut actions = Vec::new();
         for kind in ACTION_KINDS {
-            // Each kind has its own random numbers, so that a new kind hardly changes the actions of the others.
+            // Each kind has its own random numbers, so a new kind hardly changes the actions of other kinds.
             let mut random = random.fork();
             if random.bool() || end_ms <= START_DELAY_MS {
                 continue;
@@ -61,14 +62,12 @@ impl Scenario {
         Scenario { seed, seconds, model: None, is_auto: false, actions }
     }
 
-    /// Returns the scenario of [`from_seed`](Scenario::from_seed) for a world in which half of the links have no
-    /// family.
+    /// Returns the same scenario as [`from_seed`](Scenario::from_seed), but half of the links have no family.
     pub fn auto_from_seed(seed: u64, seconds: u64) -> Scenario {
         Scenario { is_auto: true, ..Scenario::from_seed(seed, seconds) }
     }
 
-    /// Returns the time at which all faults are cleared, 12 seconds before the end. The effects that must follow have
-    /// this time to show.
+    /// Returns the time at which all faults are cleared, 12 seconds before the end. In this time, the hub must recover.
     pub fn faults_clear_at(&self) -> Nanos {
         (self.seconds * 1_000 * MILLIS).saturating_sub(RECOVERY_TIME)
     }
@@ -91,7 +90,7 @@ impl Action {
         actions::faults(self, now)
     }
 
-    /// Returns the name of its kind.
+    /// Returns the name of the action's kind.
     pub fn name(&self) -> &'static str {
         self.kind.name
     }
@@ -176,7 +175,7 @@ impl FromStr for Scenario {
     }
 }
 
-/// Returns the scenarios that once ended in a violation, each with its reason. They must stay without a violation.
+/// Returns the scenarios that once ended in a violation, each with its reason. They must no longer end in a violation.
 ///
 /// # Panics
 ///
@@ -197,7 +196,8 @@ pub fn corpus() -> Vec<(String, Scenario)> {
 const CORPUS_TEXT: &str = include_str!("corpus.txt");
 
 /// Returns the shortest scenario found for which `check` returns the same invariant as for `scenario`. The search
-/// removes halves of the actions as long as the result stays the same, then quarters, down to single actions.
+/// removes halves of the actions as long as the invariant stays the same, then quarters, and so on down to single
+/// actions.
 pub fn shrink(scenario: &Scenario, mut check: impl FnMut(&Scenario) -> Option<&'static str>) -> Scenario {
     let Some(expected) = check(scenario) else { return scenario.clone() };
     let mut best = scenario.clone();

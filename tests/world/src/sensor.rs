@@ -16,10 +16,10 @@ use crate::scenario::Action;
 pub(crate) struct Sensor {
     scanner: Box<dyn Scanner>,
     line: LineModel,
-    /// Bytes of the host on their way to the scanner: time of arrival, value and baud rate.
+    /// Bytes from the host in transit to the scanner: time of arrival, value and baud rate.
     outgoing: VecDeque<(Nanos, u8, u32)>,
     now: Nanos,
-    /// EEPROM writes that were received by scanners that have been exchanged since.
+    /// Number of EEPROM writes that earlier scanners at this line received.
     eeprom_writes: u64,
 }
 
@@ -49,8 +49,8 @@ impl Sensor {
         self.line.poll_timeout(self.scanner.device(), self.now).into_iter().chain(received_at).min()
     }
 
-    /// Advances the time to `to`, unless it is later already. Passes bytes that arrive and points that are measured
-    /// until then to `on_event`.
+    /// Advances the time to `to`. If the time is later than `to`, it does not change. Passes bytes that arrive and
+    /// points that are measured until then to `on_event`.
     pub(crate) fn advance(&mut self, to: Nanos, mut on_event: impl FnMut(Nanos, SensorEvent)) {
         while let Some(at) = self.next_ns().filter(|&at| at <= to) {
             self.now = self.now.max(at);
@@ -66,7 +66,7 @@ impl Sensor {
             while self.outgoing.front().is_some_and(|(at, ..)| *at <= self.now)
                 && let Some((at, byte, rate)) = self.outgoing.pop_front()
             {
-                // A byte at another rate is not a part of a request.
+                // If a byte has another rate, the scanner cannot read it as a part of a request.
                 if self.scanner.device().rate() == rate {
                     self.line.receive(self.scanner.device_mut(), byte, Arrival::at(at));
                 }
@@ -81,7 +81,7 @@ impl Sensor {
         self.outgoing.push_back((free + line_time(1, rate), byte, rate));
     }
 
-    /// Discards the bytes on the way to the scanner, because the cable was unplugged.
+    /// Discards the bytes in transit to the scanner, because the cable was unplugged.
     pub(crate) fn drop_outgoing(&mut self) {
         self.outgoing.clear();
     }
@@ -101,7 +101,7 @@ impl Sensor {
         self.scanner.brown_out(self.now);
     }
 
-    /// Replaces the scanner as `action` says.
+    /// Replaces the scanner as `action` specifies.
     pub(crate) fn exchange(&mut self, action: &Action) {
         self.eeprom_writes += self.scanner.device().eeprom_writes();
         let sent = self.scanner.exchange(action, self.now);
@@ -117,7 +117,7 @@ impl Sensor {
         self.line.set_faults(faults, seed);
     }
 
-    /// Starts the misbehavior of `action`, or ends it with `None`.
+    /// Starts the misbehavior that `action` specifies. With `None`, ends it.
     pub(crate) fn misbehave(&mut self, action: Option<&Action>) {
         self.scanner.misbehave(action);
     }
@@ -138,5 +138,5 @@ impl Sensor {
     }
 }
 
-/// Pause after each byte of a host that starts a stream.
+/// Time between two bytes that a host sends to start a stream.
 const BYTE_INTERVAL: Nanos = 60 * MICROS;

@@ -1,5 +1,5 @@
-//! Setup of a world, drawn from its seed: the scanners and the states in which they are found, the hub's configuration,
-//! whether a service manager keeps ports, and the permanent subscribers.
+//! Setup of a world, drawn from its seed. It contains the scanners with their states at the start, the hub's
+//! configuration, whether a service manager keeps ports, and the permanent subscribers.
 
 use std::rc::Rc;
 
@@ -21,7 +21,7 @@ pub(crate) struct Setup {
     pub(crate) unsupported_rates: Vec<Vec<u32>>,
     /// Whether a service manager keeps the ports of a killed hub.
     pub(crate) keeps_ports: bool,
-    /// Number of consecutive scans that violate a zone.
+    /// Number of consecutive scans after which a zone is violated.
     pub(crate) min_scans: u64,
     /// Permanent subscribers: sensor, topic, behavior, and number of samples that they hold.
     pub(crate) subscribers: Vec<(usize, Topic, Behavior, usize)>,
@@ -72,7 +72,8 @@ impl Setup {
         Config::load(&Sources { files: Vec::new(), set, links })
     }
 
-    /// Returns the sensors as the hub finds them. `changes` returns the changes of a sensor's scene.
+    /// Returns the sensors in the states in which the hub finds them. `changes` returns the changes of a sensor's
+    /// scene.
     pub(crate) fn sensors(&self, mut changes: impl FnMut(usize) -> Changes) -> Vec<Sensor> {
         let sensor =
             |(number, of): (usize, &Rc<dyn Family>)| Sensor::new(of.initial_scanner(changes(number)));
@@ -81,10 +82,10 @@ impl Setup {
 }
 
 /// Removes the family from the link of the only sensor of `scenario`, or from half of the links. At some of these
-/// links, an exchange connects a scanner of another family, and some of their ports do not support all rates of the
+/// links, an exchange connects a scanner of another family. Some ports of these links do not support all rates of the
 /// search. Returns the sensors, and the rates that each port does not support.
 fn half_auto(sensors: &[Rc<dyn Family>], scenario: &Scenario) -> (Vec<Rc<dyn Family>>, Vec<Vec<u32>>) {
-    // Separate random numbers keep everything else as in the world in which all links have a family.
+    // Separate random numbers keep everything else the same as in the world in which all links have a family.
     let mut random = fastrand::Rng::with_seed(scenario.seed ^ 0xA070_0000_0000_0000);
     let of = |sensor: &Rc<dyn Family>| {
         let mut random = random.fork();
@@ -102,6 +103,6 @@ fn half_auto(sensors: &[Rc<dyn Family>], scenario: &Scenario) -> (Vec<Rc<dyn Fam
     sensors.iter().map(of).unzip()
 }
 
-/// Rates of the search, in bits per second, except the slowest, which every port supports.
+/// Rates of the search, in bits per second, without the slowest rate. Every port supports the slowest rate.
 const SEARCH_RATES: [u32; 9] =
     [19_200, 38_400, 115_200, 230_400, 256_000, 460_800, 500_000, 921_600, 1_000_000];

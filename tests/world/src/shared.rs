@@ -20,7 +20,7 @@ use crate::tty::Tty;
 pub(crate) struct SharedState {
     /// Nanoseconds since the machine was started.
     pub(crate) clock: Cell<Nanos>,
-    /// Time to add to the clock for the time since 1970, in nanoseconds.
+    /// Time to add to `clock` to get the time since 1970, in nanoseconds.
     pub(crate) wall_offset: Cell<u64>,
     pub(crate) ports: Vec<RefCell<Tty>>,
     pub(crate) topics: RefCell<TopicBoard>,
@@ -42,15 +42,15 @@ pub(crate) struct SharedState {
     pub(crate) wakeups: RefCell<Vec<(usize, WakeSource, Nanos)>>,
     /// ID of the next subscriber.
     pub(crate) next_subscriber: Cell<u32>,
-    /// Changes of subscribers that happen while a hub sends the samples of a scan.
+    /// Changes of subscribers that must happen while a hub sends the samples of a scan.
     pub(crate) changes: RefCell<Vec<SubscriberChange>>,
-    /// Subscribers that such a change has attached, with the milliseconds for which they stay; and subscribers that
+    /// Subscribers that these changes have attached, with the milliseconds for which they stay; and subscribers that
     /// have left.
     pub(crate) attached: RefCell<Vec<(Subscriber, u64)>>,
     pub(crate) detached: RefCell<Vec<SubscriberId>>,
 }
 
-/// A change of the subscribers of a sensor after it has sent some more samples.
+/// A change of a sensor's subscribers. It happens after the sensor has sent some more samples.
 pub(crate) struct SubscriberChange {
     pub(crate) sensor: usize,
     /// Number of samples that are sent before the change.
@@ -116,7 +116,7 @@ pub(crate) struct EventLog {
     detail: Detail,
     /// Invariants whose first violation ends the world.
     sought_invariants: &'static [&'static str],
-    /// Whether one of them has reported a violation.
+    /// Whether one of the `sought_invariants` has reported a violation.
     is_found: Cell<bool>,
 }
 

@@ -19,13 +19,13 @@ use crate::shared::SharedState;
 use crate::subscriber::WakeSource;
 use crate::topics::SimTransport;
 
-/// Platform of link number `number`, whose sensor has the same number.
+/// Platform of the link with index `number`. The link's sensor has the same index.
 pub(crate) struct SimPlatform<'a> {
     pub(crate) shared: Rc<SharedState>,
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
     pub(crate) save_slot: Option<scanhub_daemon::SaveSlot<'a>>,
-    /// Whether an injected defect holds back the first ring.
+    /// Whether an injected defect delays the first ring of the doorbell.
     is_ring_delayed: Cell<bool>,
 }
 
@@ -75,7 +75,7 @@ impl Platform for SimPlatform<'_> {
     }
 
     fn pause(&self, until: Nanos) {
-        // Typical delay of a sleeping thread.
+        // The typical delay of a sleeping thread is added.
         self.clock.advance_to(until + 50 * MICROS);
     }
 

@@ -1,5 +1,5 @@
-//! Models of subscribers: prompt ones that sleep until they are woken, slow ones that poll at fixed intervals, ones
-//! that hold samples, and a robot that accepts the verdicts of a sensor's zones. They use the rules of the client
+//! Models of subscribers. Prompt subscribers sleep until they are woken. Slow subscribers poll at fixed intervals. Some
+//! subscribers hold samples. A robot accepts the verdicts of a sensor's zones. All of them use the rules of the client
 //! library.
 
 use std::collections::VecDeque;
@@ -25,9 +25,9 @@ pub(crate) enum Behavior {
     Prompt,
     /// Takes one sample every `every_ms` milliseconds.
     Slow { every_ms: u64 },
-    /// Like a prompt one, but sleeps on the event of the sensor.
+    /// Like `Prompt`, but sleeps on the event of the sensor.
     Listener,
-    /// Like a prompt one, and accepts the verdicts.
+    /// Like `Prompt`, and also accepts the verdicts.
     Robot,
 }
 
@@ -46,11 +46,11 @@ pub(crate) struct Subscriber {
     pub(crate) sensor: usize,
     pub(crate) topic: Topic,
     behavior: Behavior,
-    /// Samples that the subscriber holds, and their maximum number.
+    /// Samples that the subscriber holds, and the maximum number of them.
     held_samples: VecDeque<Rc<Sample>>,
     max_held: usize,
     sequence: SequenceTracker,
-    /// Time of the next poll; [`Nanos::MAX`] if only a wakeup starts one.
+    /// Time of the next poll. It is [`Nanos::MAX`] if only a wakeup starts the next poll.
     next_poll_at: Nanos,
     /// Time until which the subscriber is stalled.
     stalled_until: Nanos,
@@ -90,7 +90,7 @@ impl Subscriber {
         })
     }
 
-    /// Wakes the subscriber if it sleeps on `source`, which the hub rang or sent at `at`.
+    /// Wakes the subscriber if it sleeps on `source`. The hub rang or sent `source` at `at`.
     pub(crate) fn wake(&mut self, source: WakeSource, at: Nanos) {
         let awaited = match self.behavior {
             Behavior::Listener => WakeSource::Event,
@@ -108,7 +108,7 @@ impl Subscriber {
         }
     }
 
-    /// Returns whether it takes all samples as soon as it is woken.
+    /// Returns whether the subscriber takes all samples as soon as it is woken.
     pub(crate) fn is_prompt(&self) -> bool {
         self.behavior == Behavior::Prompt
     }
@@ -192,5 +192,5 @@ fn moment(now: Nanos) -> Timestamp {
 
 /// Time from the hub's ring until a subscriber has a sample.
 const WAKE_DELAY: Nanos = 60 * MICROS;
-/// Time within which a running hub passes the history to a new subscriber, without waking it.
+/// Maximum time until a running hub passes the history to a new subscriber. It does so without waking the subscriber.
 const HISTORY_DELAY: Nanos = 110 * MILLIS;

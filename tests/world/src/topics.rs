@@ -1,5 +1,5 @@
-//! Topics in the memory of one process, with the limits of the real ones. There is a queue for each subscriber that
-//! drops the oldest sample when it is full, the history for late joiners, and the loans of a publisher.
+//! Topics in the memory of one process, with the limits of the real topics. Each subscriber has a queue that drops its
+//! oldest sample when it is full. A topic has the history for late joiners and the loans of a publisher.
 
 use std::borrow::{Borrow, BorrowMut};
 use std::cell::{Cell, RefCell};
@@ -25,12 +25,12 @@ pub(crate) struct Sample {
     pub(crate) topic: Topic,
     pub(crate) header: Header,
     pub(crate) bytes: Vec<u8>,
-    /// Time at which it was sent, and number of samples of its topic that the same hub had sent before.
+    /// Time at which the sample was sent; and number of samples of its topic that the same hub had sent before it.
     pub(crate) sent_at: Nanos,
     pub(crate) index: u64,
-    /// Number of subscribers to which it was sent.
+    /// Number of subscribers that the sample was sent to.
     pub(crate) receivers: usize,
-    /// Counts the sample as long as a queue, a history or a subscriber has it.
+    /// Counts the sample as long as a queue, a history or a subscriber contains it.
     _counted: LiveCount,
 }
 
@@ -54,7 +54,7 @@ impl Drop for LiveCount {
 /// All topics of all sensors.
 pub(crate) struct TopicBoard {
     sensors: Vec<[Channel; Topic::ALL.len()]>,
-    /// Number of loans that were not sent, and number of samples that are held, queued or in a history.
+    /// Number of loans that were not sent; and number of samples that are held, queued or in a history.
     loans: Rc<Cell<usize>>,
     samples: Rc<Cell<usize>>,
     /// For each sensor, the number of times that a subscriber has attached.
@@ -75,7 +75,7 @@ struct SubscriberSlot {
     is_connected: bool,
     /// Whether the subscriber sleeps on the event of the sensor.
     is_listener: bool,
-    /// Whether the subscriber's process was killed. The next hub removes it.
+    /// Whether the subscriber's process was killed. The next hub removes a killed subscriber.
     was_killed: bool,
 }
 
@@ -119,13 +119,13 @@ impl TopicBoard {
         self.attached[sensor]
     }
 
-    /// Returns whether the event of `sensor` has a listener. A killed one counts until the next hub cleans up.
+    /// Returns whether the event of `sensor` has a listener. A killed listener counts until the next hub removes it.
     pub(crate) fn has_listeners(&self, sensor: usize) -> bool {
         self.sensors[sensor].iter().flat_map(|channel| &channel.slots).any(|place| place.is_listener)
     }
 
-    /// Attaches `subscriber`, which sleeps on the event of the sensor if it `is_listener`. Returns whether there was a
-    /// free slot.
+    /// Attaches `subscriber`. It sleeps on the event of the sensor if `is_listener`. Returns whether there was a free
+    /// slot.
     pub(crate) fn attach(
         &mut self,
         sensor: usize,
@@ -336,5 +336,5 @@ impl<P: Payload + ?Sized> SimTransport<P> {
     }
 }
 
-/// First byte of unknown zones.
+/// Value of the first byte of unknown zones.
 const UNKNOWN: u8 = Verdict::Unknown as u8;

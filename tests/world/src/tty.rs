@@ -1,5 +1,5 @@
-//! A serial port with the properties of a Linux tty: a buffer, a baud rate, and one owner. It can be unplugged, and
-//! returns as another device. It logs everything that happens to bytes.
+//! A serial port with the properties of a Linux tty: a buffer, a baud rate, and one owner. The port can be unplugged,
+//! and returns as another device. It logs everything that happens to bytes.
 
 use std::collections::VecDeque;
 
@@ -13,23 +13,23 @@ use crate::event::{Event, Telegram};
 use crate::sensor::{Sensor, SensorEvent};
 use crate::shared::EventLog;
 
-/// A port with the sensor at its line.
+/// A port together with the sensor at its line.
 pub(crate) struct Tty {
     number: usize,
     pub(crate) sensor: Sensor,
     /// ID of the device that is plugged in, if any.
     device: Option<u64>,
-    /// Number of devices so far.
+    /// Number of devices that have been plugged in so far.
     devices: u64,
     /// Whether the device has another name than the configured one.
     has_other_name: bool,
     /// Rates that the port does not support.
     unsupported_rates: Vec<u32>,
-    /// Error of opening the port, although it exists.
+    /// Error that opening the port returns although the port exists.
     pub(crate) open_error: Option<PortError>,
     is_open: bool,
     rate: u32,
-    /// Rate that the hub has set. It differs from `rate` if another process has changed that.
+    /// Rate that the hub has set. It differs from `rate` if another process has changed the port's rate.
     hub_rate: u32,
     baud_mismatch: BaudMismatch,
     buffer: VecDeque<u8>,
@@ -41,17 +41,17 @@ pub(crate) struct Tty {
 
 /// Telegram that is on the line.
 struct PartialTelegram {
-    /// Position of its first byte, and time at which that entered the buffer.
+    /// Position of the telegram's first byte; and time at which that byte entered the buffer.
     first: u64,
     first_at: Nanos,
-    /// Reason why it is damaged.
+    /// Reason why the telegram is damaged, or `None`.
     damage: Option<&'static str>,
 }
 
-/// Number of bytes that a tty buffers, like a pty of Linux. Further bytes are lost.
+/// Maximum number of bytes that a tty buffers, as in a pty of Linux. Further bytes are lost.
 const BUFFER_LEN: usize = 17_024;
-/// Number of these bytes in the line discipline, which the tty reports and returns at once. The others are in the
-/// driver's buffers.
+/// Maximum number of buffered bytes in the line discipline. The tty reports and returns only these bytes at once. The
+/// other bytes are in the driver's buffers.
 const LINE_DISCIPLINE_LEN: usize = 4_095;
 
 impl Tty {
@@ -159,7 +159,7 @@ impl Tty {
         Ok(device)
     }
 
-    /// Takes over the open port for another hub, at `rate`. Returns false if the device is not the same any more.
+    /// Takes over the open port for another hub, at `rate`. Returns false if `device` is no longer plugged in.
     pub(crate) fn adopt(&mut self, device: u64, rate: u32, log: &EventLog, now: Nanos) -> bool {
         self.advance(now, log);
         if !self.is_plugged_in(device) || self.has_other_name || !self.supports_rate(rate) {
@@ -185,12 +185,12 @@ impl Tty {
         self.device == Some(device)
     }
 
-    /// Returns the number of bytes to read that a driver reports: those in the line discipline.
+    /// Returns the number of readable bytes that a driver reports. These are the bytes in the line discipline.
     pub(crate) fn waiting(&self) -> usize {
         self.buffer.len().min(LINE_DISCIPLINE_LEN)
     }
 
-    /// Reads buffered bytes into `into`, at most those in the line discipline. Returns their number.
+    /// Reads buffered bytes into `into`, at most those in the line discipline. Returns the number of bytes.
     pub(crate) fn read(&mut self, into: &mut [u8], log: &EventLog, now: Nanos) -> usize {
         let len = into.len().min(self.waiting());
         for (place, byte) in into.iter_mut().zip(self.buffer.drain(..len)) {

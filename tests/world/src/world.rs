@@ -29,7 +29,7 @@ pub struct Outcome {
     pub violations: Vec<Violation>,
     /// Hash of all events.
     pub hash: u64,
-    /// Virtual seconds times sensors.
+    /// Virtual seconds, multiplied by the number of sensors.
     pub sensor_seconds: u64,
     /// Number of samples that hubs published.
     pub samples: u64,
@@ -37,13 +37,13 @@ pub struct Outcome {
     pub figures: RevolutionFigures,
 }
 
-/// Runs `scenario`, and prints its events to standard error as `detail` says.
+/// Runs `scenario`. Prints its events to standard error as `detail` specifies.
 pub fn run(scenario: &Scenario, detail: Detail) -> Outcome {
     World::new(scenario, detail, None, &[]).run_to_end()
 }
 
 /// Returns whether one of `invariants` finds a violation while `scenario` runs with `defect` around the hub. The world
-/// ends with the first violation.
+/// ends at the first violation.
 pub fn is_found(scenario: &Scenario, defect: Option<Defect>, invariants: &'static [&'static str]) -> bool {
     let outcome = World::new(scenario, Detail::Nothing, defect, invariants).run_to_end();
     outcome.violations.iter().any(|violation| invariants.contains(&violation.invariant))
@@ -52,7 +52,7 @@ pub fn is_found(scenario: &Scenario, defect: Option<Defect>, invariants: &'stati
 /// A task that runs at its time, or when all faults are cleared.
 type ScheduledTask = Box<dyn FnOnce(&mut World)>;
 
-/// Requests of actions to the hub.
+/// Requests from actions to the hub.
 #[derive(Default)]
 pub(crate) struct HubRequests {
     /// Request to end.
@@ -63,7 +63,7 @@ pub(crate) struct HubRequests {
     pub(crate) sensor_requests: Vec<(usize, Verb)>,
 }
 
-/// The kind of a hub's end, and the time at which the next one starts.
+/// The way in which a hub ends, and the time at which the next hub starts.
 #[derive(Clone, Copy)]
 pub(crate) struct HubEnding {
     pub(crate) is_killed: bool,
@@ -84,7 +84,7 @@ pub(crate) struct World {
     pub(crate) hub_requests: HubRequests,
     /// Edition of the configuration that the hub reads next.
     pub(crate) edition: Rc<Cell<u64>>,
-    /// Number of the current or next run of the hub, and time at which it starts or has started.
+    /// Number of the current or next run of the hub; and time at which that run starts or has started.
     pub(crate) run: u64,
     pub(crate) hub_starts_at: Nanos,
     /// Time until which the hub's process is stalled.
@@ -170,7 +170,7 @@ impl World {
         self.now() >= self.end || self.shared.log.is_found()
     }
 
-    /// Returns the time for which faults may still occur.
+    /// Returns the remaining time in which faults may occur.
     pub(crate) fn time_until_faults_clear(&self) -> Nanos {
         self.faults_clear_at.saturating_sub(self.now())
     }
@@ -221,7 +221,7 @@ impl World {
         }
     }
 
-    /// Applies the attachments and departures of subscribers that happened while samples were sent.
+    /// Applies the changes of subscribers that happened while samples were sent.
     fn apply_subscriber_changes(&mut self) {
         let shared = self.shared.clone();
         let leavers = shared.detached.take();
@@ -241,7 +241,7 @@ impl World {
         }
     }
 
-    /// Makes all subscribers poll. Each of them searches for a hub at fixed intervals, and finds the one that has
+    /// Makes all subscribers poll. Each subscriber searches for a hub at fixed intervals, and finds the hub that has
     /// started.
     pub(crate) fn poll_all_subscribers(&mut self) {
         let at = self.now() + HUB_POLL_INTERVAL;
@@ -271,7 +271,7 @@ impl World {
         Some(number)
     }
 
-    /// Removes a subscriber, which leaves or is killed.
+    /// Removes a subscriber. The subscriber leaves, or is killed if `is_killed`.
     pub(crate) fn detach(&mut self, id: SubscriberId, is_killed: bool) {
         if let Some(at) = self.subscribers.iter().position(|subscriber| subscriber.id == id) {
             self.subscribers.remove(at).detach(&self.shared, is_killed, false);
@@ -359,9 +359,9 @@ impl World {
     }
 }
 
-/// Wall clock at the start of a world, a day in 2026.
+/// Wall clock at the start of a world, in nanoseconds since 1970. It is a day in 2026.
 const WALL_NS: u64 = 1_780_000_000_000_000_000;
-/// More than the number of samples of one scan. A subscriber leaves after fewer.
+/// Exclusive limit for the number of samples after which a subscriber leaves. A scan has fewer samples.
 const MAX_SENDS: u64 = 12;
 /// Interval at which a subscriber without a hub searches for one.
 const HUB_POLL_INTERVAL: Nanos = 50 * MILLIS;

@@ -1,4 +1,4 @@
-//! Tests of the invariants: each injected defect is found within 200 seeds, by the invariant that checks for it.
+//! Tests of the invariants: within 200 seeds, each injected defect is found by the invariant that checks for it.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -58,8 +58,8 @@ const ROTATING_DEFECTS: [(Defect, &str); 12] = [
     (Defect::UnsentWarning, "ld19"),
 ];
 
-/// First seed that finds a defect, if it is not 0. The test starts with this seed, and tries all others only if it no
-/// longer finds the defect.
+/// First seed that finds a defect, for each defect whose first seed is not 0. The test starts with this seed. It tries
+/// all other seeds only if this seed no longer finds the defect.
 const SEEDS: [(Defect, &str, u64); 17] = [
     (Defect::MergedRevolution, "", 1),
     (Defect::ExtraBeam, "", 1),
@@ -80,7 +80,8 @@ const SEEDS: [(Defect, &str, u64); 17] = [
     (Defect::IgnoredRequests, "a1::streaming", 3),
 ];
 
-/// Returns a seed that finds `defect` in worlds with `model` alone, or in all worlds if it is empty.
+/// Returns a seed that finds `defect` in worlds whose only scanner is `model`. If `model` is empty, searches all
+/// worlds.
 fn found_by(defect: Defect, model: &str) -> Option<u64> {
     let finds = |seed: &u64| {
         let model = Some(model.to_owned()).filter(|model| !model.is_empty());
@@ -111,7 +112,7 @@ fn every_injected_defect_is_found() {
     assert_eq!(missed.into_inner().expect("whole"), []);
 }
 
-/// Kinds of actions between the machines, each with a defect that they reveal without other actions.
+/// Kinds of actions between the machines. Each one has a defect that it reveals without other actions.
 const NETWORK_DEFECTS: [(&str, Defect); 3] = [
     ("partition", Defect::RemoteSurvivingVerdict),
     ("router_killed", Defect::RouterNotReconnected),

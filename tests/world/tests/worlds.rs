@@ -1,4 +1,4 @@
-//! Tests that bugs that worlds have found stay fixed, and that a world depends only on its scenario.
+//! Tests that the bugs found by worlds stay fixed, and that a world depends only on its scenario.
 
 use std::sync::atomic::AtomicBool;
 use std::thread;
@@ -23,20 +23,20 @@ fn the_same_seed_has_the_same_hash() {
     assert_eq!(different.len(), scenarios.len());
 }
 
-/// Debug and release builds have the same hash, on every machine.
+/// The hash is the same in debug and release builds and on every machine.
 #[test]
 fn the_hash_of_a_world_is_known() {
     let scenario: Scenario = "seed 5 seconds 15\n1000 kill_hub away_ms=500\n".parse().unwrap();
     assert_eq!(run(&scenario, Detail::Nothing).hash, 0xad26_3a4b_b7f0_1116);
 }
 
-/// These are the first of the seeds that `.ci/run` runs.
+/// Runs the first seeds of those that `.ci/run` runs.
 #[test]
 fn worlds_are_well() {
     assert_no_violation((0..20).map(|seed| Scenario::from_seed(seed, 60)).collect());
 }
 
-/// These are the first of the seeds that `.ci/run` runs. The hub searches for scanners in these worlds.
+/// Runs the first seeds of those that `.ci/run` runs. The hub searches for scanners in these worlds.
 #[test]
 fn worlds_with_links_without_a_family_are_well() {
     assert_no_violation((0..10).map(|seed| Scenario::auto_from_seed(seed, 60)).collect());

@@ -1,5 +1,5 @@
-//! Invariants of a world. Each one checks every event for one property, and reports its violations. It depends neither
-//! on the other invariants nor on the scenario's actions.
+//! Invariants of a world. Each one checks one property at every event, and reports its violations. An invariant does
+//! not depend on other invariants or on the scenario's actions.
 
 mod counters;
 mod early;
@@ -35,7 +35,7 @@ pub(crate) trait Invariant {
     }
 }
 
-/// Collects the violations of one invariant at one time.
+/// Collects the violations of one invariant at one event.
 pub(crate) struct ViolationReporter<'a> {
     pub(crate) invariant: &'static str,
     pub(crate) at_ns: Nanos,
@@ -45,7 +45,7 @@ pub(crate) struct ViolationReporter<'a> {
 impl ViolationReporter<'_> {
     /// Adds a violation.
     pub(crate) fn report(&mut self, message: String) {
-        // A violation often repeats with every sample.
+        // The same violation often repeats with every sample.
         if self.violations.len() < MAX_VIOLATIONS {
             self.violations.push(Violation { invariant: self.invariant, at_ns: self.at_ns, message });
         }

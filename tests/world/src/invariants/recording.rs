@@ -1,6 +1,6 @@
 //! Invariant on recordings: a recording contains each telegram of each sensor with its header, in order, and the number
-//! of missing ones. The real writer writes the recording into memory, and the real reader reads it. It takes as long as
-//! everything else, so only one world in four is recorded.
+//! of missing telegrams. The real writer writes the recording into memory, and the real reader reads it. A recorded
+//! world takes about twice as long, so only one world in four is recorded.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -124,5 +124,5 @@ impl Invariant for Recording {
 
 /// Interval of seeds at which worlds are recorded.
 const RECORDING_INTERVAL: u64 = 4;
-/// Encoding, which only logs need that are not recordings of a hub.
+/// Encoding of the telegrams. Only logs that are not recordings of a hub need it.
 const ENCODING: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };

@@ -1,9 +1,9 @@
-//! Invariant on revolutions: a scan of a rotating scanner contains the points of one revolution, no others, and all of
-//! them unless it is marked. Each point of the scan was measured at its angle, with its range, at the time that the
-//! scan states. All scans in a run of a topic have the same number of beams.
+//! Invariant on revolutions: a scan of a rotating scanner contains only points of one revolution. It contains all of
+//! them unless the hub marks it as incomplete. Each point of the scan was measured at its angle, with its range, at the
+//! time that the scan states. While the port stays open, the number of beams changes at most every ten seconds.
 //!
-//! A stamp can be right only after the hub has received a packet without delay. Before that, a delayed line cannot be
-//! distinguished from a delayed scanner.
+//! A stamp can be right only after the hub has received a packet without delay. Before that, the hub cannot distinguish
+//! a delayed line from a delayed scanner.
 
 use std::cell::Cell;
 use std::collections::hash_map::Entry;
@@ -32,30 +32,32 @@ struct SensorPoints {
     family: Rc<dyn Family>,
     /// Recently measured points, in order of time.
     points: VecDeque<Point>,
-    /// Hashes of recently sent packets: their counts, and their order.
+    /// Number of times that each recent packet was sent, by the packet's hash; and these hashes in the order of
+    /// sending.
     sent: HashMap<u64, u32>,
     sent_order: VecDeque<u64>,
-    /// Number of packets that were removed from the start of `sent_order`, and number of packets before the next one to
-    /// be published.
+    /// Number of packets that were removed from the start of `sent_order`; and number of packets before the next one
+    /// that the hub will publish.
     dropped: usize,
     matched: usize,
     /// Accuracy of the packets that were published last.
     exactness: PointAccuracy,
-    /// Time at which a unit of unknown origin was last published: it was not sent, or an earlier one could not be
-    /// published for lack of memory. The second field is the sequence number of the last telegram that was sent.
+    /// Time at which the last unit of unknown origin was published. No scanner sent this unit, or the hub could not
+    /// publish an earlier unit for lack of memory. The second field is the sequence number of the last telegram that a
+    /// scanner sent.
     foreign_at: Option<Nanos>,
     last_known: Option<u64>,
-    /// Run of the hub, number of beams, and time of the first scan with this number since the port was opened.
+    /// Run of the hub, number of beams, and time of the first scan with this number of beams since the port was opened.
     beams: Option<(u64, usize, Nanos)>,
-    /// Position after the last packet that arrived without delay, and the time of its arrival.
+    /// Position after the last packet that arrived without delay, and time at which that packet arrived.
     prompt: Option<(u64, Nanos)>,
-    /// Number of packets that were read without delay since the session began, time at which the session had enough of
-    /// them, and time of the last one.
+    /// Number of packets that were read without delay since the session began; time at which this number was large
+    /// enough; and time of the last of these packets.
     prompts: u32,
     settled_at: Option<Nanos>,
     last_prompt_at: Option<Nanos>,
-    /// Position after the last sent packet, and time of the last bytes that took no time on the line. Packets that are
-    /// read together with such bytes seem to arrive early.
+    /// Position after the last sent packet; and time of the last bytes that took no time on the line. A packet that is
+    /// read together with such bytes seems to arrive early.
     end: u64,
     queued_at: Option<Nanos>,
     /// Time at which an intact packet was last on the line.
@@ -165,7 +167,7 @@ impl SensorPoints {
         for &truth in points {
             let rotated_deg = match self.points.back() {
                 Some(last) => {
-                    // After a power cycle a new revolution starts, whatever the angle. Points may be out of order.
+                    // After a power cycle, a new revolution starts at any angle. Points may be out of order.
                     let is_new = truth.at_ns > last.truth.at_ns + MIN_POWER_OFF;
                     let step_deg = (truth.clockwise_deg - last.truth.clockwise_deg).rem_euclid(360.0);
                     let is_back = step_deg > 360.0 - MAX_REORDER_DEG && !is_new;
@@ -185,7 +187,7 @@ impl SensorPoints {
         }
     }
 
-    /// Returns the time at which the last point of a packet was measured that arrived completely at `at`.
+    /// Returns the time at which the last point of `packet` was measured. The packet arrived completely at `at`.
     fn last_point_time(&self, at: Nanos, packet: &FirstPoint, exactness: PointAccuracy) -> Option<Nanos> {
         let (of, maximum) = (self.points.len(), at.saturating_sub(MAX_PACKET_TIME + packet.line_time));
         let lately = (0..of).rev().skip(packet.points - 1);
@@ -281,14 +283,14 @@ impl SensorPoints {
         };
         let is_crowded = self.queued_at.is_some_and(|crowded_at| at < crowded_at + DELAY_WINDOW);
         let settles = if self.exactness.has_clock { SETTLE_TIME } else { CLOCK_LEARNING_TIME };
-        // A stalled hub does not improve its estimate of the clock.
+        // While the hub is stalled, its estimate of the scanner's clock does not improve.
         let learned_at = if self.exactness.has_clock { Some(at) } else { self.last_prompt_at };
         let is_learned =
             |settled_at: Nanos| learned_at.is_some_and(|learned_at| settled_at + settles < learned_at);
         let is_settled = self.settled_at.is_some_and(is_learned) && !is_crowded;
         let (mut points, mut shift) = (found(0), 0);
-        // For backlogged packets without a timestamp, the number of revolutions that are missing in a gap is determined
-        // later.
+        // If packets have no timestamp and are backlogged, the hub determines the number of missing revolutions in a
+        // gap later.
         let is_open = was_backlogged && scan.is_incomplete() && !self.exactness.has_clock;
         if let Some(gap) = points.iter().position(Option::is_none).filter(|gap| is_open && *gap > 0)
             && self.is_from_later_revolution(
@@ -367,8 +369,8 @@ impl SensorPoints {
             return;
         }
         if telegram.damage.is_none() {
-            // The line lost all packets in this time. If packets have no timestamp, the next ones have no known time
-            // yet.
+            // The line lost all packets in this time. Without a timestamp in packets, the time of the next packets is
+            // not known yet.
             if !self.exactness.has_clock && self.arrived_at + MAX_GAP < at {
                 self.restart();
             }
@@ -401,8 +403,8 @@ impl SensorPoints {
         }
     }
 
-    /// Returns whether the published `unit` was sent. Standard packets are so short that fragments of two often equal a
-    /// packet that was sent before. They must therefore be in order, too.
+    /// Returns whether a scanner sent the published `unit`. Standard packets are very short, so parts of two packets
+    /// often equal a packet that was sent before. Standard packets must therefore also be in order.
     fn was_sent(&mut self, unit: &[u8]) -> bool {
         let key = HistoryHash::hash_bytes(unit);
         if self.exactness.neighbors == 0 {
@@ -426,8 +428,8 @@ impl SensorPoints {
         near.into_iter().find(|point| point.matches(reported, &self.exactness))
     }
 
-    /// Returns whether all `reported` points were measured one or several revolutions later than reported, all by the
-    /// same time.
+    /// Returns whether all `reported` points were measured later than reported, all by the same time, which is one or
+    /// several revolutions.
     fn is_from_later_revolution(
         &self,
         reported: &[ReportedPoint],
@@ -452,8 +454,8 @@ impl SensorPoints {
         reported.iter().filter(is_wrong).count() as u64
     }
 
-    /// Returns the time by which most points were measured later than reported. Points repeat nearly from revolution to
-    /// revolution, so the revolution that fits best counts.
+    /// Returns the time difference between report and measurement for most points. Points are nearly the same in each
+    /// revolution, so the revolution that matches the most points counts.
     fn best_shift(&self, reported: &[ReportedPoint]) -> i64 {
         let Some(first) = reported.iter().find(|reported| reported.range_mm.is_some()) else { return 0 };
         let fit = |reported: &mut dyn Iterator<Item = &ReportedPoint>, shift: i64| {
@@ -471,44 +473,44 @@ impl SensorPoints {
     }
 }
 
-/// Maximum angle by which a point may lie before one that was measured earlier.
+/// Maximum angle by which a point may lie before a point that was measured earlier, in degrees.
 const MAX_REORDER_DEG: f64 = 40.0;
 /// Minimum time with the same number of beams while the port stays open.
 const MIN_BEAM_COUNT_TIME: Nanos = 10_000 * MILLIS;
 /// Maximum time between the first and the last point of a packet.
 const MAX_PACKET_TIME: Nanos = 60 * MILLIS;
-/// Maximum error of a stamp. While the speed of the head changes, a later point may be off by another tenth of the time
-/// since the stamp.
+/// Maximum error of a stamp. While the speed of the head changes, the time of a later point may have an additional
+/// error of a tenth of the time since the stamp.
 const MAX_STAMP_ERROR: Nanos = 5 * MILLIS;
 /// Maximum time that a packet spends on the line and in the port if it is not delayed.
 const MAX_PROMPT_DELAY: Nanos = 15 * MILLIS;
 /// Number of packets without delay after which the session has estimated the clock.
 const MIN_PROMPT_PACKETS: u32 = 10;
-/// Time after that from which on stamps must be right.
+/// Time from the last of these packets until stamps must be right.
 const SETTLE_TIME: Nanos = 10 * MILLIS;
-/// For packets without a timestamp, the time that the session needs to estimate the scanner's clock, and the time
-/// without a packet after which a different scanner may be connected.
+/// For packets without a timestamp: time that the session needs to estimate the scanner's clock; and time without a
+/// packet after which a different scanner may be connected.
 const CLOCK_LEARNING_TIME: Nanos = 1_500 * MILLIS;
 const MAX_GAP: Nanos = 300 * MILLIS;
-/// Time over which the session takes the smallest delay.
+/// Time window in which the session determines the smallest delay.
 const DELAY_WINDOW: Nanos = 9_000 * MILLIS;
-/// Time after a foreign packet in which revolutions may contain its points.
+/// Maximum time after a foreign packet in which revolutions may contain points of that packet.
 const FOREIGN_POINTS_TIME: Nanos = 2_000 * MILLIS;
-/// Time in which a hub has read its backlog after a stall.
+/// Maximum time that a hub needs to read its backlog after a stall.
 const CATCH_UP_TIME: Nanos = 10 * MILLIS;
 /// Minimum duration of a power cycle.
 const MIN_POWER_OFF: Nanos = 50 * MILLIS;
-/// Time for which measured points are stored, and number of stored packets.
+/// Time for which measured points are stored; and maximum number of stored packets.
 const HISTORY_TIME: Nanos = 12_000 * MILLIS;
 const MAX_SENT: usize = 65_536;
-/// Maximum time between a point and a measurement that confirms it.
+/// Maximum time between a reported point and a matching measurement.
 const POINT_MATCH_NS: Nanos = 15 * MILLIS;
 
 /// A measured point.
 #[derive(Clone, Copy, PartialEq)]
 struct Point {
     truth: TruePoint,
-    /// Angle since the first point in degrees, including whole revolutions.
+    /// Angle since the first point of all, in degrees. It includes whole revolutions.
     rotated_deg: f64,
 }
 
@@ -532,7 +534,7 @@ fn reported_points(stamp: Nanos, scan: &Scan) -> Vec<ReportedPoint> {
 }
 
 impl Point {
-    /// Returns whether this is the reported point. A scanner may get no return from an object.
+    /// Returns whether `reported` is this point. A scanner may get no return from an object.
     fn matches(&self, reported: &ReportedPoint, exactness: &PointAccuracy) -> bool {
         let (is_there, most_deg) = match (reported.range_mm, self.truth.range_mm) {
             (Some(reported), Some(exact)) => {

@@ -9,19 +9,19 @@ use crate::event::{Event, Telegram};
 use crate::family::{Family, is_ld_packet};
 use crate::topics::Sample;
 
-/// Invariant: a sample has the family of its scanner. At a link without a family, samples have none until the scanner
-/// is found: the link publishes no telegram and no scan, and a status only while the hub searches or has no port. The
-/// hub sends no byte to an LDROBOT that streams undisturbed.
+/// Invariant: a sample has the family of its scanner. If a link has no family, its samples have no family until the
+/// scanner is found. Until then, the link publishes no telegram and no scan, and publishes a status only while the hub
+/// searches or has no port. The hub sends no byte to an LDROBOT that streams undisturbed.
 pub(crate) struct Families(Vec<FamilyProgress>);
 
 struct FamilyProgress {
-    /// The family, or both families of a scanner that is exchanged for a scanner of another family.
+    /// The family of the scanner. Both families if an exchange replaces the scanner with one of another family.
     families: Vec<FamilyName>,
     is_auto: bool,
     opened_at: Nanos,
-    /// Time from which a scanner that was exchanged for one of another family must be found like any other.
+    /// Time from which the hub must find a scanner of another family like any other scanner.
     search_from: Nanos,
-    /// Time since which packets have been arriving without damage and without gaps, and time of the last one.
+    /// Time since which packets have arrived without damage and without gaps; and time of the last packet.
     clean_since: Option<Nanos>,
     last_at: Nanos,
     /// Position after the last packet.
@@ -73,8 +73,8 @@ impl Invariant for Families {
 }
 
 impl FamilyProgress {
-    /// Returns whether an LDROBOT has been streaming since the port was opened, or for longer than a search needs to
-    /// notice.
+    /// Returns whether an LDROBOT has streamed since the port was opened, or for longer than the search takes to detect
+    /// the stream.
     fn is_undisturbed(&self, at: Nanos) -> bool {
         // The hub may have saved the other family, whose rates it then tries first.
         let is_known = self.families == [FamilyName::Ld];
@@ -86,7 +86,7 @@ impl FamilyProgress {
 
     fn send(&mut self, at: Nanos, telegram: &Telegram<'_>) {
         let begin = std::mem::replace(&mut self.sent_end, telegram.span.1);
-        // The scanner and the line are intact: the port is at another rate, or the hub does not read.
+        // The scanner and the line work: the port has another rate, or the hub does not read.
         let is_harmless = |damage: &str| matches!(damage, "baud" | "unread" | "flushed");
         let is_clean = is_ld_packet(telegram.bytes)
             && telegram.damage.is_none_or(is_harmless)
@@ -128,13 +128,13 @@ impl FamilyProgress {
 
 /// Maximum time between two packets of a scanner that streams.
 const MAX_PACKET_GAP: Nanos = 50 * MILLIS;
-/// Duration of a round of the search, after which it notices that a scanner has begun to stream.
+/// Maximum time of a round of the search. After a round, the search detects that a scanner has begun to stream.
 const SEARCH_ROUND: Nanos = 4_000 * MILLIS;
 /// Time without data from the scanner after which the search starts again.
 const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
 
-/// Invariant: a port that another process sets to another rate soon has the hub's rate again. The hub does not read
-/// bytes at the wrong rate for a whole second.
+/// Invariant: if another process sets a port to another rate, the hub soon restores its own rate. The hub reads bytes
+/// at the wrong rate for less than a second.
 pub(crate) struct PortRate {
     sensors: Vec<PortState>,
 }
@@ -144,7 +144,7 @@ struct PortState {
     is_altered: bool,
     /// Time of the first read since the alteration, or since the last telegram.
     misread_since: Option<Nanos>,
-    /// Whether the last read was too long after that.
+    /// Whether the last read happened too long after `misread_since`.
     is_overdue: bool,
 }
 
@@ -179,7 +179,7 @@ impl Invariant for PortRate {
                     reporter.report(format!("sensor {sensor}: the port keeps the rate of another process"));
                     of.is_altered = false;
                 }
-                // The hub sets the rate after the read, not before it.
+                // The hub sets the rate after a read, not before it.
                 of.is_overdue = at > *of.misread_since.get_or_insert(at) + MAX_MISREAD_TIME;
             }
             _ => {}
@@ -187,10 +187,10 @@ impl Invariant for PortRate {
     }
 }
 
-/// Time for which bytes may arrive at the wrong rate.
+/// Maximum time for which the hub may read bytes at the wrong rate.
 const MAX_MISREAD_TIME: Nanos = 1_000 * MILLIS;
 
-/// Invariant: no request of the hub writes the EEPROM of a scanner. It is checked at the end of the world.
+/// Invariant: no request of the hub writes the EEPROM of a scanner. The invariant is checked at the end of the world.
 pub(crate) struct Eeprom;
 
 impl Invariant for Eeprom {

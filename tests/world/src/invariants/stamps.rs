@@ -11,25 +11,25 @@ use crate::family::Family;
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// Invariant: the stamps of a scan's telegram are right, or the hub marks them as estimates. Without the mark, they are
-/// the times at which the first and last bytes of the telegram arrived at the port, even if the hub was stalled. While
-/// nothing is wrong, no stamp of a streaming scanner is an estimate. It applies to families whose samples are single
-/// telegrams; the invariant `turns` checks the others.
+/// Invariant: the stamps of a scan's telegram are right, or the hub marks them as estimates. Without the mark, the
+/// stamps are the times at which the first and last bytes of the telegram arrived at the port, even if the hub was
+/// stalled. While nothing is wrong, no stamp of a streaming scanner is an estimate. This invariant applies to families
+/// in which each sample is one telegram; the invariant `turns` checks the others.
 pub(crate) struct Stamps {
     families: Vec<Rc<dyn Family>>,
     sensors: BTreeMap<usize, SensorStamps>,
     faults_cleared_at: Option<Nanos>,
-    /// Until this time, bytes may arrive that took no time on the line. Telegrams that are read with them look earlier
-    /// than they were.
+    /// Time until which bytes may arrive that took no time on the line. A telegram that is read together with such
+    /// bytes seems to arrive too early.
     crowded_until: Nanos,
 }
 
 #[derive(Default)]
 struct SensorStamps {
     sent: VecDeque<SentTelegram>,
-    /// Place after the last byte that the hub has read.
+    /// Position after the last byte that the hub has read.
     read_end: u64,
-    /// Scans that were published since the line was opened or retuned, and since the last reply.
+    /// Number of published scans since the line was opened, since its rate changed, and since the last reply.
     consecutive_scans: usize,
 }
 
@@ -105,18 +105,19 @@ impl SensorStamps {
         }
     }
 
-    /// Returns the error of the stamps of a scan's telegram that is published. Nothing is wrong if `is_faultless`.
+    /// Returns a description of the error in the stamps of a scan's telegram. If `is_faultless`, nothing is wrong in
+    /// the world.
     fn publish(&mut self, header: &Header, bytes: &[u8], is_faultless: bool) -> Option<String> {
         if header.flags & Flags::STAMP_ESTIMATED != 0 {
             let is_new = self.consecutive_scans <= LEARNING_SCANS;
             return (is_faultless && !is_new)
                 .then(|| "a stamp is an estimate although nothing went wrong".to_owned());
         }
-        // The telegram is marked as suspect: it follows damaged bytes, or took longer than usual.
+        // The hub marks the telegram as suspect, because the telegram follows damaged bytes or took longer than usual.
         if header.reasons != 0 {
             return None;
         }
-        // Scans of a simulated scene repeat, so every telegram that has been read is compared.
+        // Scans of a simulated scene repeat, so the telegram is compared with every telegram that has been read.
         let is_it = |sent: &&SentTelegram| sent.end <= self.read_end && sent.bytes == bytes;
         let is_right = |sent: &SentTelegram| {
             let maximum = MAX_STAMP_ERROR + line_time(USB_CHUNK_LEN, sent.rate);
@@ -134,28 +135,28 @@ impl SensorStamps {
     }
 }
 
-/// Maximum error of a stamp that is not marked, in addition to the time of the bytes that a port passes on at once.
+/// Maximum error of a stamp without a mark. The time on the line of the bytes that a port passes on at once is added.
 const MAX_STAMP_ERROR: Nanos = 5 * MILLIS;
-/// Time by which a telegram may take longer than usual before it is marked as suspect.
+/// Maximum time by which a telegram may take longer than usual before the hub marks it as suspect.
 const MAX_DELAY: Nanos = 8 * MILLIS;
-/// Bytes that a USB adapter passes on at once, and after which a stamp is an estimate.
+/// Number of bytes that a USB adapter passes on at once. A longer chunk makes a stamp an estimate.
 const USB_CHUNK_LEN: usize = 64;
-/// Time after the last fault from which on no effect of a fault is expected.
+/// Time after the last fault until no fault has an effect any more.
 const RECOVERY_TIME: Nanos = 3_000 * MILLIS;
-/// Number of scans in a stream after which the session has estimated the scan period.
+/// Number of consecutive scans after which the session has estimated the scan period.
 const LEARNING_SCANS: usize = 8;
-/// Number of stored telegrams: more than a port buffers.
+/// Maximum number of stored telegrams. A port buffers fewer.
 const MAX_TELEGRAMS: usize = 256;
 
-/// Invariant: the hub wakes a sleeping subscriber. A prompt subscriber has each sample of a telegram shortly after the
-/// telegram was sent, and a subscriber to zones need not wait for the marks of the same scan.
+/// Invariant: the hub wakes a sleeping subscriber. A prompt subscriber receives each sample of a telegram shortly after
+/// the hub has sent it. A subscriber to zones need not wait for the marks of the same scan.
 #[derive(Default)]
 pub(crate) struct Wakeups {
     /// Times at which prompt subscribers attached.
     attached_at: BTreeMap<SubscriberId, Nanos>,
     /// Topics of the subscribers.
     topics: BTreeMap<SubscriberId, (usize, Topic)>,
-    /// For each sensor, the number of the telegram whose samples have subscribers that are not woken yet.
+    /// For each sensor, the `seq` of the telegram whose samples have subscribers that are not woken yet.
     unwoken: BTreeMap<usize, u64>,
 }
 

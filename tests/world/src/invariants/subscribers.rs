@@ -1,5 +1,5 @@
-//! Invariant on subscribers that attach and leave at any time: each one gets the next sample, and none is woken late or
-//! needlessly.
+//! Invariant on subscribers that attach and leave at any time: each subscriber receives the next sample, and no
+//! subscriber is woken late or without need.
 
 use std::collections::BTreeMap;
 
@@ -10,10 +10,10 @@ use crate::event::Event;
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// Invariant: a subscriber gets the samples of every scan that begins after it has attached (`docs/topics.md`). Each
-/// sample belongs to a word of the doorbell. The hub rings a word once all its samples are sent, before the samples of
-/// the next word and the next telegram, and only if one of them has a subscriber. The event follows if one of its
-/// listeners has a sample.
+/// Invariant: a subscriber receives the samples of every scan that begins after the subscriber has attached
+/// (`docs/topics.md`). Each sample belongs to a word of the doorbell. The hub rings a word after it has sent all
+/// samples of the word, and before it sends samples of the next word or the next telegram. It rings a word only if a
+/// sample of the word has a subscriber. It then sends the event if one of the event's listeners has a sample.
 pub(crate) struct Subscribers {
     sensors: Vec<SensorSubscribers>,
     sensor_of_subscriber: BTreeMap<SubscriberId, usize>,
@@ -27,20 +27,20 @@ struct SensorSubscribers {
     scan: Option<u64>,
     /// For each topic, the `seq` of its last sample.
     published: BTreeMap<Topic, u64>,
-    /// Topics that had no memory since the last scan.
+    /// Topics for whose samples there was no memory since the last scan.
     without_memory: Vec<Topic>,
-    /// For each word of the doorbell, whether a sample has subscribers that were not woken since, and the `seq` of the
-    /// first telegram for which the hub must ring before the next telegram.
+    /// For each word of the doorbell, whether a sample has subscribers that were not woken after it; and the `seq` of
+    /// the first telegram after whose samples the hub must ring.
     is_due: [bool; RING_COUNT],
     due: [Option<u64>; RING_COUNT],
-    /// The `seq` of the telegram whose samples have listeners that were not notified.
+    /// The `seq` of the telegram whose samples have listeners that the hub has not notified.
     unnotified: Option<u64>,
 }
 
 struct AttachedSubscriber {
     topic: Topic,
     is_listener: bool,
-    /// The `seq` of the last telegram before the subscriber attached.
+    /// The `seq` of the last telegram before the subscriber attached, or `None` if there was none.
     after: Option<u64>,
 }
 
@@ -108,7 +108,7 @@ impl SensorSubscribers {
     fn publish(&mut self, sample: &Sample) -> Vec<String> {
         let mut broken = Vec::new();
         let (topic, seq) = (sample.topic, sample.header.seq);
-        // A warning has the `seq` of a telegram that is not complete yet.
+        // An early warning has the `seq` of a telegram that is not complete yet.
         let is_next = topic == Topic::Early || self.last < Some(seq);
         if self.due[DoorbellWord::Early as usize].is_some() && topic != Topic::Early {
             broken.push(format!("{topic:?} of {seq} was sent before subscribers to warnings were woken"));
@@ -133,7 +133,7 @@ impl SensorSubscribers {
                 broken.extend(self.missing_topics(&[Topic::Scan], Some(seq)));
                 self.without_memory.clear();
             }
-            // A backlogged scan has no hub time, either.
+            // A backlogged scan has no hub time either.
             self.scan = is_of_scan.then_some(seq);
         }
         self.published.insert(topic, seq);
@@ -143,7 +143,7 @@ impl SensorSubscribers {
         let ring = topic.spec().doorbell_word;
         if sample.receivers > 0 {
             self.is_due[ring as usize] = true;
-            // A status waits for the next telegram.
+            // A status is sent before the next telegram.
             if is_of_scan {
                 self.due[ring as usize].get_or_insert(seq);
             }
@@ -155,8 +155,8 @@ impl SensorSubscribers {
         broken
     }
 
-    /// Returns those of `topics` that have no sample of `scan`, although one of their subscribers had attached before
-    /// it.
+    /// Returns each of `topics` that has no sample of `scan`, although one of its subscribers had attached before the
+    /// scan.
     fn missing_topics(&self, topics: &[Topic], scan: Option<u64>) -> Vec<String> {
         let Some(scan) = scan else { return Vec::new() };
         let is_absent = |of: &&AttachedSubscriber| {

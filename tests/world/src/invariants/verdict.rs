@@ -1,4 +1,4 @@
-//! Invariants on the verdicts that robots accept, next to the hub and on another machine.
+//! Invariants on the verdicts that robots accept, both next to the hub and on another machine.
 
 use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{MILLIS, Nanos, Topic, Verdict, Zones};
@@ -12,10 +12,10 @@ use crate::setup::Setup;
 
 /// Invariant: a robot does not accept a clear verdict for longer than documented while an object is inside a zone.
 ///
-/// According to `docs/topics.md`, a verdict is valid for two periods and 20 ms in the hub, for 20 ms more in a
-/// subscriber, and unknown after that. A scan shows the objects at the time of its measurement and is then on the line
-/// for a while. A zone is violated by a number of consecutive scans, each of which may be as late as a verdict is valid
-/// in the hub.
+/// According to `docs/topics.md`, a verdict is valid for two periods and 20 ms in the hub, and for 20 ms more in a
+/// subscriber. After that, it is unknown. A scan shows the objects at the time of its measurement, and needs some time
+/// on the line. A zone is violated only after a number of consecutive scans. Each of these scans may arrive as late as
+/// a verdict is valid in the hub.
 pub(crate) struct LocalVerdict {
     sensors: Vec<SensorVerdict>,
 }
@@ -24,7 +24,7 @@ struct SensorVerdict {
     /// Times at which an object is inside a zone.
     object_spans: Vec<(Nanos, Nanos)>,
     max_delay: Nanos,
-    /// Time since which the robot has accepted a clear verdict, if it does.
+    /// Time since which the robot has accepted a clear verdict, or `None` if the accepted verdict is not clear.
     clear_since: Option<Nanos>,
 }
 
@@ -83,7 +83,7 @@ fn max_clear_time(setup: &Setup, number: usize) -> Nanos {
     told_after + setup.min_scans * in_hub + STALENESS_MARGIN + TIMER_DELAY
 }
 
-/// Margin after two periods in the hub, and once more in a subscriber.
+/// Margin that is added to two periods in the hub, and once more in a subscriber.
 const STALENESS_MARGIN: Nanos = 20 * MILLIS;
 /// Maximum delay of all threads and timers together.
 const TIMER_DELAY: Nanos = 3 * MILLIS;
@@ -91,10 +91,10 @@ const TIMER_DELAY: Nanos = 3 * MILLIS;
 /// Invariant: a remote robot does not accept a clear verdict for longer than documented while an object is inside a
 /// zone.
 ///
-/// The maximum time has two parts. A gateway is a subscriber of the hub like a robot, so it sends clear zones for no
-/// longer than a robot next to the hub accepts them. From its arrival on (`docs/topics.md`: the delay on the network is
-/// unknown), a verdict is valid for two periods as sent and 40 ms, at least half a second and at most 5.04 s, and
-/// unknown after that.
+/// The maximum time has two parts. The first part is the time on the hub's machine: a gateway subscribes like a robot,
+/// so it sends clear zones for no longer than a robot next to the hub accepts them. The second part starts when the
+/// zones arrive, because the delay on the network is unknown (`docs/topics.md`). A verdict is then valid for two
+/// periods as sent and 40 ms, at least half a second and at most 5.04 s. After that, it is unknown.
 pub(crate) struct RemoteVerdict {
     begin_ns: u64,
     sensors: Vec<RemoteSensor>,
@@ -103,7 +103,7 @@ pub(crate) struct RemoteVerdict {
 struct RemoteSensor {
     /// Times at which an object is inside a zone.
     object_spans: Vec<(Nanos, Nanos)>,
-    /// Maximum time for which a robot next to the hub may accept another verdict.
+    /// Maximum time for which the gateway may send a clear verdict while an object is inside a zone.
     max_delay: Nanos,
     /// Time until which the last published verdict is valid.
     valid_until: Nanos,
@@ -114,7 +114,7 @@ impl RemoteVerdict {
     pub(crate) fn new(setup: &Setup, scenario: &Scenario, terms: &LinkSettings) -> RemoteVerdict {
         let sensor = |number: usize| {
             let object_spans = objects_inside(scenario, number, setup.sensors.len());
-            // In a bridge, the newest sample may wait until the next one arrives.
+            // A bridge may keep the newest sample in its queue until the next one arrives.
             let (period, _) = setup.sensors[number].scan_times();
             let waits = if terms.are_bridges { terms.send_interval.get() * period } else { 0 };
             let max_delay = max_clear_time(setup, number) + waits;
@@ -172,7 +172,8 @@ impl Invariant for RemoteVerdict {
 }
 
 impl RemoteSensor {
-    /// Checks that the accepted verdict is still valid. A verdict that the robot drops now was accepted until now.
+    /// Checks that the accepted verdict is still valid. If the robot drops its verdict now, it accepted the verdict
+    /// until now.
     fn check(&self, sensor: usize, at: Nanos, reporter: &mut ViolationReporter<'_>) {
         if self.accepted != Verdict::Unknown && at > self.valid_until {
             let late = (at - self.valid_until) / MILLIS;
@@ -187,7 +188,7 @@ fn is_clear(payload: &[u8]) -> bool {
     zones.unpack(payload) && zones.verdict() == Verdict::Clear
 }
 
-/// Margin after two periods, and the shortest and the longest validity of a verdict.
+/// Margin that is added to two periods; and minimum and maximum time for which a verdict is valid.
 const VALIDITY_MARGIN: Nanos = 40 * MILLIS;
 const MIN_VALIDITY: Nanos = 500 * MILLIS;
 const MAX_VALIDITY: Nanos = 5_040 * MILLIS;

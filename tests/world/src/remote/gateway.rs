@@ -31,7 +31,7 @@ pub(super) struct Gateway {
     tick_at: Nanos,
 }
 
-/// Subscription to one topic of one sensor.
+/// Subscription of the gateway to one topic of one sensor.
 struct TopicSubscription {
     sensor: usize,
     topic: Topic,
@@ -42,7 +42,7 @@ struct TopicSubscription {
 }
 
 impl Gateway {
-    /// Starts run number `run` of the gateway, with `sensors` sensors.
+    /// Starts the gateway as run number `run`, with `sensors` sensors.
     pub(super) fn begin(shared: &SharedState, terms: &LinkSettings, run: u32, sensors: usize) -> Gateway {
         let (now, epoch) = (shared.clock.get(), BASE_EPOCH + run);
         shared.log_event(&Event::GatewayStarted { epoch });
@@ -67,7 +67,7 @@ impl Gateway {
         Gateway { outgoing, epoch, subscriptions, zones, background_interval, next_poll_at, tick_at }
     }
 
-    /// Wakes the gateway. The hub has woken the subscribers of a sensor at `at`.
+    /// Wakes the gateway, because the hub woke the subscribers of a sensor at `at`.
     pub(super) fn wake(&mut self, at: Nanos) {
         self.next_poll_at = self.next_poll_at.min(at + WAKE_DELAY);
     }
@@ -129,7 +129,8 @@ impl Gateway {
         self.outgoing.is_waiting()
     }
 
-    /// Removes the sample that has been queued for longest, and returns its bytes. The router accepts it if `is_taken`.
+    /// Removes the sample that has been queued for the longest time, and returns its bytes. The router accepts them if
+    /// `is_taken`.
     pub(super) fn take_next(&mut self, shared: &SharedState, now: Nanos, is_taken: bool) -> Option<Vec<u8>> {
         if shared.defect.triggers(Defect::UncountedDrop, 100) {
             self.outgoing.take_next(stamp(shared, now));
@@ -170,7 +171,7 @@ impl TopicSubscription {
         }
     }
 
-    /// Takes the oldest sample from the queue. Returns it with the number of samples that were missed before it.
+    /// Takes the oldest sample from the queue. Returns the sample and the number of samples that were missed before it.
     fn take(&mut self, shared: &SharedState, now: Nanos) -> Option<(std::rc::Rc<Sample>, u64)> {
         let sample = shared.topics.borrow_mut().take(self.sensor, self.topic, self.id)?;
         let SequenceGap { missed, .. } = self.sequence.note(&sample.header);
@@ -200,7 +201,7 @@ impl Transmit for Uplink<'_> {
     }
 }
 
-/// Returns the clocks of the hub's machine.
+/// Returns the time of the clocks on the hub's machine.
 fn stamp(shared: &SharedState, now: Nanos) -> WallTimestamp {
     WallTimestamp { monotonic_ns: now, wall_ns: now + shared.wall_offset.get() }
 }
@@ -211,16 +212,16 @@ fn moment(now: Nanos) -> Timestamp {
 
 /// ID of the hub in datagrams.
 const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
-/// Epoch before the first one.
+/// Epoch of a run with number 0. The first run has the next epoch.
 const BASE_EPOCH: u32 = 1_780_000_000;
-/// First subscriber ID of gateways. Those of all other subscribers are lower.
+/// First subscriber ID of gateways. The IDs of all other subscribers are lower.
 pub(crate) const FIRST_SUBSCRIBER_ID: u32 = 1_000_000;
 /// Interval between two announcements.
 const ANNOUNCE_INTERVAL: Nanos = ANNOUNCEMENT_INTERVAL.as_nanos() as Nanos;
-/// Time within which a running hub passes the history to a new subscriber, without waking it.
+/// Maximum time until a running hub passes the history to a new subscriber. It does so without waking the subscriber.
 const HISTORY_DELAY: Nanos = 110 * MILLIS;
 
-/// Defines `lend`, which reads the bytes of a sample by the table of topics.
+/// Defines `lend`, which interprets the bytes of a sample as the table of topics specifies.
 macro_rules! payloads {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Passes the payload of `sample` to `to`, and returns the result.
@@ -252,7 +253,7 @@ macro_rules! payloads {
 
 scanhub_schema::for_each_topic!(payloads);
 
-/// Buffer for a payload as in datagrams. Its size limits the length of payloads.
+/// Buffer for a payload that is encoded as in a datagram. The size of the buffer limits the length of the payload.
 pub(crate) struct PayloadBuffer {
     buffer: Vec<u8>,
 }
@@ -268,7 +269,7 @@ impl PayloadBuffer {
         PayloadBuffer { buffer: vec![0; room] }
     }
 
-    /// Returns the payload of `sample` as in datagrams, or `None` if it does not fit.
+    /// Returns the payload of `sample`, encoded as in a datagram. Returns `None` if the payload does not fit.
     pub(crate) fn encode(&mut self, sample: &Sample) -> Option<&[u8]> {
         let len = lend(sample, |payload| payload.pack(&mut self.buffer))?;
         self.buffer.get(..len)

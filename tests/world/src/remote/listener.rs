@@ -1,6 +1,6 @@
-//! A run of a listener, and a robot that subscribes to its topics. The listener takes datagrams in the order in which
-//! they arrived, and publishes their samples. The robot handles the zones of remote sensors by the rules of the client
-//! library.
+//! A run of a listener, and a robot that subscribes to the listener's topics. The listener takes datagrams in the order
+//! of their arrival, and publishes their samples. The robot handles the zones of remote sensors as the client library
+//! does.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -33,7 +33,7 @@ pub(super) struct Listener {
 }
 
 impl Listener {
-    /// Starts run number `run` of the listener, which publishes in `memory`.
+    /// Starts the listener as run number `run`. The listener publishes in `memory`.
     pub(super) fn begin(
         shared: &SharedState,
         terms: &LinkSettings,
@@ -73,7 +73,7 @@ impl Listener {
     }
 
     /// Reads the datagrams in the kernel's buffer. With a key, the wall clock of the listener's machine is
-    /// `clock_offset_ns` ahead of virtual time, and accepted epochs are saved in `epochs`.
+    /// `clock_offset_ns` ahead of virtual time, and the listener saves accepted epochs in `epochs`.
     pub(super) fn run(
         &mut self,
         shared: &SharedState,
@@ -171,7 +171,7 @@ impl Listener {
     }
 }
 
-/// Returns the sample that a faulty listener would make from one part: zeros take the place of the other parts.
+/// Returns the sample that a faulty listener would create from one part. Zeros replace the other parts.
 fn partial_sample(bytes: &[u8]) -> Option<Vec<u8>> {
     let Datagram { head, payload, .. } = Datagram::read(bytes).ok().filter(|it| it.head.parts > 1)?;
     let begin = HEADER_LEN + payload.len() * usize::from(head.part);
@@ -183,7 +183,7 @@ fn partial_sample(bytes: &[u8]) -> Option<Vec<u8>> {
 
 /// ID of the publishing process.
 const PUBLISHER_PID: u32 = 77;
-/// Maximum number of datagrams that are handled before other work.
+/// Maximum number of datagrams that the listener handles before other work.
 const BATCH_SIZE: usize = 64;
 /// Size of the kernel's buffer, in bytes.
 const RECEIVE_BUFFER_LEN: usize = 1 << 20;
@@ -207,7 +207,7 @@ impl RemoteRobot {
         RemoteRobot { robot, sensors }
     }
 
-    /// Returns the time at which a verdict expires if no sample arrives.
+    /// Returns the time at which the first verdict expires if no sample arrives.
     pub(super) fn next_ns(&self, terms: &LinkSettings, now: Nanos) -> Nanos {
         let left = self.sensors.iter().filter_map(|(_, state, _)| state.time_left(terms.moment(now)));
         left.min().map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos))

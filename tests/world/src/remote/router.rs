@@ -1,6 +1,6 @@
-//! A router between two bridges, with a link to each of them. Everything that it accepts arrives once and in order, but
-//! the links can be slow or closed, and everything in the router is lost when it is killed. Both ends reconnect by
-//! themselves.
+//! A router between two bridges, with a link to each of them. Everything that the router accepts arrives once and in
+//! order. However, the links can be slow or closed. If the router is killed, everything in it is lost. Both bridges
+//! reconnect by themselves.
 
 use std::collections::VecDeque;
 
@@ -8,15 +8,15 @@ use scanhub_schema::{MICROS, MILLIS, Nanos};
 
 /// The router and its links.
 pub(super) struct Router {
-    /// Bytes per second: of a link without faults, and of the link at present.
+    /// Rate of a link without faults, and current rate of the link, in bytes per second.
     rate: u64,
     current_rate: u64,
     delay_ns: Nanos,
     is_running: bool,
     /// Whether a partition is active.
     is_partitioned: bool,
-    /// Time span in which the sender can pass datagrams to the router. It ends when the sender detects the loss of its
-    /// link.
+    /// Time span in which the sender can pass datagrams to the router. The span ends when the sender detects that its
+    /// link is lost.
     connected: (Nanos, Nanos),
     /// Time from which on the receiver is connected.
     receives_from: Nanos,
@@ -48,7 +48,7 @@ impl Router {
         }
     }
 
-    /// Sets the packet loss and the delay of the link. Lost packets are sent again, which takes time.
+    /// Sets the packet loss and the delay of the link. The link sends lost packets again, which takes time.
     pub(super) fn set_link(&mut self, loss: f64, delay_ns: Nanos) {
         self.current_rate = (self.rate as f64 / (1.0 + 100.0 * loss)) as u64;
         self.delay_ns = delay_ns;
@@ -57,7 +57,7 @@ impl Router {
     /// Starts or ends a partition.
     pub(super) fn set_partitioned(&mut self, is_partitioned: bool, now: Nanos) {
         if self.is_partitioned && !is_partitioned {
-            // The datagrams that waited arrive now, in order.
+            // The datagrams that the partition delayed arrive now, in order.
             for ((at, _), after) in self.in_transit.iter_mut().zip((now..).step_by(MAX_SPACING_NS)) {
                 *at = after.max(*at);
             }
@@ -65,8 +65,8 @@ impl Router {
         self.is_partitioned = is_partitioned;
     }
 
-    /// Kills the router. Everything in it is lost, and so is everything that the sender passes on until it detects the
-    /// loss.
+    /// Kills the router. Everything in the router is lost. Everything that the sender passes on before it detects the
+    /// loss of its link is also lost.
     pub(super) fn kill(&mut self, now: Nanos) {
         if self.is_running {
             self.is_running = false;
@@ -77,7 +77,7 @@ impl Router {
         }
     }
 
-    /// Starts another router. Both ends try to connect from time to time. With `gives_up`, they never do.
+    /// Starts another router. Both bridges try to connect from time to time. With `gives_up`, they never try.
     pub(super) fn begin(&mut self, now: Nanos, gives_up: bool) {
         if !self.is_running && !gives_up {
             self.is_running = true;
@@ -95,7 +95,7 @@ impl Router {
         }
     }
 
-    /// Returns the time at which there is room for a queued datagram, or [`Nanos::MAX`] if that is unknown.
+    /// Returns the time at which the router has room for a queued datagram, or [`Nanos::MAX`] if that time is unknown.
     pub(super) fn next_room_at(&self) -> Nanos {
         let at = self.has_room_at.max(self.connected.0);
         if at >= self.connected.1 || self.bytes >= SOCKET_BUFFER_LEN { Nanos::MAX } else { at }
@@ -130,17 +130,18 @@ impl Router {
     }
 }
 
-/// Possible rates of a link, in bytes per second: a radio link, a network.
+/// Possible rates of a link, in bytes per second. They range from a radio link to a fast network.
 const LINK_RATES: [u64; 3] = [2_000_000, 5_000_000, 50_000_000];
-/// Number of bytes that wait in sockets.
+/// Number of bytes that sockets buffer.
 const SOCKET_BUFFER_LEN: usize = 64 << 10;
-/// Interval between datagrams that arrive after a partition, in nanoseconds.
+/// Maximum time between two datagrams that arrive after a partition, in nanoseconds.
 const MAX_SPACING_NS: usize = 10_000;
 /// Maximum time until a sender detects the loss of its link.
 const MAX_DISCONNECT_DELAY: Nanos = 20 * MILLIS;
 /// Time until a new listener is connected.
 const CONNECT_TIME: Nanos = 500 * MICROS;
-/// Maximum time until an end is connected again.
+/// Maximum time until a bridge is connected again.
 pub(crate) const RECONNECT_INTERVAL: Nanos = 500 * MILLIS;
-/// Time in which a link without faults sends the whole queue: the longest samples of all topics.
+/// Maximum time in which a link without faults sends the whole queue. The queue contains the longest samples of all
+/// topics.
 pub(crate) const MAX_DRAIN_TIME: Nanos = 200 * MILLIS;
