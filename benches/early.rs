@@ -1,8 +1,8 @@
 //! Gain and cost of early warnings from partial scans. Posts appear in the smaller zone, one after the other, at
-//! positions all over the scan. A warning is compared with the zones of the same scan by the times at which the hub
-//! sent them, for an LMS and for rotating scanners. On a line that loses bytes in bursts, some warnings are withdrawn,
-//! and counted. The CPU time of the hub with a subscriber to `early` is compared with that for `zones` alone. The bench
-//! does not measure what a robot gains: its brakes are slower.
+//! positions all over the scan. The gain is the time from the warning until the hub sends the zones of the same scan,
+//! for an LMS and for rotating scanners. On a line that loses bytes in bursts, the hub withdraws some warnings, and the
+//! bench counts them. The cost is the CPU time of the hub with a subscriber to `early`, compared with a subscriber to
+//! `zones` alone. The bench does not measure how much earlier a robot stops, because its brakes are slower.
 
 mod support;
 
@@ -32,9 +32,10 @@ struct Scanner {
     name: &'static str,
     flags: &'static [&'static str],
     keys: &'static [&'static str],
-    /// Directions of its posts: the first, and the extent, in radians counterclockwise from the right.
+    /// Directions of the scanner's posts: the first direction, and the angle that all posts cover. In radians,
+    /// counterclockwise from the right.
     view: (f64, f64),
-    /// Time for which each post exists, and time from the start of one to the start of the next, in seconds.
+    /// Time for which each post exists; and time from the start of one post to the start of the next. In seconds.
     post_duration_s: f64,
     post_interval_s: f64,
     warning_figures: [&'static str; 4],
@@ -129,11 +130,12 @@ fn measure(options: &Options) -> Outcome<()> {
 /// Results of a scanner, one value per pair of runs.
 #[derive(Default)]
 struct WarningFigures {
-    /// Medians of the gain in ms, by parts of the scan.
+    /// Medians of the gain in ms, by part of the scan.
     gains: BTreeMap<usize, Vec<f64>>,
-    /// Number of warnings and of withdrawn warnings on a clean line, and then on one that loses bytes.
+    /// Number of warnings and number of withdrawn warnings on a clean line; then both numbers on a line that loses
+    /// bytes.
     counts: [Vec<f64>; 4],
-    /// CPU time of the hub in percent, with a subscriber to `early` and without.
+    /// CPU time of the hub in percent, with a subscriber to `early` and without one.
     cpu_percents: [Vec<f64>; 2],
 }
 
@@ -195,8 +197,8 @@ impl Scanner {
         Ok(WarningRun::from_samples(&early, &zones, beams.max(1)))
     }
 
-    /// Returns the CPU time of the hub in percent of one processor, with a subscriber to `zones`, and to `early` too if
-    /// `is_early`.
+    /// Returns the CPU time of the hub in percent of one processor, with a subscriber to `zones`. If `is_early`, there
+    /// is also a subscriber to `early`.
     fn busy_share(
         &self,
         environment: &BenchEnvironment,
@@ -224,7 +226,8 @@ impl Scanner {
         Ok(share)
     }
 
-    /// Returns a world with a room in which one post at a time appears, 0.55 m from the sensor, for a few scans each.
+    /// Returns a world with a room in which one post at a time appears, 0.55 m from the sensor. Each post exists for a
+    /// few scans.
     fn posts_world(&self) -> Outcome<String> {
         let mut world = String::from("[noise]\nerrors = 0\nweak = false\n");
         world += "[[thing]]\nline = [[-4000, -3000], [4000, -3000], [4000, 4000], [-4000, 4000], [-4000, -3000]]\n";
@@ -243,12 +246,12 @@ impl Scanner {
 struct WarningRun {
     warnings: usize,
     withdrawn: usize,
-    /// Times in ms from the first warning of a scan to its zones, by sixths of the scan.
+    /// Times in ms from the first warning of a scan to the zones of this scan, by sixth of the scan.
     gains_ms: BTreeMap<usize, Vec<f64>>,
 }
 
 impl WarningRun {
-    /// Evaluates the samples of both topics, for scans of this number of `beams`.
+    /// Evaluates the samples of `early` and `zones`, for scans with this number of `beams`.
     fn from_samples(early: &[(Header, Early)], zones: &[(Header, ())], beams: usize) -> WarningRun {
         let sent: BTreeMap<u64, u64> =
             zones.iter().rev().map(|(header, ())| (header.seq, sent_ns(header))).collect();
@@ -259,7 +262,7 @@ impl WarningRun {
                 continue;
             }
             run.warnings += 1;
-            // During a revolution, a warning has the `seq` of a packet, so take the next zones.
+            // During a revolution, a warning has the `seq` of a packet, so the next zones belong to it.
             if let Some((_, zones_ns)) = sent.range(header.seq..).next() {
                 let gain_ms = (*zones_ns as f64 - sent_ns(header) as f64) / 1e6;
                 let place = usize::from(early.beam) * SCAN_PARTS / beams;
@@ -278,7 +281,7 @@ impl WarningRun {
     }
 }
 
-/// Receives a topic for `span` from its first sample on. Returns the headers, each with the result of `take`.
+/// Receives a topic for `span` from its first sample on. Returns each header together with the result of `take`.
 fn receive<P: Payload, T>(
     environment: &BenchEnvironment,
     span: Duration,

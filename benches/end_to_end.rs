@@ -1,10 +1,10 @@
-//! Transport and start. 2 x 1500 telegrams pass from ptys at 500 kBd through the running hub into a process per sensor.
-//! They are compared with the log of the simulator, to check that everything arrives in order, bit for bit and in time.
-//! Starts are measured with an idle sensor at each of the four rates, and compared with a bare host that knows the
-//! rate. The tests of the framer cover damaged bytes.
+//! Transport and start. For the transport, 2 x 1500 telegrams pass from ptys at 500 kBd through the running hub to a
+//! process per sensor. The bench compares them with the log of the simulator: everything must arrive in order, bit for
+//! bit and in time. The start is measured with an idle sensor at each of the four rates. The baseline is a minimal host
+//! that has the rate from the beginning. The tests of the framer cover damaged bytes.
 //!
-//! The baseline of a start knows the rate. At 9,600 baud it requests the status, which takes 0.17 s there. The hub
-//! first waits for a running stream, and then tries one rate after the other, 19,200 baud last.
+//! At 9,600 baud, the baseline requests the status, which takes 0.17 s at this rate. The hub first waits for a running
+//! stream, and then tries one rate after the other, 19,200 baud last.
 
 mod support;
 
@@ -37,7 +37,7 @@ fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
         subscriber.wait_for_line("attaching", STEP_TIMEOUT)?;
         Ok(subscriber)
     };
-    // A subscriber must attach before the sensors start in order to detect every loss, so the sensors start last.
+    // The sensors start last, because a subscriber can detect every loss only if it attaches before they start.
     let subscribers: Vec<Child> = SENSORS.iter().map(start).collect::<Outcome<_>>()?;
     let hub = environment.start_hub(&SENSORS)?;
     hub.wait_for_line("ready", STEP_TIMEOUT)?;
@@ -61,7 +61,7 @@ fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
         let sent = known.iter().max().map_or(0, |last| last + 1);
         let values = [
             hashes.len() as f64,
-            // Everything that was sent up to the last telegram received.
+            // Telegrams that were sent before the last received telegram and did not arrive.
             (sent - known.len()) as f64,
             places.iter().filter(|place| place.is_none()).count() as f64,
             known.windows(2).filter(|pair| pair[0] >= pair[1]).count() as f64,
@@ -115,7 +115,7 @@ fn start_hub(rate: u32) -> Outcome<[f64; 2]> {
     Ok([streaming, first])
 }
 
-/// Returns the same times for a host that knows the rate.
+/// Returns the same times for a host that has the rate from the beginning.
 fn start_baseline(rate: u32) -> Outcome<[f64; 2]> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate(&ONE_SENSOR, rate)?;
@@ -133,5 +133,5 @@ const START_CASES: [(u32, &str, &str); 4] = [
     (9_600, "9600 Bd to streaming", "9600 Bd to first scan"),
 ];
 const ONE_SENSOR: [&str; 1] = ["front"];
-/// Rate at 180 degrees and 0.5 degrees: a scan takes two revolutions of the mirror.
+/// Scans per second at 180 degrees and 0.5 degrees: a scan takes two revolutions of the mirror.
 const NOMINAL_HZ: f64 = 1e9 / (2.0 * lms::variant::MIRROR_PERIOD as f64);

@@ -1,6 +1,6 @@
-//! The four pictures of the paper's Fig. 8, from the simulated room of that name: `cargo bench --bench fig8 -- --draw
-//! DIR` writes them as SVG, `-- --method paper` uses the paper's method, `-- --seed 3` is another run. Without `--draw`
-//! it only prints what they would show.
+//! The four pictures of Fig. 8 of the paper, from the simulated room with the same name. `cargo bench --bench fig8 --
+//! --draw DIR` writes the pictures as SVG. `-- --method paper` uses the paper's method, and `-- --seed 3` draws other
+//! random numbers. Without `--draw`, the bench only prints what the pictures would show.
 
 #[path = "../tests/testkit/decoded_scan.rs"]
 mod decoded_scan;
@@ -20,11 +20,11 @@ use scanhub_sim::room::Room;
 const SCAN_COUNT: u64 = 2_000;
 /// Time between two scans.
 const SCAN_PERIOD_NS: Nanos = 2 * MIRROR_PERIOD;
-/// End of the time in which nothing changes: box 1 is put down at 15 s.
+/// Time until which nothing changes. Box 1 is put down at 15 s.
 const UNCHANGED_UNTIL_NS: Nanos = 14_900_000_000;
 /// Time of the snapshot: the person is in the room, and box 1 is still foreground.
 const SNAPSHOT_NS: Nanos = 19_000_000_000;
-/// Difference of two backgrounds that is drawn, in mm: the threshold of the methods.
+/// Minimum difference of two backgrounds that is drawn, in mm. It is the threshold of the methods.
 const MIN_DIFFERENCE_MM: u16 = 30;
 
 struct Options {
@@ -49,7 +49,7 @@ impl Options {
                         other => return Err(format!("--method {other}? paper or multi")),
                     }
                 }
-                // Cargo passes this to every bench.
+                // Cargo passes this argument to every bench.
                 "--bench" => {}
                 _ => return Err(format!("{word}? --draw DIR, --method paper|multi, --seed NUMBER")),
             }
@@ -68,7 +68,7 @@ struct RoomRun {
     before: Vec<u16>,
     after: Vec<u16>,
     snapshot: Option<(Vec<u16>, Box<Foreground>)>,
-    /// The last scan, whose beams are those of all scans.
+    /// The last scan. All scans have the same beams.
     scan: Box<Scan>,
 }
 
@@ -212,23 +212,23 @@ struct Position {
 }
 
 impl Position {
-    /// Returns the end of beam `i` of `scan` if it has this range, in units of the scan.
+    /// Returns the end of beam `i` of `scan` at this `range`, in units of the scan.
     fn of(scan: &Scan, i: usize, range: u16) -> Position {
         let mm = f64::from(range) * f64::from(scan.unit_um) / 1000.0;
         let (left, ahead) = scan.angle(i).sin_cos();
         Position { right_mm: (-mm * left).round() as i32, ahead_mm: (mm * ahead).round() as i32 }
     }
 
-    /// Returns the position on the page. A pixel is one centimeter.
+    /// Returns the position on the page, in pixels. A pixel is one centimeter.
     fn pixel(self) -> (i32, i32) {
         let centimeters = |mm: i32| (f64::from(mm) / 10.0).round() as i32;
         (LEFT + centimeters(self.right_mm), BOTTOM - centimeters(self.ahead_mm))
     }
 }
 
-/// A floor plan as SVG, seen from above, with the sensor at the bottom: dots in classes, rings, a scale. Dots of one
-/// class are one path on a grid of one centimeter, so the file is small. It has no background and no extreme colors, so
-/// it is readable on light and on dark pages.
+/// A floor plan as SVG, seen from above, with the sensor at the bottom. It has dots in classes, rings and a scale. The
+/// dots of one class are one path on a grid of one centimeter, so the file is small. The picture has no background and
+/// no extreme colors, so it is readable on light and on dark pages.
 struct FloorPlan {
     body: String,
     legend: Vec<&'static str>,

@@ -1,7 +1,7 @@
-//! Cost of the hub per telegram. Measures its CPU time and its sleeps while 1, 2 or 4 sensors stream, with one sleeping
-//! subscriber per sensor. The baseline is a bare reader of ptys that makes only the necessary system calls and wakes a
-//! process per telegram. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the same time
-//! (`support/simultaneous.rs`). The bench does not measure the cost of subscribers, or of a real adapter.
+//! Cost of the hub per telegram. Measures the hub's CPU time and its sleeps while 1, 2 or 4 sensors stream, with one
+//! sleeping subscriber per sensor. The baseline is a minimal reader of ptys that makes only the necessary system calls
+//! and wakes a process per telegram. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the
+//! same time (`support/simultaneous.rs`). The bench does not measure the cost of subscribers or of a real adapter.
 
 mod support;
 
@@ -31,7 +31,7 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
         rounds.push(load_of_round(&comparison, round, seconds)?);
     }
     let figure = |name, unit, of: fn(&Load) -> Option<f64>, target| {
-        // Other work of the machine makes some seconds far more expensive than most, so the median counts.
+        // Other programs on the machine make some seconds far more expensive than most, so the median counts.
         let in_round = |loads: &Vec<Load>| {
             let mut seconds: Vec<f64> = loads.iter().filter_map(of).collect();
             seconds.sort_by(f64::total_cmp);
@@ -145,8 +145,8 @@ struct Sample {
 }
 
 impl Sample {
-    /// Reads the counters of `pid`. The reading threads of a hub have the names of its sensors. All threads of the
-    /// baseline are readers, except the first, which only waits for them.
+    /// Reads the counters of `pid`. The reading threads of a hub have the names of its sensors. In the baseline, all
+    /// threads except the first are readers. The first one only waits for the others.
     fn take(pid: u32, sensors: Option<&[&str]>) -> Outcome<Sample> {
         let now = clock::now();
         let process = ThreadUsage::of(pid, |_| true)?;
@@ -158,8 +158,8 @@ impl Sample {
     }
 }
 
-/// Returns wake-ups and telegrams of all links as the hub has counted them. Called outside of the measured time,
-/// because it adds a subscriber.
+/// Returns the hub's own counts of wake-ups and telegrams, for all links. Called outside of the measured time, because
+/// the call adds a subscriber.
 fn counters(environment: &BenchEnvironment, sensors: &[&str]) -> Outcome<(f64, f64)> {
     let mut sum = (0, 0);
     for sensor in sensors {

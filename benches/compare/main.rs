@@ -11,20 +11,22 @@
 //!   sender's CPU time therefore includes the writing and the sleep until the next message. "Sending alone" includes
 //!   neither.
 //! - In the targets, the column "baseline" is the baseline or the socket with which topics are compared.
-//! - With more receivers than processors, the last one waits for the CPU time of the others, with every mechanism.
+//! - With more receivers than processors, the last receiver waits until the others have used the processors. This is
+//! true for every mechanism.
 //! - UDP datagrams hold 65,507 bytes, and Unix datagram sockets 65,536. Longer messages are sent in parts, and one
 //!   lost part loses the message.
 //! - At full speed, streams, pipes and Unix datagrams wait for their receivers; multicast and topics lose messages.
-//! - The baselines `futex` and `cache line` use the hub's own doorbell: one addition and one system call. The
-//!   baseline `eventfd` has none of the hub's code.
+//! - The baselines `futex` and `cache line` use the hub's own doorbell: one addition and one system call. The baseline
+//! `eventfd` uses no code of the hub.
 //! - Topics are a service with the hub's settings for messages of any length. For the scan there is also
 //!   `Subscriber::next`.
-//! - For each sample, the shared-memory library checks all possible subscriber slots three times. For one small
-//!   message to one receiver, a pipe or a Unix socket copies less than that. At 37.5 Hz, this memory has left the
-//!   caches each time, which is also why spinning does not reach the microsecond that it reaches when messages arrive
-//!   without a pause.
-//! - The event is one datagram of the library for each listener, and one more system call to receive it: about twice
-//!   a futex. The doorbell wakes all sleeping subscribers at once, so they compete for two cores.
+//! - For each sample, the shared-memory library checks all possible subscriber slots three times. For one small message
+//! to one receiver, a pipe or a Unix socket needs less memory than the slots. At 37.5 Hz, the slots have left the
+//! caches before each message. For the same reason, spinning does not reach the microsecond that it reaches when
+//! messages arrive without a pause.
+//! - For the event, the library sends one datagram to each listener, and the listener needs one more system call to
+//! receive it. The event takes about twice as long as a futex. The doorbell wakes all sleeping subscribers at once, so
+//! they compete for two cores.
 
 mod baselines;
 mod message;
@@ -122,8 +124,8 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Runs all mechanisms with the same messages and the same number of receivers, `pairs` times, each time starting with
-/// another one.
+/// Runs all mechanisms with the same messages and the same number of receivers, `pairs` times. Each time, another
+/// mechanism runs first.
 fn compare(
     stage: &BenchEnvironment,
     payload: usize,

@@ -1,5 +1,5 @@
-//! The mechanisms that are compared, the messages that each of them carries, and the phases in which they are sent.
-//! Sender and receivers know all of these.
+//! The mechanisms that are compared, the messages that each of them carries, and the phases in which messages are sent.
+//! Sender and receivers both use these definitions.
 
 use std::hint::black_box;
 
@@ -22,11 +22,11 @@ pub(crate) enum Mechanism {
     Multicast,
     /// A Unix datagram socket for each receiver.
     UnixDatagram,
-    /// A Unix stream socket for each.
+    /// A Unix stream socket for each receiver.
     UnixStream,
-    /// A TCP connection on the loopback for each.
+    /// A TCP connection on the loopback for each receiver.
     Tcp,
-    /// A pipe for each.
+    /// A pipe for each receiver.
     Pipe,
     /// Only a wake-up by futex.
     FutexBaseline,
@@ -79,7 +79,7 @@ impl Mechanism {
             .ok_or_else(|| format!("unknown mechanism {name}"))?)
     }
 
-    /// Returns whether users would take this mechanism instead of topics.
+    /// Returns whether users would choose this mechanism instead of topics.
     pub(crate) fn is_alternative(self) -> bool {
         matches!(
             self,
@@ -96,7 +96,7 @@ impl Mechanism {
         matches!(self, Mechanism::FutexBaseline | Mechanism::EventfdBaseline | Mechanism::SpinBaseline)
     }
 
-    /// Returns whether the sender never waits for its receivers, so that slow ones miss messages.
+    /// Returns whether the sender never waits for its receivers, so that slow receivers miss messages.
     pub(crate) fn is_lossy(self) -> bool {
         !self.is_baseline()
             && !matches!(
@@ -119,12 +119,12 @@ impl Mechanism {
     }
 }
 
-/// Identification of a message, at both of its ends.
+/// Identification of a message. It is written to both ends of the message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Label {
     /// Index of its phase in [`PHASES`].
     pub(crate) phase: usize,
-    /// Number in its phase, from 0.
+    /// Number of the message in its phase, from 0.
     pub(crate) number: u64,
     /// Whether it only reports the end of its phase.
     pub(crate) is_end: bool,
@@ -141,8 +141,8 @@ impl Label {
         bytes[tail..].copy_from_slice(&number);
     }
 
-    /// Reads a byte of each cache line of a message, and returns its label. Fails if its ends belong to different
-    /// messages.
+    /// Reads a byte of each cache line of a message, and returns its label. Fails if the two ends of `bytes` belong to
+    /// different messages.
     pub(crate) fn read(bytes: &[u8]) -> Outcome<Label> {
         black_box(bytes.iter().step_by(CACHE_LINE_LEN).fold(0u64, |sum, byte| sum + u64::from(*byte)));
         let [number, kind] = [&bytes[..NUMBER_LEN], &bytes[NUMBER_LEN..LABEL_LEN]].map(word);
@@ -157,7 +157,8 @@ fn word(bytes: &[u8]) -> u64 {
     bytes.iter().rev().fold(0, |word, byte| word << 8 | u64::from(*byte))
 }
 
-/// A message in the sender's own memory. It is written again for each send, because real data was just computed.
+/// A message in the sender's own memory. The sender writes it again for each send, because a real sender has just
+/// computed its data.
 pub(crate) struct MessageBuffer {
     contents: Vec<u8>,
     bytes: Vec<u8>,
@@ -188,7 +189,7 @@ impl MessageBuffer {
     }
 }
 
-/// Returns the content of a message of `len` bytes, which the label then overwrites at both ends.
+/// Returns the content of a message of `len` bytes. The label then overwrites both ends.
 pub(crate) fn contents(len: usize) -> Vec<u8> {
     (0..len).map(|i| i as u8).collect()
 }
@@ -211,13 +212,13 @@ pub(crate) struct Phase {
     pub(crate) period_ns: u64,
     /// Maximum number of messages.
     max_count: usize,
-    /// Time after which the phase ends in any case, in ns: some mechanisms cannot keep the rate.
+    /// Time after which the phase ends in any case, in ns. Some mechanisms cannot keep the rate.
     max_ns: u64,
 }
 
 impl Phase {
-    /// Returns the number of messages of `mechanism`. Baselines are sent only at a rate, because a wake-up counts only
-    /// while a receiver waits.
+    /// Returns the number of messages that `mechanism` sends. Baselines send only at a rate, because a wake-up counts
+    /// only while a receiver waits.
     pub(crate) fn count(&self, mechanism: Mechanism) -> usize {
         if mechanism.is_baseline() && self.period_ns == 0 { 0 } else { self.max_count }
     }
@@ -229,7 +230,7 @@ impl Phase {
     }
 }
 
-/// The phases in their order. The first one fills memory and caches, and does not count.
+/// The phases in their order. The first phase fills memory and caches, and does not count.
 pub(crate) const PHASES: [Phase; 4] = [
     Phase { name: "warm-up", period_ns: 1_000_000, max_count: 20, max_ns: 40_000_000 },
     Phase { name: "37.5 Hz", period_ns: 26_666_667, max_count: 28, max_ns: 900_000_000 },

@@ -1,5 +1,5 @@
-//! The sending and the receiving process of a run. Both work with any mechanism: they print when each message was sent
-//! or received, and what that cost.
+//! The sending and the receiving process of a run. Both work with any mechanism. They print the time at which each
+//! message was sent or received, and the CPU time that this took.
 
 use std::fmt::Write as _;
 use std::io::ErrorKind;
@@ -15,7 +15,7 @@ use crate::support::{Outcome, clock};
 /// The run that sender and receivers belong to.
 pub(crate) struct RunParameters<'a> {
     pub(crate) mechanism: Mechanism,
-    /// Bytes of a message.
+    /// Length of a message, in bytes.
     pub(crate) payload: usize,
     pub(crate) receivers: usize,
     /// Domain of topics.
@@ -48,7 +48,8 @@ pub(crate) trait MessageSender {
 }
 
 /// Sends until the control socket reports the end. Prints `ready ADDRESS`, `open`, and for each phase `sent BUSY_NS
-/// SENDING_NS SENT_NS..`. SENDING_NS excludes the writing of messages and the waits, and is 0 if it was not measured.
+/// SENDING_NS SENT_NS..`. SENDING_NS is the CPU time without the writing of messages and the waits. It is 0 if it was
+/// not measured.
 pub(crate) fn send_all(task: &RunParameters) -> Outcome<()> {
     let control_socket = UnixDatagram::bind(control_path(task.path_prefix))?;
     let mut outlet = sender(task)?;
@@ -85,8 +86,8 @@ pub(crate) fn control_path(path_prefix: &str) -> String {
     format!("{path_prefix}-control")
 }
 
-/// Returns the CPU time of this thread, in ns. Schedstat has the same value, but updates it only at the end of a tick
-/// or of a sleep.
+/// Returns the CPU time of this thread, in ns. Schedstat has the same value, but the kernel updates it only at the end
+/// of a tick or of a sleep.
 pub(crate) fn busy_ns() -> u64 {
     let busy = clock_gettime(ClockId::ThreadCPUTime);
     busy.tv_sec as u64 * 1_000_000_000 + busy.tv_nsec as u64
@@ -105,7 +106,8 @@ fn sender(task: &RunParameters) -> Outcome<Box<dyn MessageSender>> {
     })
 }
 
-/// Runs a phase. Returns the CPU time of sending alone, and then the time at which each message was sent.
+/// Runs a phase. Returns the CPU time of sending without writing and waits, followed by the time at which each message
+/// was sent.
 fn send(
     sender: &mut dyn MessageSender,
     phase: &Phase,
@@ -156,7 +158,7 @@ fn is_signaled(socket: &UnixDatagram) -> Outcome<bool> {
     }
 }
 
-/// Interval at which the end of a phase is reported again if it can be lost.
+/// Interval at which the sender reports the end of a phase again if the report can be lost.
 const END_REPEAT_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Receiving end of a mechanism.
@@ -165,8 +167,8 @@ pub(crate) trait MessageReceiver {
     fn next(&mut self) -> Outcome<Label>;
 }
 
-/// Receives all phases. Prints `ready` once no later message can be missed, and for each phase `took BUSY_NS`, then the
-/// number and the time of every message.
+/// Receives all phases. Prints `ready` when it can no longer miss a message. For each phase, prints `took BUSY_NS`,
+/// followed by the number and the time of every message.
 pub(crate) fn receive_all(task: &RunParameters, number: usize, address: &str) -> Outcome<()> {
     let mut inlet = receiver(task, number, address)?;
     println!("ready");

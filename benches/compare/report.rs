@@ -1,5 +1,5 @@
-//! The tables, one for each length of messages, number of receivers and rate, and the targets: the maximum cost of
-//! topics relative to the baselines and to the cheapest socket.
+//! The tables and the targets. There is one table for each length of messages, number of receivers and rate. A target
+//! is the maximum cost of topics relative to the baselines or to the cheapest socket.
 
 use serde_json::{Value, json};
 
@@ -9,12 +9,12 @@ use super::{Cell, MEBIBYTE};
 use crate::support::Options;
 use crate::support::figures::{self, Spread, percentile};
 
-/// Value of a figure.
+/// Function that returns the value of a figure.
 type FigureOf = fn(&PhaseFigures) -> Option<f64>;
 
-/// Prints all tables, after the machine. With `--json`, prints a line `{class: "machine", bench, machine, processors,
-/// runs}`, the most important figures as cells, and a line of class `compared` with all figures for each mechanism,
-/// length, number of receivers and rate.
+/// Prints the machine, and then all tables. With `--json`, prints a line `{class: "machine", bench, machine,
+/// processors, runs}` and the most important figures as cells. It then prints a line of class `compared` with all
+/// figures for each mechanism, length, number of receivers and rate.
 pub(crate) fn print_tables(options: &Options, processors: usize, pairs: usize, cells: &[Cell]) {
     let digests = cells.iter().flat_map(digests).collect::<Vec<_>>();
     if options.json {
@@ -110,7 +110,7 @@ fn values(cell: &Cell, of: FigureOf) -> Vec<f64> {
     cell.runs.iter().filter_map(of).collect()
 }
 
-/// Returns processor and kernel.
+/// Returns the names of the processor and the kernel.
 fn machine() -> String {
     let read = |path| std::fs::read_to_string(path).unwrap_or_default();
     let (processor, kernel) = (read("/proc/cpuinfo"), read("/proc/sys/kernel/osrelease"));
@@ -119,8 +119,8 @@ fn machine() -> String {
 }
 
 /// Prints the targets of topics relative to the baselines and to the cheapest socket, and whether they are met. With
-/// `--json`, prints lines of class `measurement`, whose `baseline` is the mechanism that topics are compared with, and
-/// a line of class `above` for each cell in which a socket is cheaper.
+/// `--json`, prints lines of class `measurement`, whose `baseline` is the mechanism that topics are compared with. It
+/// also prints a line of class `above` for each cell in which a socket is cheaper.
 pub(crate) fn print_targets(options: &Options, cells: &[Cell]) {
     let mut verdicts = Vec::new();
     for cell in cells.iter().filter(|cell| cell.is_paced()) {
@@ -140,14 +140,14 @@ struct TargetCheck {
     unit: &'static str,
     /// One value per run.
     topic_values: Vec<f64>,
-    /// One value per run of the mechanism that it is compared with; empty if there is none.
+    /// Values of the mechanism that the topic is compared with, one per run. Empty if there is none.
     compared_values: Vec<f64>,
     target: String,
     is_met: bool,
 }
 
 impl TargetCheck {
-    /// Compares `cell` with `other`: it should take at most `max_ratio` times as much.
+    /// Compares `cell` with `other`. The target is that `cell` takes at most `max_ratio` times as much.
     fn check_ratio(
         cell: &Cell,
         other: &Cell,
@@ -167,7 +167,7 @@ impl TargetCheck {
         Some(verdict)
     }
 
-    /// Returns the ratios run by run, because the runs of a pair are within the same minute.
+    /// Returns the ratio for each run, because the two runs of a pair happen within the same minute.
     fn ratios(&self) -> Vec<f64> {
         self.topic_values.iter().zip(&self.compared_values).map(|(ours, other)| ours / other).collect()
     }
@@ -209,7 +209,7 @@ fn check_waits(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     )
 }
 
-/// Checks spinning, for which the other processors must be idle.
+/// Checks spinning. The other processors must be idle for this.
 fn check_spinning(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     const MAX_LATENCY_US: f64 = 1.0;
     if cell.case.mechanism != Mechanism::Spin || cell.case.payload > MAX_HUB_MESSAGE_LEN {
@@ -260,8 +260,8 @@ fn check_many_receivers(cell: &Cell, cells: &[Cell]) -> Vec<TargetCheck> {
     SENDER_FIGURES.into_iter().filter_map(verdict).collect()
 }
 
-/// Compares sender and last receiver with the cheapest socket: one target for all cells together, and one for each cell
-/// that is above it.
+/// Compares the sender and the last receiver with the cheapest socket. There is one target for all cells together, and
+/// one for each cell in which topics take more than the socket.
 fn check_sockets(cells: &[Cell]) -> Vec<TargetCheck> {
     const LAST_FIGURE: (&str, FigureOf) = ("last receiver's p50", |run| run.last[0]);
     let mut verdicts = Vec::new();
@@ -315,7 +315,8 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     percentile(&values, 0.5)
 }
 
-/// CPU time of the sender for a message: including writing it and the wait until it is due, and without both.
+/// CPU time of the sender per message. The first figure includes writing the message and the wait until it is due. The
+/// second one excludes both.
 const SENDER_FIGURES: [(&str, FigureOf); 2] =
     [("sender's CPU time", |run| Some(run.sender_us)), ("sending alone", |run| run.sending_us)];
 /// Maximum length of the hub's own messages.

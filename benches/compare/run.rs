@@ -1,5 +1,5 @@
-//! A run of one mechanism with one number of receivers and one length of messages: starts the processes, leads them
-//! through all phases, and computes figures from their output.
+//! A run of one mechanism with one number of receivers and one length of messages. It starts the processes, controls
+//! them through all phases, and computes figures from their output.
 
 use std::os::unix::net::UnixDatagram;
 
@@ -13,7 +13,7 @@ use crate::support::figures::percentile;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Case {
     pub(crate) mechanism: Mechanism,
-    /// Bytes of a message.
+    /// Length of a message, in bytes.
     pub(crate) payload: usize,
     pub(crate) receivers: usize,
 }
@@ -21,13 +21,13 @@ pub(crate) struct Case {
 /// Figures of one phase.
 #[derive(Clone, Debug)]
 pub(crate) struct PhaseFigures {
-    /// Time from just before the send until the message is received, of all receivers: p50, p99, p99.9, in us.
+    /// Time from just before the send until a receiver has the message, over all receivers: p50, p99, p99.9, in us.
     pub(crate) latency: [Option<f64>; 3],
-    /// The same for the last receiver of each message that all of them received.
+    /// The same time for the last receiver of each message, if all receivers received the message.
     pub(crate) last: [Option<f64>; 3],
-    /// CPU time of the sender per message, including writing it and waiting until it is due, in us.
+    /// CPU time of the sender per message, in us. It includes writing the message and waiting until it is due.
     pub(crate) sender_us: f64,
-    /// The part of it that is sending, in us; `None` if messages are not sent at a rate.
+    /// Part of `sender_us` that is spent on sending, in us. `None` if messages are not sent at a rate.
     pub(crate) sending_us: Option<f64>,
     /// CPU time of a receiver per message, in us; `None` if no message arrived.
     pub(crate) receiver_us: Option<f64>,
@@ -40,7 +40,7 @@ pub(crate) struct PhaseFigures {
 }
 
 impl Case {
-    /// Runs the case, and returns the figures of each phase that it has, with the index of the phase.
+    /// Runs the case. Returns the index and the figures of each phase that the case has.
     pub(crate) fn measure(&self, environment: &BenchEnvironment) -> Outcome<Vec<(usize, PhaseFigures)>> {
         let place = environment.port("compare");
         let [payload, receivers] = [self.payload, self.receivers].map(|number| number.to_string());
@@ -88,8 +88,8 @@ impl Case {
 /// Output of a process about one phase.
 struct Report {
     busy_ns: u64,
-    /// A sender reports the CPU time of sending, and then the time of each message. A receiver reports number and time
-    /// of each message, alternating.
+    /// For a sender: the CPU time of sending, and then the time of each message. For a receiver: the number and the
+    /// time of each message, alternating.
     numbers: Vec<u64>,
 }
 
@@ -136,7 +136,7 @@ fn figures(sent: &Report, receivers: &[Report]) -> Outcome<PhaseFigures> {
     })
 }
 
-/// Returns p50, p99 and p99.9 of times in ns, in us.
+/// Returns p50, p99 and p99.9 of `times` in us. `times` are in ns.
 fn percentiles(times: Vec<u64>) -> [Option<f64>; 3] {
     let mut sorted: Vec<f64> = times.iter().map(|time| *time as f64 / 1e3).collect();
     sorted.sort_by(f64::total_cmp);

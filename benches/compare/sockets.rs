@@ -21,15 +21,15 @@ use super::message::{Label, MIN_MESSAGE_LEN, Mechanism, MessageBuffer};
 use super::process::{MessageReceiver, MessageSender, RunParameters};
 use crate::support::Outcome;
 
-/// Sending sockets of UDP multicast on the loopback, with one socket for the group, or of Unix datagrams, with one
-/// socket per receiver. A message that is longer than a datagram is sent as several datagrams and reassembled by the
-/// receiver, as users would do it. If one of them is lost, the message is lost.
+/// Sending sockets for datagrams. UDP multicast on the loopback has one socket for the group, and Unix datagrams have
+/// one socket per receiver. The sender splits a message that is longer than a datagram, and the receiver reassembles
+/// it, as a user's program would do. If one of the datagrams is lost, the message is lost.
 pub(crate) struct DatagramSender {
     group: Option<Ipv4Addr>,
     paths: Vec<String>,
     sockets: Vec<OwnedFd>,
     buffer: MessageBuffer,
-    /// Bytes of a message in one datagram.
+    /// Number of bytes of a message in one datagram.
     part_len: usize,
 }
 
@@ -111,7 +111,7 @@ pub(crate) struct DatagramReceiver {
     message: Vec<u8>,
     len: usize,
     part_len: usize,
-    /// Parts of the message that have arrived.
+    /// Number of parts of the current message that have arrived.
     received_parts: usize,
 }
 
@@ -122,12 +122,12 @@ impl DatagramReceiver {
             _ => UnixDatagram::bind(socket_path(task.path_prefix, number))?.into(),
         };
         let (len, part_len) = (task.payload, max_part_len(task));
-        // A part of another message, received in place of the last part, may be longer.
+        // A part of another message may arrive instead of the last part, and may be longer.
         Ok(DatagramReceiver { socket, message: vec![0; len + part_len], len, part_len, received_parts: 0 })
     }
 
-    /// Receives the next part, and writes it after those that have arrived. Returns the label of the message if that
-    /// was the last part.
+    /// Receives the next part, and writes it after the parts that have arrived. Returns the label of the message if the
+    /// part was its last one.
     fn take_part(&mut self) -> Outcome<Option<Label>> {
         let place = self.received_parts * self.part_len;
         let (mut number, mut index) = ([0; NUMBER_LEN], [0; NUMBER_LEN]);
@@ -143,7 +143,7 @@ impl DatagramReceiver {
         if index == 0 {
             self.message.copy_within(place..place + self.part_len, 0);
         } else if index != self.received_parts || self.message[..NUMBER_LEN] != number {
-            // The parts that have arrived will never be complete.
+            // The message with the parts that have arrived will never be complete.
             self.received_parts = 0;
             return Ok(None);
         }
@@ -183,7 +183,7 @@ fn group_socket(group: Ipv4Addr) -> Outcome<OwnedFd> {
     Ok(socket.into())
 }
 
-/// Returns how many bytes of a message a datagram of this kind holds.
+/// Returns the maximum number of a message's bytes in one datagram.
 fn max_part_len(task: &RunParameters) -> usize {
     match task.mechanism {
         Mechanism::Multicast if task.payload > MAX_UDP_LEN => MAX_UDP_LEN - 2 * NUMBER_LEN,
@@ -200,15 +200,16 @@ fn socket_path(path_prefix: &str, number: usize) -> String {
 const NUMBER_LEN: usize = size_of::<u64>();
 /// Maximum length of a UDP datagram.
 const MAX_UDP_LEN: usize = 65_507;
-/// Maximum length that the system's send buffer holds with the kernel's overhead.
+/// Maximum length of a Unix datagram that fits into the system's send buffer with the kernel's overhead.
 const MAX_UNIX_LEN: usize = 65_536;
 /// Receive buffer of a member of the group, in bytes.
 const RECEIVE_BUFFER_LEN: usize = 4 << 20;
 /// Port of all groups; each run has its own group.
 const GROUP_PORT: u16 = 29_183;
 
-/// The sending ends of Unix stream sockets, TCP or pipes: one connection per receiver, and one write to each for a
-/// message. All messages have the same length, so a receiver reads exactly one message, with one read if possible.
+/// The sending ends of Unix stream sockets, TCP or pipes. Each receiver has its own connection, and each message is one
+/// write per connection. All messages have the same length, so a receiver reads exactly one message, if possible with
+/// one read.
 pub(crate) struct StreamSender {
     listener: Listener,
     receivers: usize,
@@ -268,7 +269,8 @@ impl MessageSender for StreamSender {
                 }
                 Listener::Pipes(paths) => {
                     let end = OpenOptions::new().write(true).open(&paths[number])?;
-                    // As large as a message. Users may not be allowed that; then the size stays.
+                    // Make the pipe as large as a message. If the system does not permit that, the size does not
+                    // change.
                     let _ = fcntl_setpipe_size(&end, self.buffer.bytes().len().max(PIPE_LEN));
                     end
                 }
@@ -314,7 +316,7 @@ impl StreamReceiver {
     pub(crate) fn new(task: &RunParameters, number: usize, address: &str) -> Outcome<StreamReceiver> {
         let end = match task.mechanism {
             Mechanism::Tcp => File::from(OwnedFd::from(TcpStream::connect(address)?)),
-            // Opened for writing too, because a pipe without a writer is at its end.
+            // Opened also for writing, because a pipe without a writer is at its end.
             Mechanism::Pipe => OpenOptions::new()
                 .read(true)
                 .write(true)

@@ -1,6 +1,6 @@
-//! Topics: a service of bytes with the settings of the hub for messages of any length, and the hub's topic `scan` for
-//! comparison. Both are published as in the hub: the sample is loaned, written in place and sent, and then all
-//! subscribers are woken once.
+//! Topics of two kinds: a service of bytes with the hub's settings for messages of any length, and for comparison the
+//! hub's topic `scan`. Both are published as in the hub. The publisher loans a sample, writes it in place, sends it,
+//! and then wakes all subscribers once.
 
 use iceoryx2::prelude::ServiceName;
 use scanhub_schema::limits::TopicLimits;
@@ -111,9 +111,9 @@ pub(crate) struct BytesReceiver {
 
 /// The way in which a subscriber waits, as in the client library.
 enum WaitMethod {
-    /// The doorbell, its count when samples were last received, and whether the subscriber sleeps.
+    /// The doorbell, the doorbell's count when samples were last received, and whether the subscriber sleeps.
     Doorbell(Doorbell, u32, bool),
-    /// The event, and whether wake-ups were taken since the last sleep.
+    /// The event, and whether the subscriber has taken wake-ups since its last sleep.
     Event(Box<Listener>, bool),
 }
 

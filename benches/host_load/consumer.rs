@@ -1,6 +1,6 @@
-//! Programs that use the data of both sensors, each a process with a thread per sensor. They use raw bytes, datagrams,
-//! the hub's scans, or the hub's results. They regularly print how many scans they have received, which shows whether
-//! one of them falls behind.
+//! Programs that use the data of both sensors. Each program is a process with a thread per sensor. A program uses raw
+//! bytes, datagrams, the hub's scans, or the hub's results. It regularly prints how many scans it has received, which
+//! shows whether it falls behind.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -23,9 +23,9 @@ use crate::support::environment::SENSORS;
 use crate::support::subscriber::subscribe;
 use crate::support::{Outcome, clock};
 
-/// Reads two serial lines, at most `max_read` bytes at once, like the simplest of programs: a thread per line blocks in
-/// `read` and finds telegrams with a state machine of six states. It makes no other system call. Programs that read a
-/// UART with 16 bytes read one byte at a time; more than 16 are never available there.
+/// Reads two serial lines, at most `max_read` bytes at once, like a very simple program. A thread per line blocks in
+/// `read` and finds telegrams with a state machine of six states. It makes no other system call. A program that reads a
+/// UART with a buffer of 16 bytes reads one byte at a time; more than 16 bytes are never available there.
 pub(crate) fn read_bytes(ports: [&str; 2], max_read: usize) -> Outcome<()> {
     run_for_both(|number, progress| {
         let line = SerialLine::open(Path::new(ports[number]), BAUD_RATE)?;
@@ -44,7 +44,7 @@ pub(crate) fn read_bytes(ports: [&str; 2], max_read: usize) -> Outcome<()> {
     })
 }
 
-/// Receives bare telegrams at `port` for the first sensor, and at the next port for the second.
+/// Receives plain telegrams at `port` for the first sensor, and at the next port for the second sensor.
 pub(crate) fn receive_datagrams(port: u16) -> Outcome<()> {
     run_for_both(|number, progress| {
         let (socket, mut processors) = (datagrams::receiver(port + number as u16)?, Processors::new());
@@ -78,7 +78,7 @@ pub(crate) fn receive_results(domain: &str) -> Outcome<()> {
         loop {
             let Some(foreground) = foreground.next()? else { continue };
             black_box((foreground.beams, foreground.segments().len()));
-            // Take the zones of the same scan, and any earlier ones that reported a silence.
+            // Take the zones of the same scan. Also take earlier zones that reported a silence.
             while let Some(zones) = zones.try_next()? {
                 black_box((zones.verdict(), zones.nearest()));
                 if zones.header().seq >= foreground.header().seq {
@@ -90,7 +90,7 @@ pub(crate) fn receive_results(domain: &str) -> Outcome<()> {
     })
 }
 
-/// Runs `follow` for both sensors, each in a thread. The process exits if one fails.
+/// Runs `follow` for both sensors, each in its own thread. The process exits if one of them fails.
 fn run_for_both(follow: impl Fn(usize, &mut Progress) -> Outcome<()> + Sync) -> Outcome<()> {
     let follow_or_end = |number: usize| {
         let mut progress = Progress { sensor: SENSORS[number], count: 0 };
@@ -126,11 +126,11 @@ impl Progress {
 const BEAM_COUNT: usize = 361;
 /// Baud rate of the simulated sensors.
 const BAUD_RATE: u32 = 500_000;
-/// Scans between two reports, a little less than a second.
+/// Number of scans between two reports. It corresponds to a little less than a second.
 const REPORT_INTERVAL: u64 = 32;
 
-/// Everything that is computed from the scans of one sensor, with the same code and settings as in the hub: decoding,
-/// zones, marks, background, and foreground with its segments.
+/// All processors for the scans of one sensor, with the same code and settings as in the hub: decoding, zones, marks,
+/// background, and foreground with its segments.
 struct Processors {
     zone_checker: zones::ZoneChecker,
     marks: marks::MarkDetector,

@@ -1,5 +1,5 @@
-//! CPU time of the machine and of its processes, as the kernel counts it. There are two counts. `/proc/stat` adds whole
-//! ticks to the thread that runs at the tick, and the scheduler adds nanoseconds to each thread.
+//! CPU time of the machine and of its processes, as the kernel counts it in two ways. `/proc/stat` adds whole ticks to
+//! the thread that runs at the tick. The scheduler adds nanoseconds to each thread.
 
 use std::collections::BTreeMap;
 use std::fs::{read_dir, read_to_string};
@@ -70,7 +70,7 @@ impl<'a> Span<'a> {
         Span { before, after }
     }
 
-    /// Returns the CPU time of the whole machine by `/proc/stat`. Interrupts count as system time.
+    /// Returns the CPU time of the whole machine as `/proc/stat` counts it. Interrupts count as system time.
     pub(crate) fn machine(&self) -> Share {
         let (before, after) = (self.before.ticks, self.after.ticks);
         let part = |ticks: u64| self.percent(ticks as f64 / USER_HZ * 1e9);
@@ -80,13 +80,13 @@ impl<'a> Span<'a> {
         }
     }
 
-    /// Returns the time that the hypervisor took away, in percent of one processor.
+    /// Returns the time that the hypervisor used for other machines, in percent of one processor.
     pub(crate) fn stolen(&self) -> f64 {
         let stolen = self.after.ticks.stolen.saturating_sub(self.before.ticks.stolen);
         self.percent(stolen as f64 / USER_HZ * 1e9)
     }
 
-    /// Returns the CPU time of these processes by the scheduler. Fails if one of them has ended.
+    /// Returns the CPU time of these processes as the scheduler counts it. Fails if one of the processes has ended.
     pub(crate) fn of(&self, pids: &[u32]) -> Outcome<Share> {
         let mut sum = Usage::default();
         for pid in pids {
@@ -96,13 +96,14 @@ impl<'a> Span<'a> {
         Ok(sum.share(self.percent(sum.busy_ns as f64)))
     }
 
-    /// Returns the CPU time of the kernel's threads by the scheduler, in percent of one processor. Some of these
-    /// threads pass on the bytes of ttys.
+    /// Returns the CPU time of the kernel's threads as the scheduler counts it, in percent of one processor. Some of
+    /// these threads transfer the bytes of ttys.
     pub(crate) fn kernel(&self) -> f64 {
         self.sum(|usage| usage.is_kernel)
     }
 
-    /// Returns the same for all processes that existed at the end.
+    /// Returns the CPU time of all processes that existed at the end, as the scheduler counts it, in percent of one
+    /// processor.
     pub(crate) fn all_processes(&self) -> f64 {
         self.sum(|_| true)
     }
@@ -149,16 +150,16 @@ impl Ticks {
 /// CPU time of a process since its start.
 #[derive(Clone, Copy, Debug, Default)]
 struct Usage {
-    /// CPU time, exact.
+    /// Exact CPU time.
     busy_ns: u64,
-    /// Ticks in user and system mode, which divide `busy_ns`.
+    /// Ticks in user mode and in system mode. Their ratio divides `busy_ns`.
     user: u64,
     system: u64,
     is_kernel: bool,
 }
 
 impl Usage {
-    /// Returns the counters of the process with this directory; `None` if it has exited.
+    /// Returns the counters of the process with this directory, or `None` if it has exited.
     fn of(process: &Path) -> Option<Usage> {
         let stat = read_to_string(process.join("stat")).ok()?;
         // The name may contain spaces and brackets; the field after it is the third.
@@ -191,13 +192,13 @@ impl Usage {
 
     /// Returns `busy` divided into user and system time.
     fn share(&self, busy: f64) -> Share {
-        // Half a tick is added to each, so that no time is lost if no tick was counted.
+        // Half a tick is added to both, so that the whole time is divided even if no tick was counted.
         let system = busy * (self.system as f64 + 0.5) / ((self.user + self.system) as f64 + 1.0);
         Share { user: busy - system, system }
     }
 }
 
-/// Ticks per second of the figures that the kernel reports, whatever its own tick is.
+/// Ticks per second in the figures that the kernel reports. The kernel's own tick may differ.
 const USER_HZ: f64 = 100.0;
 /// Parent of all threads of the kernel.
 const KTHREADD_PID: u64 = 2;

@@ -1,5 +1,5 @@
-//! Simulation of the paper's unit between two sensors and a network. It sends only the datagrams of that unit: bare
-//! telegrams to a multicast group on the loopback, one port per sensor, at the sensors' rate.
+//! Simulation of the paper's unit between two sensors and a network. It sends only the datagrams of that unit: plain
+//! telegrams to a multicast group on the loopback, with one port per sensor, at the sensors' rate.
 
 use std::net::{Ipv4Addr, UdpSocket};
 
@@ -14,7 +14,7 @@ use scanhub_sim::room::Room;
 use crate::consumer::MODE;
 use crate::support::{Outcome, clock};
 
-/// Prints `ready`, and then sends forever: to `port` for the first sensor, and to the next port for the second.
+/// Prints `ready`, and then sends forever: to `port` for the first sensor, and to the next port for the second sensor.
 pub(crate) fn send(port: u16) -> Outcome<()> {
     let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
     set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST)?;
@@ -25,7 +25,7 @@ pub(crate) fn send(port: u16) -> Outcome<()> {
     let begin = clock::now();
     for number in 0.. {
         for (sensor, telegrams) in rooms.iter().enumerate() {
-            // Sensors are not synchronized; here they are half a scan apart.
+            // Sensors are not synchronized. In this simulation, their scans are half a period apart.
             clock::sleep_until(begin + number * SCAN_PERIOD_NS + sensor as u64 * SCAN_PERIOD_NS / 2);
             let telegram = &telegrams[number as usize % telegrams.len()];
             socket.send_to(telegram, (GROUP, port + sensor as u16))?;
@@ -34,7 +34,8 @@ pub(crate) fn send(port: u16) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns a socket that receives the datagrams for `port` of the group. Any number of sockets can do so.
+/// Returns a socket that receives the datagrams of the group for `port`. Several sockets can receive them at the same
+/// time.
 pub(crate) fn receiver(port: u16) -> Outcome<UdpSocket> {
     let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
     set_socket_reuseaddr(&socket, true)?;
@@ -60,5 +61,5 @@ fn telegrams(sensor: u64) -> Vec<Vec<u8>> {
 
 /// A group whose datagrams never leave this machine, because of its scope and the time to live.
 const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 76, 90);
-/// Time from scan to scan of 361 beams, in ns.
+/// Time from one scan of 361 beams to the next, in ns.
 const SCAN_PERIOD_NS: u64 = 2 * MIRROR_PERIOD;

@@ -1,30 +1,30 @@
 //! Load of a machine by programs that use two sensors (the paper's Fig. 7), in five setups.
 //!
-//! - a: Each program reads the raw bytes, one by one, from its own two lines, and does everything itself.
-//! - b: Each does the same, but reads all bytes that have arrived.
-//! - c: Each receives bare telegrams by multicast, as from the paper's unit, and does the rest itself.
-//! - d: Each receives the scans of the hub.
-//! - e: Each receives the zones and the foreground of the hub.
+//! - a: Each program reads the raw bytes from its own two lines, one byte at a time, and does everything itself.
+//! - b: Like a, but each program reads all bytes that have arrived.
+//! - c: Each program receives plain telegrams by multicast, as from the paper's unit, and does the rest itself.
+//! - d: Each program receives the scans of the hub.
+//! - e: Each program receives the zones and the foreground of the hub.
 //!
-//! Each program is a process, and each receives 37.5 scans per second of each sensor; a table shows whether it did.
-//! Processes that simulate hardware (simulators, and in c the unit) do not count: their time is subtracted from that of
-//! the machine.
+//! Each program is a process, and must receive 37.5 scans per second of each sensor. A table shows whether it did.
+//! Processes that simulate hardware do not count: the simulators, and in c the unit. Their time is subtracted from the
+//! machine's time.
 //!
-//! Each run has two counts. `/proc/stat` is the paper's count: the whole machine, with interrupts as system time, and
-//! with all other programs that run. A kernel that counts by ticks (CONFIG_TICK_CPU_ACCOUNTING) adds a tick of 1 to 10
-//! ms to the thread that runs at the tick. Most threads here run for less than 0.1 ms at a time. The table "/proc/stat,
-//! as a share of the scheduler's count" measures the error: 100 % would be exact. It is more if other processes ended
-//! during the run, because the scheduler's count then lacks them.
+//! Each run has two counts. `/proc/stat` is the paper's count. It covers the whole machine with all other programs that
+//! run, and counts interrupts as system time. A kernel that counts by ticks (CONFIG_TICK_CPU_ACCOUNTING) adds a tick of
+//! 1 to 10 ms to the thread that runs at the tick. Most threads here run for less than 0.1 ms at a time. The table
+//! "/proc/stat, as a share of the scheduler's count" shows the error: 100 % would be exact. The share is larger if
+//! other processes ended during the run, because the scheduler's count does not contain them.
 //!
-//! The count of the processes is the scheduler's, in nanoseconds (schedstat); only its division into user and system
-//! time is by ticks, over the whole run time of a process. The targets refer to this count. It does not include the
-//! work of the kernel's threads for a pty, which is more if there are more ptys; another table shows it.
+//! The scheduler counts the CPU time of processes in nanoseconds (schedstat). Only the division into user and system
+//! time comes from ticks, over the whole run time of a process. The targets apply to this count. The count excludes the
+//! work of the kernel's threads for a pty, which increases with the number of ptys. Another table shows that work.
 //!
 //! The bench does not measure the cost of a real UART, because a pty has no interrupts. It needs an otherwise idle
 //! machine.
 //!
-//! Figures are shares of one processor. A rate below 37.5 Hz means that the setup fell behind: its load is that of an
-//! overloaded machine.
+//! Figures are shares of one processor. A rate below 37.5 Hz means that the setup fell behind. Its load is then the
+//! load of an overloaded machine.
 
 mod consumer;
 mod cpu_time;
@@ -70,7 +70,7 @@ fn measure(options: &Options) -> Outcome<()> {
     let span = Duration::from_secs(seconds);
     let mut runs = Vec::new();
     for pair in 0..pairs {
-        // CPU time of the sender without receivers.
+        // CPU time of the sender when there are no receivers.
         let deaf = Setup::Datagrams.start(0)?.measure(span)?.drivers;
         for (round, &count) in counts.iter().enumerate() {
             let mut set_ups = Setup::ALL;
@@ -160,8 +160,8 @@ impl<'a> Tables<'a> {
         }
     }
 
-    /// Returns the figures of the hub's results compared with raw bytes. The targets are the paper's: a sixth of the
-    /// system time, a third of the user time.
+    /// Returns the figures of the hub's results, compared with raw bytes. The targets come from the paper: a sixth of
+    /// the system time, and a third of the user time.
     fn figures(&self) -> Vec<Figure> {
         let of = |name, value: Value, target| {
             let [hub, baseline] =
@@ -194,7 +194,7 @@ const fn load(name: &'static str, rows: &'static [Setup], value_of: Value) -> Ta
 }
 
 const BENCH_NAME: &str = "host_load";
-/// Number of subscribers in the paper's setup, to which its figures belong.
+/// Number of subscribers in the paper's setup. The paper's figures apply to this number.
 const MAX_SUBSCRIBERS: usize = 4;
 /// Setups with a hub.
 const WITH_HUB: [Setup; 2] = [Setup::Scans, Setup::Results];

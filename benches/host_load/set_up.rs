@@ -1,5 +1,5 @@
-//! The ways in which programs receive the data of two sensors. Each setup is a set of processes. Some belong to the
-//! host, and some only simulate hardware outside of it. Also measures their CPU time.
+//! The ways in which programs receive the data of two sensors. Each setup is a set of processes. Some processes belong
+//! to the host. The others only simulate hardware outside of the host. This module also measures their CPU time.
 
 use std::thread;
 use std::time::Duration;
@@ -14,13 +14,13 @@ use crate::support::environment::{BenchEnvironment, Child, SENSORS, STEP_TIMEOUT
 pub(crate) enum Setup {
     /// Each subscriber has its own two serial lines, reads them byte by byte and does everything itself.
     Bytes,
-    /// The same, but each reads all bytes that have arrived.
+    /// Like `Bytes`, but each subscriber reads all bytes that have arrived.
     Blocks,
-    /// Each receives bare telegrams by multicast and does the rest itself.
+    /// Each subscriber receives plain telegrams by multicast and does the rest itself.
     Datagrams,
-    /// Each receives the scans of the hub.
+    /// Each subscriber receives the scans of the hub.
     Scans,
-    /// Each receives the zones and the foreground of the hub.
+    /// Each subscriber receives the zones and the foreground of the hub.
     Results,
 }
 
@@ -84,7 +84,7 @@ impl Setup {
     }
 }
 
-/// All processes of a setup. They are ended in this order.
+/// All processes of a setup. Dropping the setup ends them in this order.
 pub(crate) struct SetupProcesses {
     pub(crate) consumers: Vec<Child>,
     pub(crate) hub: Option<Child>,
@@ -103,7 +103,7 @@ impl SetupProcesses {
         Load::of(&Span::new(&before, &after), self, self.hz(before.at_ns(), after.at_ns())?)
     }
 
-    /// Returns the scans per second of the subscriber and sensor with the fewest; 0 without subscribers.
+    /// Returns the scans per second of the slowest combination of subscriber and sensor, or 0 without subscribers.
     fn hz(&self, from_ns: u64, to_ns: u64) -> Outcome<f64> {
         let mut minimum: Option<f64> = None;
         for subscriber in &self.consumers {
@@ -118,7 +118,7 @@ impl SetupProcesses {
                     [(first, from_ns), .., (last, to_ns)] => {
                         (last - first) as f64 * 1e9 / (to_ns - from_ns) as f64
                     }
-                    // The program is too slow, or the time is too short for a rate.
+                    // The program is too slow, or the time is too short to calculate a rate.
                     _ => 0.0,
                 };
                 minimum = Some(minimum.map_or(hz, |minimum| minimum.min(hz)));
@@ -136,11 +136,11 @@ const SETTLE_TIME: Duration = Duration::from_secs(2);
 /// CPU time during a run, in percent of one processor.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Load {
-    /// The whole machine by `/proc/stat`.
+    /// The whole machine as `/proc/stat` counts it.
     pub(crate) machine: Share,
-    /// Subscribers and hub by the scheduler.
+    /// Subscribers and hub as the scheduler counts them.
     pub(crate) processes: Share,
-    /// The part of `processes` that is the hub's.
+    /// The hub's part of `processes`.
     pub(crate) hub: Share,
     /// Threads of the kernel.
     pub(crate) kernel: f64,
@@ -150,18 +150,18 @@ pub(crate) struct Load {
     pub(crate) bench: Share,
     /// All processes and threads of the kernel that existed at the end.
     pub(crate) all_processes: f64,
-    /// Time that the hypervisor took away.
+    /// Time that the hypervisor used for other machines.
     pub(crate) stolen: f64,
-    /// Scans per second of the subscriber and sensor with the fewest.
+    /// Scans per second of the slowest combination of subscriber and sensor.
     pub(crate) hz: f64,
 }
 
 /// CPU time of the host by both counts, in percent of one processor.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Host {
-    /// By `/proc/stat`, without processes that are not part of the host.
+    /// CPU time as `/proc/stat` counts it, without processes that are not part of the host.
     pub(crate) machine: Share,
-    /// By the scheduler: subscribers and hub.
+    /// CPU time of subscribers and hub as the scheduler counts it.
     pub(crate) processes: Share,
 }
 
@@ -182,9 +182,9 @@ impl Load {
         })
     }
 
-    /// Returns the host's part. On a loopback, the system call of the sender also delivers a datagram; on a network,
-    /// the receiver's interrupt does that. The time that a sender needs beyond `idle`, the time of one without
-    /// receivers, therefore belongs to the host. Other setups pass `None`.
+    /// Returns the host's part. On a loopback, the sender's system call also delivers a datagram; on a network, the
+    /// receiver's interrupt does that. `idle` is the CPU time of a sender without receivers. The time that a sender
+    /// needs beyond `idle` therefore belongs to the host. Other setups pass `None`.
     pub(crate) fn of_host(&self, idle: Option<Share>) -> Host {
         let delivery = idle.map_or(0.0, |deaf| (self.drivers.total() - deaf.total()).max(0.0));
         let delivery = Share { user: 0.0, system: delivery };

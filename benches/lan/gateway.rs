@@ -1,4 +1,5 @@
-//! Latency and CPU time that the gateway adds to a datagram, and the maximum number of datagrams that it can send.
+//! Latency and CPU time that the gateway adds to a datagram, and the maximum number of datagrams that it can send per
+//! second.
 
 use std::io::Read;
 use std::net::UdpSocket;
@@ -20,19 +21,19 @@ use crate::support::usage::ThreadUsage;
 use crate::support::{Outcome, clock};
 use crate::wire::{self, has_topic, number};
 
-/// Samples of a run.
+/// Number of samples in a run.
 const SAMPLE_COUNT: usize = 800;
-/// Samples at the start of a run that do not count.
+/// Number of samples at the start of a run that do not count.
 const SKIPPED_SAMPLES: usize = 80;
 /// Period of the samples, in ns. Two sensors at 37.5 Hz send every 13 ms; a shorter period keeps the runs short.
 const PERIOD_NS: u64 = 7_000_000;
-/// Position of the sequence number in the header.
+/// Position of the sequence number in the header of a datagram.
 const NUMBER_FIELD: std::ops::Range<usize> = 20..24;
 /// Arguments with which this program is the sender of a baseline run.
 pub(crate) const SENDER_PART: [&str; 2] = ["part", "sender"];
 
-/// Measures p50 and p99 of the time from shared memory to a receiving application on the loopback. Alternates with a
-/// baseline that sends a datagram of the same length when an eventfd is signaled.
+/// Measures p50 and p99 of the time from shared memory to a receiving program on the loopback. The runs alternate with
+/// a baseline that sends a datagram of the same length when an eventfd is signaled.
 pub(crate) fn latency(pairs: usize) -> Outcome<Vec<Figure>> {
     let (mut hub, mut baseline): (Vec<Run>, Vec<Run>) = Default::default();
     for pair in 0..pairs {
@@ -96,8 +97,8 @@ fn baseline_run() -> Outcome<Run> {
     application.end()
 }
 
-/// Runs the process that a baseline run wakes. It sends a datagram with the next number each time that its stdin, an
-/// eventfd, is signaled.
+/// Runs the process that a baseline run wakes. Its stdin is an eventfd. Each time the eventfd is signaled, the process
+/// sends a datagram with the next number.
 pub(crate) fn run_sender() -> Outcome<()> {
     set_parent_process_death_signal(Some(Signal::TERM))?;
     let socket = wire::sender()?;
@@ -107,7 +108,7 @@ pub(crate) fn run_sender() -> Outcome<()> {
     while !numbers.is_empty() {
         let mut count = [0; 8];
         rustix::io::read(rustix::stdio::stdin(), &mut count)?;
-        // A sender that is late reads a count of several.
+        // If the sender is late, it reads a count greater than one.
         for number in numbers.by_ref().take(u64::from_ne_bytes(count) as usize) {
             datagram[NUMBER_FIELD].copy_from_slice(&number.to_le_bytes());
             socket.send_to(&datagram, wire::address(Topic::Scan))?;
@@ -116,7 +117,7 @@ pub(crate) fn run_sender() -> Outcome<()> {
     Ok(())
 }
 
-/// Ages in us, sorted, and the number of datagrams that did not arrive.
+/// Sorted ages in us, and number of datagrams that did not arrive.
 type Run = (Vec<f64>, f64);
 
 /// A thread that collects the ages of datagrams.
@@ -147,8 +148,8 @@ impl Application {
         Ok(Application { is_finished, thread })
     }
 
-    /// Ends the thread, and returns what arrived. Some may be missing, because a hub does not wait for a process that
-    /// is descheduled.
+    /// Ends the thread, and returns what arrived. Some datagrams may be missing, because a hub does not wait for a
+    /// process that is descheduled.
     fn end(self) -> Outcome<Run> {
         self.is_finished.store(true, Ordering::Relaxed);
         let ages = self.thread.join().map_err(|_| "the application panicked")?;
@@ -172,14 +173,14 @@ fn wall_ns() -> u64 {
     now.unwrap_or(Duration::ZERO).as_nanos() as u64
 }
 
-/// Time in which the gateway certainly finds a new hub.
+/// Time after which the gateway has certainly found a new hub, in ns.
 const ATTACH_TIMEOUT_NS: u64 = 6_000_000_000;
 
 const MEASURE_TIME: Duration = Duration::from_secs(8);
-/// Time in which the gateway certainly finds a new hub.
+/// Time after which the gateway has certainly found a new hub.
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(6);
 const UNPACED_TIME: Duration = Duration::from_secs(3);
-/// Name of the thread that is the baseline.
+/// Name of the thread that runs the baseline.
 const BASELINE_THREAD: &str = "bare";
 /// Datagrams within this time are sent without a pause, in ns.
 const BURST_NS: u64 = 1_000_000;
@@ -187,8 +188,8 @@ const BURST_NS: u64 = 1_000_000;
 /// Time of arrival, and a datagram.
 type ReceivedDatagram = (u64, Vec<u8>);
 
-/// Measures the gateway's CPU time per datagram for two sensors with all their topics, compared with a thread that
-/// sends the same datagrams at the same times; and how many datagrams per second it can send.
+/// Measures the gateway's CPU time per datagram for two sensors with all their topics. The baseline is a thread that
+/// sends the same datagrams at the same times. Also measures how many datagrams per second the gateway can send.
 pub(crate) fn cpu_time(pairs: usize) -> Outcome<Vec<Figure>> {
     let (mut hub, mut baseline, mut share, mut rate) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     {
@@ -218,7 +219,7 @@ pub(crate) fn cpu_time(pairs: usize) -> Outcome<Vec<Figure>> {
     ])
 }
 
-/// Returns the gateway's CPU time in ns, and the datagrams that it sent.
+/// Returns the gateway's CPU time in ns, and the datagrams that the gateway sent.
 fn gateway_cpu_time(environment: &BenchEnvironment) -> Outcome<(f64, Vec<ReceivedDatagram>)> {
     let gateway = wire::gateway(environment, "lo", &wire::all_topics())?;
     thread::sleep(ATTACH_TIMEOUT);
@@ -234,7 +235,7 @@ fn gateway_cpu_time(environment: &BenchEnvironment) -> Outcome<(f64, Vec<Receive
     Ok((busy_ns as f64, received))
 }
 
-/// Returns the CPU time of a thread that sends the same datagrams, with a receiver as well.
+/// Returns the CPU time of a thread that sends the same datagrams while a thread receives them.
 fn baseline_cpu_time(received: &[ReceivedDatagram]) -> Outcome<f64> {
     let (stop, socket, to_groups) = (Arc::new(AtomicBool::new(false)), wire::receiver()?, wire::sender()?);
     let flag = stop.clone();
@@ -282,7 +283,7 @@ fn receive(socket: &UdpSocket, stop: &AtomicBool) -> Vec<ReceivedDatagram> {
     received
 }
 
-/// Returns how many scans per second the gateway sends if more are always available.
+/// Returns the number of scans per second that the gateway sends if more scans are always available.
 fn max_rate_of_gateway() -> Outcome<f64> {
     let environment = BenchEnvironment::new()?;
     let mut source = ScanSource::open(&environment.domain)?;
@@ -293,7 +294,7 @@ fn max_rate_of_gateway() -> Outcome<f64> {
     }
     let lines = gateway.end()?;
     let scans: Vec<_> = lines.iter().filter(|(_, line)| has_topic(line, SENSOR, "scan")).collect();
-    // Compare two of its statistics in the middle of the run.
+    // Compare two statistics of the gateway in the middle of the run.
     let [.., (from_ns, first), (to_ns, last), _] = scans[..] else { return Err("too few statistics".into()) };
     if number(last, "missed") == number(first, "missed") {
         eprintln!("the gateway could have sent more");
@@ -301,7 +302,7 @@ fn max_rate_of_gateway() -> Outcome<f64> {
     Ok((number(last, "sent") - number(first, "sent")) as f64 / ((to_ns - from_ns) as f64 / 1e9))
 }
 
-/// Returns how many datagrams of this length a loop sends per second.
+/// Returns the number of datagrams of this length that a loop sends per second.
 fn max_rate_of_baseline() -> Outcome<f64> {
     let to_groups = wire::sender()?;
     let datagram = vec![0; HEADER_LEN + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];

@@ -9,7 +9,7 @@
 //!
 //! The bench does not measure what a real switch does.
 //!
-//! After a link was down, the kernel sends no datagram until its link watch has run, up to a second later.
+//! After a link was down, the kernel sends no datagram until its link watch has run. That takes up to a second.
 
 #[path = "../../tests/testkit/child.rs"]
 mod child;
@@ -78,7 +78,7 @@ fn measure_healthy_link(seconds: u64) -> Outcome<Vec<Figure>> {
     let mut rates = Vec::new();
     for sensor in SENSORS {
         let lines: Vec<_> = sent.iter().filter(|(_, line)| has_topic(line, sensor, "scan")).collect();
-        // The first statistics are from before the sensors stream. The last ones may cover a fraction of a second.
+        // The first statistics were printed before the sensors stream. The last ones may cover a fraction of a second.
         let [(from_ns, first), .., (to_ns, last), _] = lines[..] else { return Err("too short".into()) };
         let count = number(last, "sent") - number(first, "sent");
         rates.push(count as f64 / ((to_ns - from_ns) as f64 / 1e9));
@@ -97,8 +97,8 @@ fn measure_healthy_link(seconds: u64) -> Outcome<Vec<Figure>> {
     ])
 }
 
-/// Beams of 100 degrees at 1, 0.5 and 0.25 degrees and of 180 degrees at 1 and 0.5, with the names without and with
-/// intensities.
+/// Number of beams with two names: without and with intensities. The beams cover 100 degrees at 1, 0.5 and 0.25
+/// degrees, and 180 degrees at 1 and 0.5 degrees.
 const VARIANTS: [(usize, &str, &str); 5] = [
     (101, "size: 100/1", "size: 100/1, intensities"),
     (201, "size: 100/0.5", "size: 100/0.5, intensities"),
@@ -120,11 +120,11 @@ fn size(name: &'static str, count: usize, contents: u8) -> Figure {
     Figure { name, unit: "B", hub, baseline: Vec::new(), target: Target::Max(MTU_SAFE as f64) }
 }
 
-/// Damaged datagrams between two intact ones. A listener's buffer certainly holds this number.
+/// Number of damaged datagrams between two intact ones. A listener's buffer certainly has room for them.
 const DAMAGED_PER_INTACT: u64 = 50;
 
-/// Sends `count` damaged and random datagrams to a listener. Measures what it accepts and reports, and whether its
-/// memory grows.
+/// Sends `count` damaged and random datagrams to a listener. Measures which datagrams the listener accepts and reports,
+/// and whether its memory grows.
 fn damaged_datagrams(count: u64) -> Outcome<Vec<Figure>> {
     let mut command = Command::new(wire::PROGRAM);
     command.args(["listen", "--json", "--interface=lo", "--topic=zones"]);
@@ -179,7 +179,7 @@ fn sealed_datagram(
     Ok(head.seal(buffer, len).ok_or("it does not fit")?.to_vec())
 }
 
-/// Returns one of `intact` with some bits flipped, with its end cut off, extended, or replaced; or random bytes.
+/// Returns one of `intact` with some bits flipped, with its end removed, extended or replaced, or returns random bytes.
 fn damaged_datagram(random: &mut fastrand::Rng, intact: &[Vec<u8>]) -> Vec<u8> {
     let mut bytes = intact[random.usize(..intact.len())].clone();
     match random.u8(..5) {
@@ -212,7 +212,8 @@ fn resident_kb(program: &Program) -> Outcome<u64> {
 /// Time for which the gateway's link is down.
 const DOWN_TIME: Duration = Duration::from_secs(10);
 
-/// Takes the gateway's link down. Measures when it is received again, and whether another machine notices.
+/// Takes the gateway's link down. Measures the time until its datagrams arrive again, and whether another machine
+/// detects the silence.
 fn measure_link_down() -> Outcome<Vec<Figure>> {
     let environment = BenchEnvironment::new()?;
     let (pulled, other) = (Machine::new(3), Machine::new(4));
