@@ -1,9 +1,9 @@
-//! Latency of subscribers in other languages than Rust, measured from the last byte that the hub read to the scan in
-//! one process, which is the only subscriber. The languages alternate. Rust sleeps on the doorbell, its default, and is
-//! the baseline. The bench does not measure what a program does with the scan.
+//! Latency of subscribers in other languages than Rust. It is the time from the last byte that the hub read until one
+//! process has the scan. This process is the only subscriber. The runs of the languages alternate. Rust sleeps on the
+//! doorbell, its default, and is the baseline. The bench does not measure what a program does with the scan.
 //!
-//! Also measures the time in which Python reads ten minutes of two sensors from a recording into numpy arrays, compared
-//! with the same loop in Rust. Both processes measure it without their start.
+//! Also measures the time in which Python reads ten minutes of two sensors from a recording into numpy arrays. The
+//! baseline is the same loop in Rust. Neither time includes the start of the process.
 
 mod support;
 
@@ -27,11 +27,11 @@ use support::{Options, Outcome};
 /// A language that is compared with Rust.
 struct Language {
     figures: [&'static str; 3],
-    /// Maximum ratio of its p50 to that of Rust.
+    /// Maximum ratio of the language's p50 to Rust's p50.
     max_ratio: f64,
-    /// Returns program and first arguments of its subscriber. Returns `None`, and prints the reason, if this machine
-    /// cannot run it. Domain, sensor and number of scans follow as arguments. The subscriber prints `aged SENSOR NS`
-    /// for each scan, and `end`.
+    /// Returns the program and the first arguments of the language's subscriber. If this machine cannot run it, prints
+    /// the reason and returns `None`. Domain, sensor and number of scans follow as arguments. The subscriber prints
+    /// `aged SENSOR NS` for each scan, and then `end`.
     subscriber_command: fn() -> Outcome<Option<Vec<String>>>,
 }
 
@@ -98,7 +98,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns the ages of `count` scans in us, sorted. Drops the first scans.
+/// Returns the ages of `count` scans in us, sorted. The first scans do not count.
 fn ages(subscriber: &Child, count: usize) -> Outcome<Vec<f64>> {
     let lines = subscriber.lines_until("end", STEP_TIMEOUT + Duration::from_millis(50) * count as u32)?;
     let aged = lines.iter().filter(|line| line.text.starts_with("aged")).skip(SKIPPED_SCANS);
@@ -107,7 +107,7 @@ fn ages(subscriber: &Child, count: usize) -> Outcome<Vec<f64>> {
     Ok(ages)
 }
 
-/// Measures how long it takes to read a recording.
+/// Measures the time that it takes to read a recording.
 fn measure_reading(environment: &BenchEnvironment, options: &Options) -> Outcome<Option<Figure>> {
     let Some(mut words) = python_subscriber()? else { return Ok(None) };
     let file = environment.file("read.mcap");
@@ -131,7 +131,7 @@ fn measure_reading(environment: &BenchEnvironment, options: &Options) -> Outcome
     Ok(Some(Figure { name, unit: "ms", hub: pythons, baseline: rusts, target: Target::Ratio(1.3) }))
 }
 
-/// Writes a recording of two sensors. The scans repeat after a while.
+/// Writes a recording of two sensors. The same scans repeat after a while.
 fn record(file: &Path, seconds: u64) -> Outcome<()> {
     let room = Room::new(&"room".parse()?, 1);
     let period_ns = Variant::HALF.revolutions() * MIRROR_PERIOD;
@@ -168,7 +168,7 @@ fn record(file: &Path, seconds: u64) -> Outcome<()> {
     Ok(())
 }
 
-/// Reads the scans of a recording into arrays, and prints the time that it took.
+/// Reads the scans of a recording into arrays, and prints the time that this took.
 fn read(file: &Path) -> Outcome<()> {
     let begin = Instant::now();
     let mut beams = 0;
@@ -237,5 +237,5 @@ fn c_subscriber() -> Outcome<Option<Vec<String>>> {
 const SENSOR: &str = "front";
 /// Sensors in the recording.
 const RECORDED: [&str; 2] = ["front", "rear"];
-/// Scans at the start of a run that do not count.
+/// Number of scans at the start of a run that do not count.
 const SKIPPED_SCANS: usize = 40;

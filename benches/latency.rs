@@ -1,13 +1,13 @@
-//! Age of a telegram when a subscriber receives it. Measured from the last byte written into the pty, by the
-//! simulator's own stamp, to the sample in another process that sleeps in the client library, at 37.5 Hz from each of
-//! two sensors. The baseline is a bare chain with the same late read: pty, process, eventfd, process. Sent and received
-//! telegrams are matched by hash. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the same
-//! time (`support/simultaneous.rs`). The bench does not cover the time from the measurement of a beam to the line, or
-//! the delay of an adapter.
+//! Age of a telegram when a subscriber receives it, at 37.5 Hz from each of two sensors. The age starts when the last
+//! byte is written into the pty, by the simulator's own stamp. It ends when another process, which sleeps in the client
+//! library, has the sample. The baseline is a minimal chain that also reads late: pty, process, eventfd, process. Sent
+//! and received telegrams are matched by hash. Hub, baselines and, with `--beside PROGRAM`, the hub of another build
+//! run at the same time (`support/simultaneous.rs`). The bench does not cover the time from the measurement of a beam
+//! to the line, or the delay of an adapter.
 //!
-//! The path up to the last byte is that of the baseline, so the difference lies between the read and the subscriber.
-//! The 99th percentile and the maximum depend on the machine as much as on the hub, because the simulator runs on the
-//! same cores.
+//! The path up to the last byte is the same for the baseline, so the difference arises between the read and the
+//! subscriber. The 99th percentile and the maximum depend on the machine as much as on the hub, because the simulator
+//! runs on the same cores.
 
 mod support;
 
@@ -71,21 +71,21 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
     Ok(())
 }
 
-/// Telegrams received through one program in a round.
+/// Telegrams received from one program in a round.
 struct ReceivedTelegrams(Vec<ReceivedTelegram>);
 
 struct ReceivedTelegram {
     sensor: usize,
     hash: String,
-    /// Time at which the reader of the pty had its last byte.
+    /// Time at which the reader of the pty had the telegram's last byte.
     read_ns: u64,
-    /// Time at which the subscriber received it.
+    /// Time at which the subscriber received the telegram.
     at_ns: u64,
 }
 
 impl ReceivedTelegrams {
-    /// Returns the time from which the run counts, and its end. The start is that of the sensor that started to stream
-    /// last, and the end that of the sensor that ended first.
+    /// Returns the start and the end of the time that counts. It starts when the last sensor has started to stream, and
+    /// ends when the first sensor ends.
     fn span(&self) -> (u64, u64) {
         let mut ends = HashMap::<usize, (u64, u64)>::new();
         for arrived in &self.0 {
@@ -96,9 +96,9 @@ impl ReceivedTelegrams {
         (first + SETTLE_TIME.as_nanos() as u64, last)
     }
 
-    /// Returns the times from sent to received and from sent to read of the telegrams received in `span`, in us. A hub
-    /// verifies checksums, so all its telegrams were sent. A baseline without checksums may receive parts of two
-    /// telegrams.
+    /// Returns two series of times for the telegrams received in `span`, in us: from sent to received, and from sent to
+    /// read. A hub verifies checksums, so the sensors have sent all its telegrams. A baseline without checksums may
+    /// receive parts of two telegrams.
     fn latencies(&self, sent: &SentTimes, span: (u64, u64), is_hub: bool) -> Outcome<Latencies> {
         let mut latencies = Latencies::default();
         for arrived in self.0.iter().filter(|arrived| (span.0..=span.1).contains(&arrived.at_ns)) {
@@ -117,7 +117,7 @@ impl ReceivedTelegrams {
     }
 }
 
-/// Returns the span in which all runs of a round count.
+/// Returns the time span that counts in all runs of a round.
 fn shared_span(runs: &[ReceivedTelegrams]) -> (u64, u64) {
     let spans = runs.iter().map(ReceivedTelegrams::span);
     spans.fold((0, u64::MAX), |all, span| (all.0.max(span.0), all.1.min(span.1)))
@@ -130,7 +130,8 @@ struct Latencies {
     read: Vec<f64>,
 }
 
-/// Runs all programs until each has received `count` telegrams of each sensor after the start. Returns these telegrams.
+/// Runs all programs until each one has received `count` telegrams of each sensor after the start. Returns these
+/// telegrams.
 fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome<Vec<ReceivedTelegrams>> {
     let count = count + (SETTLE_TIME.as_millis() as u64 * SCAN_RATE_MHZ / 1_000_000) as usize;
     let start = |(number, candidate): (usize, &MeasuredProgram)| -> Outcome<_> {

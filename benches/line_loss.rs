@@ -1,10 +1,11 @@
 //! Losses on a line that loses bytes, as in the paper's Fig. 6. The line carries five minutes of telegrams and loses
-//! 0.135 % of their bytes in bursts, and three parsers read the rest. A telegram that the line damaged cannot be
-//! restored. The parser discarded all others that are missing. `--count N` sets the number of telegrams, `--pairs N`
-//! that of lines. `hub/drivers/tests/lms/framing.rs` checks the same with another content of the line.
+//! 0.135 % of their bytes in bursts. Three parsers read the remaining bytes. No parser can restore a telegram that the
+//! line damaged. If any other telegram is missing, the parser has discarded it. `--count N` sets the number of
+//! telegrams, and `--pairs N` sets the number of lines. `hub/drivers/tests/lms/framing.rs` checks the same with
+//! different content on the line.
 //!
-//! A damaged telegram lost at least one byte. A collateral telegram arrived with every byte, and the parser discarded
-//! it. The paper lost 0.135 % of the bytes and 40.8 % of the telegrams.
+//! A damaged telegram lost at least one byte. A collateral telegram arrived with every byte, but the parser discarded
+//! it. In the paper, 0.135 % of the bytes and 40.8 % of the telegrams were lost.
 
 #[path = "../hub/drivers/tests/lms/line.rs"]
 #[allow(dead_code)] // The test uses the other content of the line.
@@ -20,7 +21,7 @@ use line::{TelegramCounts, framer};
 use support::figures::{self, Cell, Figure, Target};
 use support::{Options, Outcome};
 
-/// Telegrams of a line, as in the paper: 300 s at 37.5 Hz.
+/// Number of telegrams on a line, as in the paper: 300 s at 37.5 Hz.
 const TELEGRAM_COUNT: usize = 11_250;
 const PARSERS: [&str; 3] = ["six states, discard", "rewind to STX + 1", "hub"];
 /// Index of the hub's parser.
@@ -64,12 +65,12 @@ impl LineRun {
     }
 }
 
-/// Returns a number of telegrams as a percentage.
+/// Returns a number of telegrams as a percentage of `of`.
 fn percent(stats: &TelegramCounts, of: u64) -> f64 {
     of as f64 * 100.0 / stats.telegrams as f64
 }
 
-/// Returns the figures of the hub's parser, starting with those of the line itself, as in the paper's columns.
+/// Returns the figures of the line and then of the hub's parser, as in the paper's columns.
 fn figures(runs: &[LineRun]) -> Vec<Figure> {
     let figure = |name, unit, hub: Vec<f64>, target| Figure { name, unit, hub, baseline: Vec::new(), target };
     let ours =

@@ -1,6 +1,6 @@
-//! CPU time of the hub's processors for one scan of 361 beams, with a person who walks through the room of the paper's
-//! Fig. 8. Targets: zones, marks and background together 1 us with the method `paper`, 3 us with `multi`; 5 us with
-//! segments.
+//! CPU time of the hub's processors for one scan of 361 beams, while a person walks through the room of the paper's
+//! Fig. 8. Targets for zones, marks and background together: 1 us with the method `paper`, 3 us with `multi`, and 5 us
+//! with segments.
 
 #![allow(missing_docs)] // The macros of criterion create public functions.
 
@@ -22,7 +22,7 @@ const SENSOR_POSE: Pose = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, upside_down:
 const BEAM_COUNT: usize = 361;
 /// First scan that is measured. By then, a person walks through the room, and the background is learned.
 const FIRST_SCAN: u64 = 800;
-/// Number of different scans that are measured in turn.
+/// Number of different scans, which the bench measures one after the other and then again.
 const SCAN_COUNT: u64 = 64;
 
 /// Returns the first `count` scans of a world.
@@ -44,7 +44,7 @@ fn model(method: Method, scans: &[Box<Scan>]) -> (BackgroundModel, &[Box<Scan>])
     (model, present)
 }
 
-/// Times `update` over `scans` in turn.
+/// Measures the time of `update` for one scan after the other, over and over.
 fn time_scans(c: &mut Criterion, name: &str, scans: &[Box<Scan>], mut update: impl FnMut(&Scan)) {
     let mut next = scans.iter().cycle();
     c.bench_function(name, |b| b.iter(|| update(black_box(next.next().expect("an endless sequence")))));

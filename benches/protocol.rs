@@ -22,8 +22,8 @@ const UART_READ_LENS: [usize; 46] = {
     pieces
 };
 
-/// Returns telegrams of a room with noise, which all differ. None ends with a start byte, because the framer would hold
-/// it.
+/// Returns telegrams of a room with noise, which are all different. No telegram ends with a start byte, because the
+/// framer would hold it.
 fn telegrams() -> Vec<Vec<u8>> {
     let mut rng = Rng::with_seed(1);
     let mut scan = || {

@@ -1,9 +1,10 @@
-//! CPU time that the hub's thread needs from loan to wake-up for a scan, with 0 to 200 subscribers that are awake,
-//! asleep on the doorbell, or asleep on the event. Also measures datagrams: packing and sealing, reading and checking.
-//! Publishing is measured as CPU time of the publishing thread, including some 0.3 us for reading that clock. The CPU
-//! time of subscribers is not included.
+//! CPU time that the hub's thread needs from loan to wake-up for a scan. There are 0 to 200 subscribers that are awake,
+//! asleep on the doorbell, or asleep on the event. Publishing is measured as CPU time of the publishing thread, which
+//! includes about 0.3 us for reading the clock. It excludes the CPU time of subscribers. The bench also measures
+//! datagrams: packing and sealing, reading and checking.
 //!
-//! Subscribers that are awake keep the memory in the cache. Between two scans, the others sleep for a millisecond.
+//! Subscribers that are awake keep the memory in the cache. The other subscribers sleep for a millisecond between two
+//! scans.
 
 #![allow(missing_docs)] // The macros of criterion create public functions.
 
@@ -73,8 +74,8 @@ fn publish(c: &mut Criterion) {
                             }
                             if rest != WaitMethod::Awake {
                                 wait_until(|| crowd.received.load(Ordering::Acquire) >= sent * count);
-                                // Scans do not follow each other without a pause: wait until the last subscriber sleeps
-                                // again.
+                                // Scans do not follow each other without a pause, so wait until the last subscriber
+                                // sleeps again.
                                 thread::sleep(SCAN_INTERVAL);
                             }
                         }
@@ -188,7 +189,8 @@ where
 }
 
 const SUBSCRIBER_COUNTS: [u64; 6] = [0, 1, 4, 16, 64, 200];
-/// Pause between two scans, in which all subscribers fall asleep. The scans of a sensor are 26 times as far apart.
+/// Pause between two scans, in which all subscribers fall asleep. The time between two scans of a real sensor is 26
+/// times as long.
 const SCAN_INTERVAL: Duration = Duration::from_millis(1);
 /// Interval in which subscribers check whether the bench has ended.
 const END_POLL_INTERVAL: Duration = Duration::from_millis(500);

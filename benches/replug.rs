@@ -1,7 +1,8 @@
-//! Time and CPU time that a pulled plug costs. A pty that simulates a streaming sensor is removed under a running hub
-//! and returns under its name, every other time with another number, twenty times in all. The figures are the time
-//! until the hub reports the port as absent, the time until a subscriber has a telegram again, and the CPU time of the
-//! hub in between. The same is measured for rotating scanners, which also lose their power for a moment.
+//! Time and CPU time that unplugging a sensor costs. A pty that simulates a streaming sensor is removed under a running
+//! hub, and returns under its name. Every other time, it returns with another number. This happens twenty times. The
+//! figures are the time until the hub reports the port as absent, the time until a subscriber has a telegram again, and
+//! the CPU time of the hub in between. The same is measured for rotating scanners, which also lose their power for a
+//! moment.
 //!
 //! The bench does not measure how long the kernel takes to detect the loss of an adapter, or udev to name it.
 
@@ -62,7 +63,7 @@ fn measure(options: &Options) -> Outcome<()> {
         clock::sleep_until(started + (1_000 + 37 * (round as u64 % 20)) * MILLIS);
         let work = ThreadUsage::of(hub.guard.pid(), |_| true)?.since(before);
         busy.push(100.0 * work.busy_ns as f64 / (clock::now() - started) as f64);
-        // Drops what arrived before the sensor was unplugged.
+        // Drops the lines that arrived before the sensor was unplugged.
         telegrams.lines_so_far();
         let other_number = (round % 2 == 1).then(make_pty).transpose()?;
         plug = PluggedSensor::plug_in(&name)?;
@@ -121,8 +122,8 @@ impl PluggedSensor {
     }
 }
 
-/// Sends scans like a sensor, two revolutions of the mirror apart and each in two parts, while a program has the line
-/// open.
+/// Sends scans like a sensor while a program has the line open. Scans are two revolutions of the mirror apart, and each
+/// scan is sent in two parts.
 fn stream(line: OwnedFd, is_unplugged: &AtomicBool) -> OwnedFd {
     let mut at = clock::now();
     let mut buffer = [0; 256];
@@ -161,7 +162,7 @@ fn make_pty() -> Outcome<(OwnedFd, Vec<u8>)> {
     unlockpt(&line)?;
     let name = ptsname(&line, Vec::new())?;
     fcntl_setfl(&line, OFlags::RDWR | OFlags::NONBLOCK)?;
-    // A pty reports that it is closed only after it was opened once.
+    // A pty reports that it is closed only after a program has opened it once.
     let other = open(&*name, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
     let mut termios = tcgetattr(&other)?;
     termios.make_raw();
@@ -195,8 +196,8 @@ const SCANNERS: [RotatingScanner; 2] = [
 ];
 
 /// Measures all rotating scanners, at ptys of the simulator in this process. The adapter is unplugged for two seconds,
-/// or the power is off for a moment. The figures are the times until a subscriber has a scan of a whole revolution
-/// again.
+/// or the power is off for a moment. The figures are the times until a subscriber again has a scan of a whole
+/// revolution.
 fn rotating_scanners(options: &Options) -> Outcome<Vec<Figure>> {
     let mut figures = Vec::new();
     for scanner in &SCANNERS {
@@ -242,7 +243,8 @@ impl RotatingScanner {
             back.push((scans.wait_for_line("scanned", STEP_TIMEOUT)?.number(2)? - since) as f64 / 1e6);
             clock::sleep_until(clock::now() + (1_000 + 41 * (round % 10)) * MILLIS);
             inject(Event::PowerCycle)?;
-            // By then, everything that was in transit has arrived, and the scanner has sent nothing since.
+            // By this time, all bytes in transit have arrived, and the scanner has sent nothing since it lost its
+            // power.
             clock::sleep_until(clock::now() + BOOT_TIME.as_nanos() as u64);
             let since = clock::now();
             scans.lines_so_far();

@@ -1,11 +1,11 @@
 //! Time and telegrams that a crash of the hub costs its subscribers. The hub is killed with SIGKILL and started again,
-//! twenty times in all, without a service manager that keeps its lines, while a process per sensor receives its
-//! telegrams. Measures the time until the services exist and until each subscriber has a telegram, compared with a bare
-//! reader that opens the same streaming ptys and wakes a process. Counts damaged telegrams, telegrams missed within a
-//! run, and writes to the sensors' EEPROM.
+//! twenty times. No service manager keeps its lines. A process per sensor receives the telegrams. The bench measures
+//! the time until the services exist and the time until each subscriber has a telegram. The baseline is a minimal
+//! reader that opens the same streaming ptys and wakes a process. The bench also counts damaged telegrams, telegrams
+//! missed within a run, and writes to the sensors' EEPROM.
 //!
-//! The second part is the same under a service manager that keeps the line of one sensor open. It measures the silence
-//! and the losses. The bench does not measure how long a service manager takes to detect the exit of a service.
+//! The second part does the same under a service manager that keeps the line of one sensor open. It measures the
+//! silence and the losses. The bench does not measure how long a service manager takes to detect the exit of a service.
 
 #[path = "../tests/testkit/supervisor.rs"]
 mod supervisor;
@@ -93,7 +93,7 @@ fn measure(options: &Options) -> Outcome<()> {
 /// Times of a start, in ms from exec.
 struct StartTimes {
     up_ms: f64,
-    /// Times of the first telegram: of the subscriber that was served first, and of the other one.
+    /// Times of the first telegram at the subscriber that was served first, and at the other subscriber.
     first_ms: [f64; 2],
 }
 
@@ -129,7 +129,7 @@ impl HubRuns<'_> {
     }
 
     /// Kills the hub, if one runs, and starts the next one. Returns the times at which each subscriber has a telegram
-    /// of it.
+    /// of the new hub.
     fn restart(&mut self) -> Outcome<StartTimes> {
         self.kill()?;
         let hub = self.stage.start_hub(&SENSORS)?;
@@ -173,15 +173,15 @@ fn start_baseline(environment: &BenchEnvironment) -> Outcome<StartTimes> {
     Ok(start)
 }
 
-/// Returns the length of run number `n`: a different phase of the stream each time.
+/// Returns the length of run number `n`. The lengths differ, so that each run ends at a different phase of the stream.
 fn run_time(n: usize) -> Duration {
     Duration::from_millis(700 + 11 * (n as u64 % 20))
 }
 
 /// Measures a hub whose line a service manager keeps open, as with the unit in hub/dist. The hub is killed `kills`
-/// times, spread evenly over a telegram, and half as many times in the 0.6 ms in which a telegram is read: the only
-/// time in which a telegram has left the line and is not yet published. The telegrams of a subscriber are compared with
-/// those that the simulated sensor sent.
+/// times, evenly distributed over a telegram. It is also killed half as many times in the 0.6 ms in which it reads a
+/// telegram. Only in this time has a telegram left the line without being published. The telegrams of a subscriber are
+/// compared with the telegrams that the simulated sensor sent.
 fn measure_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
     let spread = kill_with_kept_line(kills, |n| SCAN_PERIOD_NS * (2 * n + 1) / (2 * kills as u64))?;
     let reading = kill_with_kept_line(kills.div_ceil(2), |_| SCAN_PERIOD_NS - READ_AHEAD_NS / 2)?;
@@ -217,29 +217,31 @@ fn measure_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
 /// Results of several kills.
 #[derive(Default)]
 struct KillResults {
-    /// Time from the last telegram of a run to the first of the next one, on receipt.
+    /// Time from receiving the last telegram of a run until receiving the first telegram of the next run.
     telegrams_ms: Vec<f64>,
-    /// Time from the last scan of a run to the first of the next one, on receipt.
+    /// Time from receiving the last scan of a run until receiving the first scan of the next run.
     scans_ms: Vec<f64>,
-    /// Complete telegrams of measured data from the first that was received to the last.
+    /// Number of complete telegrams of measured data that the sensor sent from the first received one to the last
+    /// received one.
     sent: usize,
     lost: usize,
-    /// Lost telegrams that the hub should not have been reading when it was killed. A hub that is woken late reads all
-    /// bytes that have arrived.
+    /// Number of lost telegrams that the hub should not have been reading when it was killed. A hub that wakes late
+    /// reads all bytes that have arrived.
     lost_while_idle: usize,
-    /// Telegrams that the sensor aborted in this time to reply to the next hub.
+    /// Number of telegrams that the sensor aborted in this time in order to reply to the next hub.
     aborted: usize,
 }
 
 /// A subscriber, with the time of the last sample of each run.
 struct Receiver {
     process: Child,
-    /// Positions of words in a line: the time at which the sample was received, and the run that it belongs to.
+    /// Positions of two words in a line: the time at which the sample was received, and the run that the sample belongs
+    /// to.
     words: (usize, usize),
     boot: u64,
     last_ns: u64,
     silences_ms: Vec<f64>,
-    /// All lines that it printed.
+    /// All lines that the subscriber has printed.
     lines: Vec<Vec<String>>,
 }
 
@@ -273,8 +275,7 @@ impl Receiver {
     }
 }
 
-/// Kills the hub `kills` times, each time at `moment(n)` after the last byte of a telegram, where n is the number of
-/// the kill.
+/// Kills the hub `kills` times. Kill number n happens `moment(n)` after the last byte of a telegram.
 fn kill_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<KillResults> {
     let environment = BenchEnvironment::new()?;
     let sensor = SENSORS[0];
@@ -337,11 +338,11 @@ fn kill_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<Kil
 const SCAN_PERIOD_NS: u64 = 26_640_000;
 /// Time before the end of a telegram at which the hub starts to read, in ns.
 const READ_AHEAD_NS: u64 = 600_000;
-/// Difference between the times that two processes report for the same event, in ns.
+/// Maximum difference between the times that two processes report for the same event, in ns.
 const CLOCK_NOISE_NS: u64 = 400_000;
-/// Delay of a hub that shares its processors, in ns.
+/// Maximum delay of a hub that shares its processors, in ns.
 const MAX_DELAY_NS: u64 = 4_000_000;
 /// Time after which the hub has certainly estimated the sensor's timing.
 const SETTLE_TIME: Duration = Duration::from_millis(700);
-/// Pause of a service manager: RestartSec of the unit.
+/// Time until a service manager restarts the hub: RestartSec of the unit.
 const RESTART_PAUSE: Duration = Duration::from_millis(20);

@@ -1,7 +1,7 @@
-//! CPU time of the hub for rotating scanners, compared with a reader that coalesces their packets in the same way and
-//! does nothing else. Also measures the accuracy of the stamps of packets and scans after the hub was stopped for half
-//! a second. There are simulated scanners on ptys with two subscribers each, as processes. The bench does not measure
-//! the cost of a real adapter, or of subscribers.
+//! CPU time of the hub for rotating scanners. The baseline is a reader that coalesces the scanners' packets in the same
+//! way and does nothing else. The bench also measures the accuracy of the stamps of packets and scans after the hub was
+//! stopped for half a second. Simulated scanners are on ptys, and each has two subscribers, which are processes. The
+//! bench does not measure the cost of a real adapter, or of subscribers.
 
 mod support;
 
@@ -39,7 +39,7 @@ struct ScannerGroup {
     model: &'static str,
     /// Approximate number of bytes per revolution.
     revolution_len: usize,
-    /// Bytes of a packet, and time from one packet to the next in ns.
+    /// Number of bytes in a packet, and time from one packet to the next in ns.
     packet: (usize, u64),
     load_figure: &'static str,
     missed_figure: &'static str,
@@ -124,7 +124,7 @@ fn load(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 2]> {
     ])
 }
 
-/// Stops the hub repeatedly for half a second, while two scanners continue.
+/// Stops the hub repeatedly for half a second, while two scanners continue to send.
 fn stalls(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 5]> {
     let environment = BenchEnvironment::new()?;
     let sensors = &SENSORS[..2];
@@ -180,7 +180,7 @@ fn stalls(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 5]> {
             baseline: none(),
             target: Target::Max(0.0),
         },
-        // A real scanner would have sent in this time. Stamps are off by up to this time, and uneven.
+        // Time in which a real scanner would have sent. Stamps may have errors of up to this time, and may be uneven.
         Figure { name: group.stall_figure, unit: "ms", hub: stood, baseline: none(), target: Target::None },
         Figure {
             name: group.unevenness_figure,
@@ -235,8 +235,7 @@ impl ScannerGroup {
         Ok((hub, subscribers))
     }
 
-    /// Returns the CPU time of the hub, and the number of scans and packets that subscribers should have received and
-    /// did not.
+    /// Returns the CPU time of the hub, and the number of scans and packets that subscribers missed.
     fn load_of_hub(&self, environment: &BenchEnvironment, span: Duration) -> Outcome<(f64, f64)> {
         let (hub, subscribers) = self.start_hub(environment, &SENSORS, 2)?;
         thread::sleep(SETTLE_TIME);
@@ -273,7 +272,7 @@ fn cpu_percent(pid: u32, span: Duration) -> Outcome<f64> {
     Ok(100.0 * work.busy_ns as f64 / (clock::now() - started) as f64)
 }
 
-/// Returns the number of packets that must have been sent and did not arrive, as the hub counts them.
+/// Returns the number of packets that the hub counts as lost.
 fn lost(environment: &BenchEnvironment) -> Outcome<u64> {
     let mut sum = 0;
     for sensor in SENSORS {
@@ -285,17 +284,17 @@ fn lost(environment: &BenchEnvironment) -> Outcome<u64> {
     Ok(sum)
 }
 
-/// Number of scanners of a large vehicle.
+/// Names of the scanners on a large vehicle.
 const SENSORS: [&str; 8] = ["a", "b", "c", "d", "e", "f", "g", "h"];
 /// Time after which the start is complete, and rates and clocks are estimated.
 const SETTLE_TIME: Duration = Duration::from_secs(3);
 /// Length of a stall, as on an overloaded machine.
 const STALL_TIME: Duration = Duration::from_millis(500);
-/// Error from which a stamp is wrong, in ms.
+/// Minimum error of a wrong stamp, in ms.
 const MAX_STAMP_ERROR_MS: f64 = 5.0;
 
-/// Baseline of a hub whose scanners send packets without pause. It sleeps until there are bytes, waits 5 ms as the hub
-/// does, reads all of them, and wakes two sleeping processes once per revolution. It has no framing, no checksum and no
+/// Baseline of a hub whose scanners send packets without pause. It sleeps until there are bytes, waits 5 ms like the
+/// hub, reads all bytes, and wakes two sleeping processes once per revolution. It has no framing, no checksum and no
 /// shared memory.
 ///
 /// Reads each of `ports` forever in a separate thread. A revolution has `revolution_len` bytes.
@@ -313,7 +312,7 @@ fn coalesce(revolution_len: usize, ports: &[&str]) -> Outcome<()> {
         let line = PtyLine::open(Path::new(port), 115_200)?;
         readers.push(thread::spawn(move || {
             if let Err(error) = read_revolutions(&line, &ends, revolution_len) {
-                // With one reader less, the baseline would be too low.
+                // The baseline would be too low if one of its readers had ended.
                 eprintln!("baseline: {error}");
                 std::process::exit(1)
             }
@@ -343,7 +342,7 @@ fn read_revolutions(line: &PtyLine, ends: &[OwnedFd], revolution_len: usize) -> 
 
 /// Number of subscribers to a scanner.
 const SUBSCRIBERS_PER_SENSOR: usize = 2;
-/// Time for which the hub leaves packets in the line, in ns.
+/// Time for which the hub leaves packets unread in the line, in ns.
 const READ_INTERVAL_NS: u64 = 5_000_000;
 
 /// Receives the scans of `sensor` forever, and prints each: `scan STAMP_NS MISSED INCOMPLETE`.
@@ -371,8 +370,8 @@ fn print_packets(domain: &str, sensor: &str, len: usize) -> Outcome<()> {
     }
 }
 
-/// Returns the maximum error, in ms, of the stamps in `lines`, and how many are off by more than `limit_ms`. `due` has
-/// the times at which each packet was due, by its hash.
+/// Returns the maximum error of the stamps in `lines`, in ms, and the number of stamps whose error is more than
+/// `limit_ms`. `due` contains the times at which each packet was due, by the packet's hash.
 fn stamp_error_ms(
     lines: &[OutputLine],
     due: &HashMap<&str, Vec<u64>>,
@@ -408,7 +407,7 @@ impl ReceivedScans {
         Ok(scans)
     }
 
-    /// Returns the maximum deviation of the distance of two consecutive scans from a whole number of revolutions, in
+    /// Returns the maximum deviation of the time between two consecutive scans from a whole number of revolutions, in
     /// ms.
     fn unevenness_ms(&self) -> f64 {
         let mut spans: Vec<f64> =

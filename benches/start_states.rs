@@ -1,15 +1,16 @@
-//! Time until a sensor streams. It starts in these states:
+//! Time until a sensor streams. The sensor starts in one of these states:
 //!
 //! - at each of the four rates, idle, streaming or left in installation mode
-//! - just powered on, with quick replies, compared with a host that knows its rate and sends no request for information
+//! - just powered on, with quick replies. The baseline is a host that has the sensor's rate and sends no request for
+//! information
 //! - power-cycled in the middle of a scan while another sensor streams
 //!
-//! The bench does not measure how long a real sensor boots. That takes up to a minute, before its boot message.
+//! The bench does not measure how long a real sensor boots before it sends its boot message. That takes up to a minute.
 //!
-//! The simulated sensor takes 55 to 145 ms to reply, like real captured ones. A stream that already runs delivers
-//! telegrams at once. Scans follow when the sensor has reported its identity and how its values are encoded. The
-//! baseline of a start after power-on knows the rate and sends no request for information: it changes the rate and
-//! starts the stream.
+//! The simulated sensor takes 55 to 145 ms to reply, like recorded real sensors. A stream that already runs delivers
+//! telegrams at once. Scans follow when the sensor has reported its identity and the encoding of its values. The
+//! baseline of a start after power-on has the sensor's rate and sends no request for information: it changes the rate
+//! and starts the stream.
 
 mod support;
 
@@ -57,8 +58,9 @@ fn start(rate: &str, state: &str) -> Outcome<f64> {
     Ok((scans.wait_for_line("scan", STEP_TIMEOUT)?.number(2)? - hub.started_ns) as f64 / 1e6)
 }
 
-/// Measures starts with an idle sensor at 9600 baud that replies after 60 ms. The first start of the hub, the next one
-/// with the saved state of the first, and the baseline with the shortest possible dialog alternate.
+/// Measures starts with an idle sensor at 9600 baud that replies after 60 ms. Three kinds of starts alternate: the
+/// first start of the hub, the next start with the state that the first one saved, and the baseline with the shortest
+/// possible dialog.
 fn cold_starts(count: usize) -> Outcome<[Figure; 2]> {
     let (mut first, mut again, mut shortest) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..count {
@@ -103,8 +105,8 @@ fn measure_adoption(count: usize) -> Outcome<Figure> {
     Ok(Figure { name: "500000 Bd, streaming, adopted", unit: "ms", hub, baseline: Vec::new(), target })
 }
 
-/// Cycles the power of one of two sensors. Measures the time from its boot message to its first telegram, and the
-/// losses of the other sensor.
+/// Cycles the power of one of two sensors. Measures the time from this sensor's boot message to its first telegram, and
+/// the losses of the other sensor.
 fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
     let (mut back, mut lost, mut writes) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..count {
@@ -178,7 +180,7 @@ fn wait_for_boot_message(environment: &BenchEnvironment) -> Outcome<u64> {
     }
 }
 
-/// Flags of a sensor that is idle at 9600 baud and takes 60 ms from ACK to reply.
+/// Flags of a sensor that is idle at 9600 baud and replies 60 ms after its ACK.
 const QUICK_FLAGS: [&str; 4] = ["--baud", "9600", "--fault", "answer=0.06"];
 
 /// Rate of the line, state of the sensor, and name of the figure.

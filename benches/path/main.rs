@@ -1,16 +1,17 @@
-//! Instructions, code lines of 64 bytes, code pages of 4 KiB and system calls that the hub executes for one telegram.
-//! They are counted by single steps of a link's thread under ptrace, with one subscriber that waits for scans. The
-//! figures hardly depend on the machine's load, unlike those of `hub_load`. The bench does not measure time.
+//! Number of instructions, code lines of 64 bytes, code pages of 4 KiB and system calls that the hub needs for one
+//! telegram. The bench counts them by single steps of a link's thread under ptrace, with one subscriber that waits for
+//! scans. Unlike the figures of `hub_load`, these figures hardly depend on the machine's load. The bench does not
+//! measure time.
 //!
-//! The sensor sends at 9,600 baud, so that the steps keep up. Two costs would therefore be too high and are excluded.
-//! The first is repeated waits ([`steps::TelegramCost`]). The second is work that the hub does at most ten times a
-//! second: at this rate with every telegram, but at 500,000 baud with one of four. In it, the hub examines the session
-//! and searches for subscribers, and once a second it publishes the status. The stage of the status is still shown.
-//! Without symbols, all figures contain it. The steps delay the hub, so it sleeps and reads less often than usual.
-//! System calls are therefore also counted at 500,000 baud, without steps.
+//! The sensor sends at 9,600 baud, because the steps are too slow for a higher rate. Two costs would therefore be too
+//! high and are excluded. The first is repeated waits ([`steps::TelegramCost`]). The second is work that the hub does
+//! at most ten times a second: it examines the session and searches for subscribers, and once a second it publishes the
+//! status. At 9,600 baud, it does this work with every telegram, but at 500,000 baud with one of four. The stage of the
+//! status is still shown. Without symbols, all figures contain this work. The steps delay the hub, so it sleeps and
+//! reads less often than usual. System calls are therefore also counted at 500,000 baud, without steps.
 //!
-//! The background is measured while it is being learned, and after it was. Another hub learns it at 500,000 baud, and
-//! the measured one starts with the saved model.
+//! The figures are measured while the hub learns the background, and after it has learned the background. Another hub
+//! learns it at 500,000 baud, and the measured hub starts with the saved model.
 //!
 //! Stages, crates and functions need the symbols of the program, which `cargo bench` strips:
 //!
@@ -18,11 +19,11 @@
 //! CARGO_PROFILE_BENCH_STRIP=none CARGO_PROFILE_RELEASE_STRIP=none cargo bench --bench path
 //! ```
 //!
-//! With `SCANHUB_WRITE=1`, the bench also writes the order of functions for the linker, `hub/path.lds`. Entries for
-//! functions that no longer exist do no harm, so write it again only if the path has changed much.
+//! With `SCANHUB_WRITE=1`, the bench also writes the order of functions for the linker, `hub/path.lds`. The linker
+//! ignores entries for functions that no longer exist, so write the file again only if the path has changed much.
 //!
-//! A code line or page counts once per telegram, and once in each stage, crate and function that uses it, so parts
-//! sum to more than the total. Code without a known function belongs to the stage of its caller.
+//! A code line or page counts once per telegram. It also counts once in each stage, crate and function that uses it, so
+//! the parts sum to more than the total. Code without a known function belongs to the stage of its caller.
 #![cfg_attr(not(target_arch = "x86_64"), allow(unused))]
 
 #[cfg(target_arch = "x86_64")]
@@ -108,7 +109,8 @@ mod on_x86_64 {
         Ok(())
     }
 
-    /// Returns a linker script that puts functions next to each other, in the order of `patterns` for their symbols.
+    /// Returns a linker script that puts functions next to each other, in the order of `patterns`. Each pattern matches
+    /// a symbol.
     fn link_order(patterns: &[String]) -> String {
         let mut known = HashSet::new();
         let patterns = patterns.iter().filter(|pattern| known.insert(*pattern));
@@ -118,8 +120,8 @@ mod on_x86_64 {
         )
     }
 
-    /// Starts a hub at 500,000 baud that learns the background and saves it. Then counts its system calls for `count`
-    /// telegrams.
+    /// Starts a hub at 500,000 baud that learns the background and saves it. Afterward, counts the hub's system calls
+    /// for `count` telegrams.
     fn measure_learning(environment: &BenchEnvironment, count: u64, cells: &mut Vec<Cell>) -> Outcome<()> {
         let hub = environment.start_hub(&[SENSOR])?;
         hub.wait_for_line("ready", STEP_TIMEOUT)?;
@@ -159,8 +161,8 @@ mod on_x86_64 {
         files.into_iter().find(|file| file.exists())
     }
 
-    /// Steps through `count` telegrams, or fewer until `end`. Returns their profile, and the system calls of each
-    /// telegram.
+    /// Steps through `count` telegrams, or fewer if `end` comes first. Returns the profile of the steps, and the system
+    /// calls of each telegram.
     fn step<'a>(
         stepper: &mut Stepper,
         code: &'a Code,
@@ -190,7 +192,8 @@ mod on_x86_64 {
                 profile.add(steps.into_iter());
                 calls.push(cost.system_calls);
             }
-            // Otherwise, the hub still reads the first bytes of the next telegram before most of it has arrived.
+            // In other cases, the hub still reads the first bytes of the next telegram before most of that telegram has
+            // arrived.
             if cost.lag > TELEGRAM_INTERVAL * 2 / 3 {
                 stepper.run_past_telegram(TELEGRAM_INTERVAL)?;
             }
@@ -201,7 +204,7 @@ mod on_x86_64 {
         Ok((profile, calls))
     }
 
-    /// Adds the tables of one state of the background.
+    /// Adds the tables for one state of the background.
     fn add_tables(
         background: &str,
         profile: &Profile<'_>,
@@ -286,14 +289,15 @@ mod on_x86_64 {
     }
 
     const SENSOR: &str = "front";
-    /// The linker script that `hub/build.rs` passes to the linker, and its first lines.
+    /// Path of the linker script that `hub/build.rs` passes to the linker, and first lines of the script.
     const LINK_ORDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/hub/path.lds");
     const LINK_ORDER_HEADER: &str = "/* The functions that run for each telegram, in the order in which they run, and then those of the\n   \
         status. Written by the bench `path`. */\n";
     /// Time between two telegrams at 9,600 baud.
     const TELEGRAM_INTERVAL: Duration = Duration::from_millis(773);
-    /// Limit for the steps of one state of the background, in seconds. An idle machine needs less for 100 telegrams.
+    /// Maximum time for the steps with one state of the background, in seconds. An idle machine needs less for 100
+    /// telegrams.
     const MAX_SECONDS: u64 = 110;
-    /// Number of functions in a table.
+    /// Maximum number of functions in a table.
     const MAX_TABLE_ROWS: usize = 20;
 }

@@ -1,5 +1,5 @@
-//! Profile of the steps of one thread: where its instructions, code lines and code pages are, by function, crate and
-//! stage.
+//! Profile of the steps of one thread. It shows the functions, crates and stages that the thread's instructions, code
+//! lines and code pages belong to.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs;
@@ -7,17 +7,18 @@ use std::process::Command;
 
 /// The code of a process, with names.
 pub(crate) struct Code {
-    /// Path of the program, and address of its first page.
+    /// Path of the program, and address of its first page in memory.
     program: String,
     base: u64,
     /// Mapped files, by address: start, end and name.
     files: Vec<(u64, u64, String)>,
-    /// Address in memory and name of each function of the program, by address. Empty if the program has no symbols.
+    /// Address in memory and name of each function of the program, sorted by address. Empty if the program has no
+    /// symbols.
     functions: Vec<(u64, String)>,
 }
 
 impl Code {
-    /// Reads the memory map of the process `pid`, and the symbols of its program by `nm`.
+    /// Reads the memory map of the process `pid`, and the symbols of its program with `nm`.
     pub(crate) fn of(pid: u32) -> Result<Code, String> {
         let failed = |error: std::io::Error| format!("process {pid}: {error}");
         let program = fs::read_link(format!("/proc/{pid}/exe")).map_err(failed)?.display().to_string();
@@ -44,7 +45,7 @@ impl Code {
         !self.functions.is_empty()
     }
 
-    /// Returns the index of the function at `address` and its name; `None` outside of the program.
+    /// Returns the index and the name of the function at `address`, or `None` if the address is not in the program.
     pub(crate) fn function(&self, address: u64) -> Option<(usize, &str)> {
         if self.file(address).is_none_or(|file| !file.is_empty()) {
             return None;
@@ -59,14 +60,15 @@ impl Code {
         file.map(|(_, _, name)| name.as_str())
     }
 
-    /// Returns the function at `address`, or the file if it is not in the program.
+    /// Returns the name of the function at `address`, or of the file if the address is not in the program.
     pub(crate) fn name(&self, address: u64) -> &str {
         let name = self.function(address).map(|(_, name)| name);
         name.or_else(|| self.file(address).filter(|name| !name.is_empty())).unwrap_or("?")
     }
 }
 
-/// Returns address and name of the functions of `program`, whose first page is at `base`, by `nm` with `flags`.
+/// Returns address and name of each function of `program`, read by `nm` with `flags`. The first page of `program` is at
+/// `base`.
 fn functions(program: &str, base: u64, flags: &[&str]) -> Vec<(u64, String)> {
     let Ok(output) = Command::new("nm").args(flags).args(["--defined-only", program]).output() else {
         return Vec::new();
@@ -90,8 +92,8 @@ fn pattern(symbol: &str) -> String {
     symbol.replace('$', "?")
 }
 
-/// Returns the crate of the function `name`: the first component of its path, which for a generic function is that of
-/// the crate that defines it.
+/// Returns the crate of the function `name`, which is the first component of its path. For a generic function, it is
+/// the crate that defines the function.
 pub(crate) fn crate_of(name: &str) -> &str {
     let Some((path, _)) = name.split_once("::") else { return if name.contains(".so") { name } else { "C" } };
     path.rsplit(|c: char| !c.is_alphanumeric() && c != '_').next().unwrap_or(path)
@@ -108,12 +110,12 @@ pub(crate) enum PathStage {
     Publish,
     Processors,
     Bookkeeping,
-    /// The status, which the hub publishes once a second, and what it checks up to ten times a second.
+    /// The status, which the hub publishes once a second, and the checks that the hub makes up to ten times a second.
     Status,
     Other,
 }
 
-/// Stages by a part of the names of functions. The innermost function with a stage counts, so that the shared-memory
+/// Stages with parts of function names. The innermost function with a stage counts, so steps in the shared-memory
 /// library, `memcpy` and the standard library belong to their callers. The first entry that matches a name counts.
 const STAGES: [(&str, PathStage); 34] = [
     ("preprocess::zones::", PathStage::Zones),
@@ -152,8 +154,8 @@ const STAGES: [(&str, PathStage); 34] = [
     ("rustix::", PathStage::Sleeping),
 ];
 
-/// Ends of the names of functions whose steps all belong to the status. With the status, the hub saves the scanner's
-/// identity.
+/// Ends of the names of functions whose steps all belong to the status. When the hub publishes the status, it also
+/// saves the scanner's identity.
 const STATUS_SUFFIXES: [&str; 6] = [
     "SessionDriver<S>::report",
     "LinkState<S>::publish_status",
@@ -223,7 +225,8 @@ pub(crate) struct Profile<'a> {
     pub(crate) by_function: HashMap<&'a str, Totals>,
     /// Sums of each telegram, without the status.
     pub(crate) per_telegram: Vec<Totals>,
-    /// Addresses of functions in the order of their first steps: for the path, and for the status.
+    /// Addresses of functions in the order of their first steps. The first list is for the path, and the second one is
+    /// for the status.
     first_steps: [Vec<u64>; 2],
 }
 
@@ -241,9 +244,9 @@ impl<'a> Profile<'a> {
         }
     }
 
-    /// Returns patterns for the symbols of the functions that were stepped through, in their order: those of the path,
-    /// or those of the status if `of_status`. The patterns omit the hash at the end of a symbol, and with it the types
-    /// of a generic function.
+    /// Returns patterns for the symbols of the executed functions, in the order of their first steps. If `of_status`,
+    /// they are the functions of the status; otherwise, those of the path. A pattern omits the hash at the end of a
+    /// symbol, and so also the types of a generic function.
     pub(crate) fn patterns(&self, of_status: bool) -> Vec<String> {
         let symbols = functions(&self.code.program, self.code.base, &[]);
         let of_address = |address| {
@@ -254,7 +257,7 @@ impl<'a> Profile<'a> {
         order.iter().flat_map(|address| of_address(*address)).map(|(_, symbol)| pattern(symbol)).collect()
     }
 
-    /// Returns the stage of an instruction at `address` in the functions `calls`, outermost first.
+    /// Returns the stage of an instruction at `address`. `calls` has the functions that called it, outermost first.
     pub(crate) fn stage(&mut self, address: u64, calls: impl DoubleEndedIterator<Item = u64>) -> PathStage {
         let mut found = self.stage_of(address);
         for function in calls.rev() {
@@ -312,6 +315,6 @@ impl Totals {
     }
 }
 
-/// Bytes of a code line and of a code page.
+/// Length of a code line and of a code page, in bytes.
 const CACHE_LINE_LEN: u64 = 64;
 const PAGE_LEN: u64 = 4096;

@@ -1,18 +1,18 @@
-//! Separation of people from the background, by the two methods of the hub and by two simple ones, in scenes of the
-//! simulated world in which the truth of each beam is known.
+//! Separation of people from the background. Two methods of the hub and two simple methods are compared, in scenes of
+//! the simulated world in which the truth of each beam is known.
 //!
-//! A beam counts as foreground if it meets a person with all of its spot. A reported beam is wrong in three cases: it
-//! meets something that has always been in the scene, it meets what was behind an object that was taken away, or it
-//! meets an object that was put down or moved more than 20 s ago. Beams do not count if they graze a person or a moved
-//! object, have no reading, or meet an object that was put down or moved in the last 20 s.
+//! A beam counts as foreground if its whole spot meets a person. A reported beam is wrong in three cases. It meets
+//! something that has always been in the scene. It meets what was behind an object that was taken away. Or it meets an
+//! object that was put down or moved more than 20 s ago. Some beams do not count: beams that graze a person or a moved
+//! object, beams without a reading, and beams that meet an object that was put down or moved in the last 20 s.
 //!
-//! Recall is the share of the foreground beams that are found, precision the share of the reported beams that are
-//! right. Wrong beams are per scan, over all 2000 scans including the first ones.
+//! Recall is the share of the foreground beams that are found. Precision is the share of the reported beams that are
+//! right. The number of wrong beams is per scan, over all 2000 scans including the first ones.
 //!
-//! A person who stands in the room at the start is learned, and no method finds this person while standing. The crowd
-//! is also present from the start. A person behind a door that has just opened is farther away than the door was, so no
-//! method finds this person either. Bytes are payloads on a network; an empty foreground has 58 of them. In the room of
-//! Fig. 8, a person is present for 40 % of the time.
+//! If a person stands in the room at the start, all methods learn this person as background, and find the person only
+//! after they move. The crowd is also present from the start. A person behind a door that has just opened is farther
+//! away than the door was, so no method finds this person either. Bytes are payloads on a network; an empty foreground
+//! has 58 bytes. In the room of Fig. 8, a person is present for 40 % of the time.
 
 use std::ops::Range;
 
@@ -38,7 +38,7 @@ const SCENES: [Scene; 11] = [
     Scene { name: "a crowd", world: "crowd", unit: Unit::Mm, mixed: true },
 ];
 
-/// Targets of `multi`: name of the figure, row, table, target.
+/// Targets of `multi`: name of the figure, table row, table column, target.
 const TARGETS: [(&str, &str, &str, Target); 11] = [
     ("recall in Fig. 8", "Fig. 8", RECALL_TABLE, Target::Min(0.99)),
     ("precision in Fig. 8", "Fig. 8", PRECISION_TABLE, Target::Min(0.95)),
@@ -110,7 +110,7 @@ pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
         }
         cells.extend(METHODS.iter().zip(&scores).flat_map(|(name, score)| scored(scene, name, score)));
     }
-    // One table for each of these quantities, although they are computed scene by scene.
+    // There is one table for each of these quantities, although they are computed scene by scene.
     cells.sort_by_key(|cell| {
         [RECALL_TABLE, PRECISION_TABLE, WRONG_TABLE].iter().position(|table| cell.table == *table)
     });
@@ -158,7 +158,7 @@ struct PayloadBytes {
     scans: u64,
     scan: u64,
     foreground: u64,
-    /// Number of scans without foreground, and their bytes.
+    /// Number of scans without foreground, and payload bytes of these scans.
     empty: (u64, u64),
 }
 
@@ -183,7 +183,7 @@ impl PayloadBytes {
         }
     }
 
-    /// Returns bytes per second at 37.5 Hz: of scans, of the foreground, and of the foreground while it is empty.
+    /// Returns bytes per second at 37.5 Hz for scans, for the foreground, and for an empty foreground.
     fn per_second(&self) -> [f64; 3] {
         let per_second = |bytes: u64, scans: u64| bytes as f64 / scans as f64 * 1e3 / 26.64;
         [
@@ -195,14 +195,16 @@ impl PayloadBytes {
 }
 
 /// A method that learns only at the start. The background of a beam is the median of its readings in the first
-/// [`LEARNING_SCANS`] scans. Readings that are nearer by more than 30 mm (60 in cm mode) are foreground.
+/// [`LEARNING_SCANS`] scans. A reading that is nearer than the background by more than 30 mm (60 in cm mode) is
+/// foreground.
 struct TeachIn {
     scans: usize,
     readings_mm: Vec<Vec<u32>>,
     background_mm: Vec<Option<u32>>,
 }
 
-/// 5 s. The room of Fig. 8 is empty for the first 8 s.
+/// Number of scans from which the background is learned. It corresponds to 5 s. The room of Fig. 8 is empty for the
+/// first 8 s.
 const LEARNING_SCANS: usize = 187;
 
 impl TeachIn {
@@ -232,10 +234,11 @@ impl Detector for TeachIn {
 }
 
 /// The adaptive Gaussian mixture of Zivkovic (ICPR 2004), which computer vision uses for the background of images, with
-/// one mixture for each beam. At most five Gaussians, learning rate 1/375 (1/n at first). The heaviest ones that
-/// together weigh .9 are background. A reading within four standard deviations is background, one within three adapts
-/// the Gaussian. Weights decay by a prior of .05. The standard deviation starts at 15 mm and stays between 5 and 40 mm,
-/// twice as much in cm mode. Only readings that are nearer than the heaviest Gaussian count as foreground.
+/// one mixture for each beam. There are at most five Gaussians, and the learning rate is 1/375 (1/n at first). The
+/// heaviest Gaussians that together weigh .9 are background. A reading within four standard deviations of them is
+/// background. A reading within three standard deviations adapts the Gaussian. Weights decay by a prior of .05. The
+/// standard deviation starts at 15 mm and stays between 5 and 40 mm, twice as much in cm mode. Only readings that are
+/// nearer than the heaviest Gaussian count as foreground.
 struct Mixtures {
     scans: f64,
     beams: Vec<Vec<Gaussian>>,

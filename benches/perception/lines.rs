@@ -1,13 +1,13 @@
-//! Accuracy of the lines in a scan relative to its beams, and the time that it takes to find them. Both forms of the
-//! hub's method are compared with simple methods with the same number of vertices. Rooms are drawn at random as in the
-//! experiment of PLE (Schaefer, Buescher, Luft, Burgard, IROS 2018), and logs are from real sensors.
+//! Accuracy of the lines in a scan relative to its beams, and CPU time to find them. Both forms of the hub's method are
+//! compared with simple methods that use the same number of vertices. The rooms are drawn at random as in the
+//! experiment of PLE (Schaefer, Buescher, Luft, Burgard, IROS 2018). The logs come from real sensors.
 //!
-//! J vertices make J - 1 lines. The ratio is to iterative end-point fit on the same scans, as in PLE's publication, and
-//! the target is PLE's own ratio. The lines have to cover .97 of the beams of a room.
+//! J vertices make J - 1 lines. The ratio is relative to iterative end-point fit on the same scans, as in PLE's
+//! publication. The target is PLE's own ratio. The lines have to cover .97 of the beams of a room.
 //!
-//! The RMSE covers the beams that meet a line, so it has to be read with the share of the beams. The hub's lines need
-//! not be connected. On logs, points more than 1 m apart are not connected, and if there are too many lines, the worst
-//! are dropped.
+//! The RMSE covers only the beams that meet a line, so read it together with the share of these beams. The hub's lines
+//! need not be connected. On logs, points more than 1 m apart are not connected. If there are too many lines, the worst
+//! ones are dropped.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::Range;
@@ -21,7 +21,7 @@ use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings::{self, normal, scan};
 
 const VERTEX_COUNTS: [usize; 5] = [10, 20, 30, 40, 50];
-/// Ratios that PLE publishes, and those of its optimized form.
+/// Ratios that PLE's publication gives, and ratios of PLE's optimized form.
 const PLE_RATIOS: [[f64; 5]; 2] = [[0.68, 0.86, 0.85, 0.87, 0.85], [0.44, 0.65, 0.67, 0.71, 0.71]];
 /// Maximum time for a scan of 360 beams, in us.
 const MAX_TIME_US: [f64; 2] = [100.0, 1000.0];
@@ -36,7 +36,7 @@ const NAMES: [[&str; 5]; 2] = [
     ],
 ];
 
-/// Measures on drawn rooms and on logs; `is_quick` takes one set of rooms and few scans of each log.
+/// Measures on drawn rooms and on logs. With `is_quick`, uses one set of rooms and few scans of each log.
 pub(crate) fn measure(is_quick: bool, is_json: bool) {
     let mut figures = Vec::new();
     let mut cells = Vec::new();
@@ -48,8 +48,8 @@ pub(crate) fn measure(is_quick: bool, is_json: bool) {
     figures::print_cells("perception, lines", is_json, &cells);
 }
 
-/// Returns the hub's line finder, limited only by the number of vertices. Points farther apart than `gap_m` are not
-/// connected.
+/// Returns the hub's line finder, limited only by the number of vertices. Points that are more than `gap_m` apart are
+/// not connected.
 fn hub_line_finder(count: usize, refine: bool, gap_m: f64) -> LineFinder {
     // At least two beams per line, as for the other methods, because all beams of a room count.
     let settings =
@@ -118,8 +118,8 @@ fn measure_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<C
     }
 }
 
-/// Compares lines with the true walls, with settings that a user can configure, and with end-point fit with the true
-/// number of vertices.
+/// Compares lines with the true walls. The methods are the hub's method with settings that a user can configure, and
+/// end-point fit with the true number of vertices.
 fn compare_with_walls(seeds: Range<u64>, cells: &mut Vec<Cell>) {
     let draws: Vec<Vec<Room>> = seeds.map(|seed| draw_rooms(seed, RAY_COUNT)).collect();
     let mut lines = Lines::default();
@@ -200,7 +200,8 @@ fn measure_logs(max_scans: usize, cells: &mut Vec<Cell>) {
 
 /// Lines that a method found in a scan, in the order of their beams.
 struct FoundLines {
-    /// First beam, last beam, and the line: distance from the sensor and direction of its nearest point.
+    /// First beam and last beam of each line, and the line itself: distance of its nearest point from the sensor, and
+    /// direction of this point.
     lines: Vec<(usize, usize, f64, f64)>,
 }
 
@@ -222,12 +223,12 @@ impl FoundLines {
         FoundLines { lines: lines.lines().iter().map(line).collect() }
     }
 
-    /// Compares the lines with the beams.
+    /// Compares the lines with the beams of `scan`.
     fn score(&self, scan: &Scan) -> Score {
         self.compare(|beam| scan.distance_m(beam), scan)
     }
 
-    /// Compares the lines with these ranges in meters of the beams of `scan`.
+    /// Compares the lines with the ranges that `range` returns for the beams of `scan`, in meters.
     fn compare(&self, range: impl Fn(usize) -> Option<f64>, scan: &Scan) -> Score {
         let (mut square, mut count) = (0.0, 0);
         let mut is_met = vec![false; scan.beams()];
@@ -254,7 +255,7 @@ fn mean(scores: &[Score]) -> Score {
     Score { rmse: mean(|score| score.rmse), share: mean(|score| score.share) }
 }
 
-/// A beam with a range, and its end.
+/// A beam with a range, and the position of its end.
 #[derive(Clone, Copy)]
 struct Point {
     beam: usize,
@@ -270,8 +271,8 @@ fn points(scan: &Scan) -> Vec<Point> {
     (0..scan.beams()).filter_map(point).collect()
 }
 
-/// Returns the distance from the sensor and the direction of the nearest point of the line through (x, y) with this
-/// normal.
+/// Returns the nearest point of a line, as its distance from the sensor and its direction. The line has this normal and
+/// goes through (x, y).
 fn normal_form(normal: (f64, f64), x: f64, y: f64) -> (f64, f64) {
     let r = normal.0 * x + normal.1 * y;
     let turned = if r < 0.0 { -1.0 } else { 1.0 };
@@ -298,8 +299,8 @@ fn farthest(points: &[Point], first: usize, last: usize) -> (f64, usize) {
         .fold((0.0, first), |best, one| if one.0 > best.0 { one } else { best })
 }
 
-/// Returns the indices of the vertices of the polyline. They start with both ends. Each further vertex is the point
-/// that is farthest from the polyline so far.
+/// Returns the indices of the vertices of the polyline. The first vertices are both ends. Each further vertex is the
+/// point that is farthest from the polyline so far.
 fn vertices(points: &[Point], count: usize) -> Vec<usize> {
     let mut vertices = vec![0, points.len() - 1];
     let mut splits = vec![farthest(points, 0, points.len() - 1)];
@@ -332,7 +333,7 @@ fn beams_on_line(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usi
     Some((begin.beam, end.beam, r, alpha))
 }
 
-/// Iterative end-point fit. The lines are those of the polyline through some of the points.
+/// Iterative end-point fit. The lines are the pieces of a polyline through some of the points.
 fn end_points(scan: &Scan, count: usize) -> FoundLines {
     let points = points(scan);
     let mut lines = Vec::new();
@@ -362,8 +363,8 @@ fn regression(points: &[Point]) -> ((f64, f64), f64) {
     (normal_form(normal, x, y), error.max(0.0))
 }
 
-/// Split and merge. Cuts into twice as many pieces as end-point fit, and then merges the neighbors whose common line is
-/// nearest to their points until few enough remain.
+/// Split and merge. It cuts the points into twice as many pieces as end-point fit. Then it repeatedly merges the two
+/// neighbors whose common line is nearest to their points, until few enough pieces remain.
 fn split_and_merge(scan: &Scan, count: usize) -> FoundLines {
     let points = points(scan);
     if points.len() < 2 {
@@ -394,12 +395,12 @@ fn split_and_merge(scan: &Scan, count: usize) -> FoundLines {
     FoundLines { lines: pieces.iter().filter_map(line).collect() }
 }
 
-/// Number of lines that RANSAC tries for each line that it finds.
+/// Number of lines that RANSAC tries before it takes one of them.
 const RANSAC_TRIES: usize = 200;
-/// Maximum distance of a point that belongs to a line of RANSAC, in meters.
+/// Maximum distance between a line of RANSAC and a point that belongs to it, in meters.
 const RANSAC_DISTANCE_M: f64 = 0.05;
 
-/// RANSAC. Draws random lines through two points, takes the one with the longest run of near points, removes these
+/// RANSAC. It draws random lines through two points, takes the line with the longest run of near points, removes these
 /// points, and repeats.
 fn ransac(scan: &Scan, count: usize) -> FoundLines {
     let mut random = Rng::with_seed(1);
@@ -425,7 +426,7 @@ fn ransac(scan: &Scan, count: usize) -> FoundLines {
     FoundLines { lines }
 }
 
-/// Returns the points around one of them that are near the line, without a break in their beams.
+/// Returns the points around the point `at` that are near the line, without a break in their beams.
 fn near_run(points: &[Point], at: usize, (r, alpha): (f64, f64)) -> std::ops::Range<usize> {
     let near = |p: &Point| (p.x * alpha.cos() + p.y * alpha.sin() - r).abs() < RANSAC_DISTANCE_M;
     let (mut first, mut end) = (at, at + 1);
@@ -443,11 +444,11 @@ const SCANS_PER_SET: usize = 260;
 /// Number of rays of a scan in the experiment.
 const RAY_COUNT: usize = 360;
 const CORNER_COUNTS: [usize; 7] = [3, 4, 5, 6, 12, 36, 180];
-/// Standard deviation of the noise of a ray: of the angle in degrees, of the range in meters.
+/// Standard deviations of a ray's noise: for the angle in degrees, and for the range in meters.
 const RAY_NOISE: (f64, f64) = (0.2, 0.03);
 
-/// Returns the rooms of `seed` with scans of `rays` rays over 360 degrees including both ends: the first and the last
-/// ray have the same direction.
+/// Returns the rooms of `seed` with scans of `rays` rays over 360 degrees. The scans include both ends, so the first
+/// and the last ray have the same direction.
 fn draw_rooms(seed: u64, rays: usize) -> Vec<Room> {
     let mut random = Rng::with_seed(seed);
     (0..SCANS_PER_SET).map(|_| room(&mut random, rays)).collect()
@@ -462,7 +463,7 @@ struct Room {
     scan: Box<Scan>,
     /// Distance of the wall in the direction of each beam, in meters.
     walls_m: Vec<f64>,
-    /// Number of corners, and of walls.
+    /// Number of corners, which is also the number of walls.
     corners: usize,
 }
 
@@ -478,7 +479,7 @@ fn room(random: &mut Rng, rays: usize) -> Room {
         let corner = ((from_first / each) as usize).min(corners - 1);
         let (one, two) = (distances[corner], distances[(corner + 1) % corners]);
         let inside = from_first - corner as f64 * each;
-        // The wall from one corner to the next, by the law of sines.
+        // Distance to the wall between two corners, by the law of sines.
         one * two * each.sin() / (one * inside.sin() + two * (each - inside).sin())
     };
     let angles = (0..rays).map(|ray| ray as f64 * step - PI);

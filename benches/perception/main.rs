@@ -56,7 +56,7 @@ struct Options {
     parts: Vec<Part>,
     is_json: bool,
     is_quick: bool,
-    /// Seeds of simulated scenes and drives. Those below 10 were used for tuning.
+    /// Seeds of simulated scenes and drives. Seeds below 10 were used for tuning.
     seeds: Range<u64>,
 }
 
@@ -79,7 +79,7 @@ impl Options {
                     let range = range.filter(|range: &Range<u64>| !range.is_empty());
                     seeds = Some(range.ok_or("--seeds needs a range such as 10..20")?);
                 }
-                // Cargo passes this to every bench.
+                // Cargo passes this argument to every bench.
                 "--bench" => {}
                 _ => {
                     return Err(format!(

@@ -1,11 +1,11 @@
-//! Accuracy of a robot's motion that is estimated from its scans, and the time that it takes. The hub's method is
-//! compared with plain point-to-point and point-to-line matching of two scans. These start at the pose of the first
-//! scan and drop the worst tenth of the pairs. Measured on recorded drives of real robots and on simulated ones.
+//! Accuracy of a robot's motion that is estimated from its scans, and CPU time of the estimate. The hub's method is
+//! compared with simple point-to-point and point-to-line matching of two scans. The simple methods start at the pose of
+//! the first scan and drop the worst tenth of the pairs. The drives are recordings of real robots and simulations.
 //!
-//! The positions of three logs come from a map that was built from them, with errors of about 20 mm. Those of the model
-//! cars have no meaning below 5 mm. Steps of three of the logs are a meter and more, so the limits of `[motion]` are
-//! wider there. A step is wrong if it is off by 200 mm (100 mm for the cars) or 5 degrees. `people in half; hidden`
-//! compares with the same scans in which beams on people have no reading.
+//! The positions of three logs come from a map that was built from the same logs, with errors of about 20 mm. The
+//! positions of the model cars have no meaning below 5 mm. Steps of three of the logs are a meter and more, so the
+//! limits of `[motion]` are wider there. A step is wrong if its error is 200 mm (100 mm for the cars) or 5 degrees.
+//! `people in half; hidden` compares with the same scans, but beams on people have no reading.
 
 use std::f64::consts::{PI, TAU};
 use std::time::Instant;
@@ -19,7 +19,7 @@ use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings::{self, Drive, normal, scan};
 use crate::worlds;
 
-/// Measures on recorded and simulated drives; `is_quick` takes fewer steps and seeds.
+/// Measures on recorded and simulated drives. With `is_quick`, uses fewer steps and seeds.
 pub(crate) fn measure(is_quick: bool, is_json: bool) {
     let (mut figures, mut cells) = (Vec::new(), Vec::new());
     let drives = recordings::drives();
@@ -34,7 +34,7 @@ pub(crate) fn measure(is_quick: bool, is_json: bool) {
     figures::print_cells("perception, motion", is_json, &cells);
 }
 
-/// Returns the hub's result for each scan, and the times for lines and motion in us per scan.
+/// Returns the hub's result for each scan, and the CPU times for lines and motion in us per scan.
 fn run(scans: &[Box<Scan>], settings: Settings) -> (Vec<Motion>, [f64; 2]) {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
     let mut finder = LineFinder::new(Pose::default(), LineSettings::default(), beams);
@@ -71,7 +71,7 @@ fn median(values: &mut [f64]) -> f64 {
     figures::percentile(values, 0.5).unwrap_or(f64::NAN)
 }
 
-/// Adds the scores of at most `max_steps` steps of `drive`, evenly spread.
+/// Adds the scores of at most `max_steps` steps of `drive`, evenly distributed.
 fn measure_drive(drive: &Drive, max_steps: usize, cells: &mut Vec<Cell>) {
     let (motions, times_us) = run(&drive.scans, drive.settings);
     let steps: Vec<(usize, Pose2)> = drive.steps().collect();
@@ -220,7 +220,7 @@ fn squared_distance((x, y): Point, (a, b): Point) -> f64 {
     (x - a) * (x - a) + (y - b) * (y - b)
 }
 
-/// Returns for each point of `moved` the nearest one of `fixed`: both indices and the square of their distance.
+/// Returns the nearest point of `fixed` for each point of `moved`: both indices and the square of the distance.
 fn pairs(fixed: &[Point], moved: &[Point]) -> Vec<(usize, usize, f64)> {
     let nearest = |(i, &point): (usize, &Point)| {
         let by_distance = fixed.iter().enumerate().map(|(j, &other)| (j, squared_distance(point, other)));
@@ -332,7 +332,7 @@ enum DriveKind {
     Room,
     /// People walk around the robot and hide about half of the view.
     People,
-    /// The same, but beams that meet people have no reading.
+    /// Like `People`, but beams that meet people have no reading.
     Hidden,
     /// Two walls and nothing else.
     Corridor,
@@ -390,8 +390,7 @@ struct Walker {
     by_second: Point,
 }
 
-/// Moves the people, and replaces those who leave the view from `visible_from`, so that about half of the view is
-/// hidden.
+/// Moves the people. Replaces people who leave the view from `visible_from`, so that about half of the view is hidden.
 fn move_people(people: &mut Vec<Walker>, visible_from: &Pose2, random: &mut Rng) {
     for Walker { at, by_second } in people.iter_mut() {
         *at = (at.0 + by_second.0 * SCAN_PERIOD_S, at.1 + by_second.1 * SCAN_PERIOD_S);
@@ -412,7 +411,7 @@ fn move_people(people: &mut Vec<Walker>, visible_from: &Pose2, random: &mut Rng)
     }
 }
 
-/// Returns `count` scans of `beams` beams over 180 degrees (270 for 1081 beams), and the pose of the robot at each.
+/// Returns `count` scans of `beams` beams over 180 degrees (270 for 1081 beams), and the robot's pose at each scan.
 fn drive(kind: DriveKind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Scan>>, Vec<Pose2>) {
     let mut random = Rng::with_seed(seed);
     let walls = match kind {

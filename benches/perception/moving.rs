@@ -1,12 +1,12 @@
-//! Separation of moving from static objects by a robot that drives, with `background.method = "moving"`. Simulated
-//! drives have known truth, and a standing robot is compared with `multi`. Recordings are from a model car with another
-//! car whose position is known.
+//! Separation of moving from static objects on a driving robot, with `background.method = "moving"`. Simulated drives
+//! have known truth. For a standing robot, the method is compared with `multi`. Recordings come from a model car, with
+//! another car whose position is known.
 //!
-//! A beam counts as foreground if it meets a person with all of its spot, in space that was seen free at least five
-//! times. Beams at a person's edge, people in space that was not seen before, and the first 12 s do not count.
+//! A beam counts as foreground if its whole spot meets a person, in space that was seen free at least five times. Three
+//! things do not count: beams at a person's edge, people in space that was not seen before, and the first 12 s.
 //!
-//! A point belongs to the other car within 0.2 m of its pose while it moves. A false beam is one reported more than
-//! 0.4 m from it.
+//! A point belongs to the other car if it is within 0.2 m of the car's pose while the car moves. A reported beam is
+//! false if it is more than 0.4 m from that pose.
 
 use std::ops::Range;
 use std::time::Instant;
@@ -56,8 +56,8 @@ impl Processors {
     }
 }
 
-/// Returns recall and precision of `method` from scan `from` on, and the time in us per scan. A map built with the true
-/// poses determines which beams are foreground.
+/// Returns recall and precision of `method` from the scan with index `from` on, and the CPU time in us per scan. A map
+/// built with the true poses determines which beams are foreground.
 fn run(drive: &Drive, method: Method, from: usize) -> (f64, f64, f64) {
     let beams = drive.scans[0].beams();
     let mut processors = Processors::new(method, beams);
@@ -116,8 +116,8 @@ fn measure_drives(seeds: Range<u64>, figures: &mut Vec<Figure>) {
     put("standing: precision below multi's", "1", less(1), Vec::new(), Target::Max(0.01));
 }
 
-/// Adds the scores for the other car: the share of the beams on it that are reported while it moves, and the number of
-/// other beams that are reported per scan.
+/// Adds the scores for the other car. They are the share of the beams on the moving car that are reported, and the
+/// number of other reported beams per scan.
 fn measure_recordings(cells: &mut Vec<Cell>) {
     let recordings = recordings::drives_with_other_car();
     if recordings.is_empty() {

@@ -1,5 +1,6 @@
-//! Recorded drives of real robots whose positions are known: logs of the CARMEN toolkit, with positions corrected by a
-//! map, and model cars under motion capture. They are not part of the project.
+//! Recorded drives of real robots whose positions are known. The first kind is logs of the CARMEN toolkit, with
+//! positions corrected by a map. The second kind is model cars under motion capture. The recordings are not part of the
+//! project.
 
 use std::f64::consts::{PI, TAU};
 use std::fs::{self, File};
@@ -15,7 +16,7 @@ use serde_json::Value;
 /// Names of the drives of model cars.
 const CARS: [&str; 2] = ["overtakes", "intersection"];
 
-/// A scan, and the pose of the robot at it, if it is known.
+/// A scan with the robot's pose at the scan, if the pose is known.
 type PosedScan = (Box<Scan>, Option<Pose2>);
 
 /// Consecutive scans of a robot.
@@ -25,19 +26,19 @@ pub(crate) struct Drive {
     /// Position of the robot at each scan, if it is known.
     pub(crate) positions: Vec<Option<Pose2>>,
     pub(crate) settings: Settings,
-    /// Error from which a step is wrong, in mm.
+    /// Minimum error of a wrong step, in mm.
     pub(crate) min_wrong_mm: f64,
 }
 
 impl Drive {
-    /// Returns the indices of the scans whose step from the previous scan is known, with that step.
+    /// Returns each scan whose step from the previous scan is known: the index of the scan, and the step.
     pub(crate) fn steps(&self) -> impl Iterator<Item = (usize, Pose2)> + '_ {
         let step = |at: usize| Some((at, self.positions[at - 1]?.inverse().then(&self.positions[at]?)));
         (1..self.positions.len()).filter_map(step)
     }
 }
 
-/// Returns all drives; empty without recordings.
+/// Returns all drives. Without recordings, there are none.
 pub(crate) fn drives() -> Vec<Drive> {
     let logs = logs().into_iter().map(|(name, scans)| {
         // All but one log have one scan per meter or per half turn.
@@ -103,7 +104,7 @@ fn carmen(path: &Path) -> Option<Vec<PosedScan>> {
     Some(lines(path).ok()?.filter_map(read).collect())
 }
 
-/// Returns the scans of all CARMEN logs, each log with its name; empty without recordings.
+/// Returns the scans of all CARMEN logs, each log with its name. Without recordings, there are none.
 pub(crate) fn logs() -> Vec<(String, Vec<PosedScan>)> {
     let entries = fs::read_dir(folder().join("carmen")).into_iter().flatten().flatten();
     let mut paths: Vec<PathBuf> = entries.map(|entry| entry.path()).collect();
@@ -133,7 +134,8 @@ fn model_car(name: &str) -> Option<Drive> {
     })
 }
 
-/// Returns a scan of these ranges in meters, in units of 1 mm. Ranges beyond what a scan can hold have no return.
+/// Returns a scan of `ranges`, which are in meters, in units of 1 mm. A range beyond the maximum of a scan becomes no
+/// return.
 pub(crate) fn scan(first_angle: f64, step: f64, ranges: &[f64]) -> Box<Scan> {
     let head = ScanHead {
         first_angle,

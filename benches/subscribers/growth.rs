@@ -3,32 +3,32 @@
 
 use crate::support::figures::{self, Cell, percentile};
 
-/// A quantity that is measured for each number.
+/// A quantity that is measured for several numbers of items.
 pub(crate) struct Quantity {
     pub(crate) name: &'static str,
     pub(crate) unit: &'static str,
-    /// Exponent of the quantity if the total grows linearly: 0 for a cost per item, 1 for the cost of all items. `None`
-    /// if the growth is not evaluated.
+    /// Exponent that the quantity has if the total grows linearly: 0 for a cost per item, 1 for the cost of all items.
+    /// `None` if the growth is not evaluated.
     pub(crate) linear: Option<f64>,
 }
 
-/// Values of several quantities, measured for several numbers.
+/// Values of several quantities, measured for several numbers of items.
 pub(crate) struct ParameterRange {
     title: String,
     /// Name of the counted items, such as `subscribers`.
     counted: &'static str,
     quantities: Vec<Quantity>,
-    /// The numbers in order, each with the values of all runs by quantity.
+    /// The numbers of items in order. Each number has the values of all runs, by quantity.
     rows: Vec<(usize, Vec<Vec<f64>>)>,
 }
 
 /// Growth of a quantity, from the medians of its runs.
 #[derive(Clone, Copy, Debug)]
 struct Growth {
-    /// Parameters of the fit `fixed + per_item * n`, by least squares of relative errors.
+    /// Parameters of the fit `fixed + per_item * n`, which minimizes the squares of relative errors.
     fixed: f64,
     per_item: f64,
-    /// Slope of the logarithms for large numbers: 1 for a quantity that grows linearly.
+    /// Slope of the logarithms for large numbers of items. It is 1 for a quantity that grows linearly.
     exponent: f64,
 }
 
@@ -38,7 +38,8 @@ impl ParameterRange {
         ParameterRange { title: title.to_owned(), counted, quantities, rows: Vec::new() }
     }
 
-    /// Adds the values of one run with `number`: one for each quantity, in their order.
+    /// Adds the values of one run with `number` items. There is one value for each quantity, in the order of the
+    /// quantities.
     pub(crate) fn add(&mut self, number: usize, values: &[f64]) {
         if self.rows.last().is_none_or(|(last, _)| *last != number) {
             self.rows.push((number, vec![Vec::new(); self.quantities.len()]));
@@ -96,7 +97,7 @@ impl ParameterRange {
         cells
     }
 
-    /// Returns the median of quantity number `at` for each number.
+    /// Returns the median of the quantity with index `at` for each number of items.
     fn medians(&self, at: usize) -> Vec<(f64, f64)> {
         let median = |(number, row): &(usize, Vec<Vec<f64>>)| {
             let mut sorted = row[at].clone();
@@ -108,7 +109,7 @@ impl ParameterRange {
 }
 
 impl Growth {
-    /// Returns the growth over `points`, or `None` for fewer than three numbers, or if a value is zero.
+    /// Returns the growth over `points`. Returns `None` for fewer than three points, or if a value is zero.
     fn of(points: &[(f64, f64)]) -> Option<Growth> {
         let greatest = points.last()?.0;
         if points.len() < 3 || points.iter().any(|&(n, value)| n <= 0.0 || value <= 0.0) {
@@ -140,7 +141,7 @@ fn line(points: impl Iterator<Item = (f64, f64, f64)>) -> Option<(f64, f64)> {
     (spread > 0.0).then(|| ((y - slope * x) / weights, slope))
 }
 
-/// Numbers within this factor of the largest one count as large.
+/// Factor that defines large numbers: those that are at least the largest number divided by this factor.
 const LARGE_FACTOR: f64 = 16.0;
-/// An exponent that exceeds that of linear growth by more than this is not explained by the spread of a few runs.
+/// Maximum difference from the exponent of linear growth that the spread of a few runs can explain.
 const EXPONENT_TOLERANCE: f64 = 0.25;

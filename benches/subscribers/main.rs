@@ -1,13 +1,13 @@
 //! Costs of many subscribers, effects of broken subscribers on the others, and growth of the hub's costs.
 //!
 //! A hundred subscribers receive one sensor at once. Then a process that holds samples is killed twenty times, a
-//! subscriber is stopped for two seconds, and all slots of a topic are taken. A witness loses nothing in all of this,
-//! and afterwards the hub is in the same state as before.
+//! subscriber is stopped for two seconds, and all slots of a topic are taken. Another subscriber, the witness, loses
+//! nothing in all of this. Afterward, the hub is in the same state as before.
 //!
 //! CPU time and memory are then measured for several numbers of subscribers, of sensors on lines, of sensors in virtual
-//! time, and of beams, and a fit shows how each of them grows. Subscribers are threads of four processes. Lines are
-//! ptys of this machine. If simulators and hub no longer keep the rate of the sensors, the table shows it. The bench
-//! does not measure real adapters.
+//! time, and of beams. A fit shows how each of them grows. Subscribers are threads of four processes. Lines are ptys of
+//! this machine. If simulators and hub no longer keep the rate of the sensors, the table shows it. The bench does not
+//! measure real adapters.
 //!
 //! How to read the figures:
 //!
@@ -15,15 +15,15 @@
 //!   telegrams arrive in three reads and pass framer, session, decoding and all processors into all topics in shared
 //!   memory. One system call wakes the subscribers, and one subscriber to each topic takes everything. Reads, sleeps
 //!   and wake-ups of subscribers are not included; `sensors on ptys` and `subscribers of one sensor` include them.
-//! - Many sensors run in hubs of 125 at the same time. The step between some ten and some hundred sensors comes from
-//!   the second-level cache: for each sample, the library checks all possible subscriber slots of the topic, 1168 bytes
-//!   apart.
-//! - A table of growth has the line `fixed + for each * n` (least squares of relative errors), and the slope of
-//!   logarithms from a sixteenth of the largest number upwards. A slope 0.25 above that of linear growth is reported as
-//!   worse than linear.
-//! - Latency is that of the last subscriber. Numbers above 125 are measured once.
+//! - If there are many sensors, they run in hubs of 125 sensors at the same time. The cost increases between about ten
+//! and about a hundred sensors because of the second-level cache. For each sample, the library checks all possible
+//! subscriber slots of the topic, which are 1168 bytes apart.
+//! - A table of growth has the line `fixed + for each * n`, which minimizes the squares of relative errors. It also has
+//! the slope of the logarithms from a sixteenth of the largest number upward. A slope that exceeds the slope of linear
+//! growth by 0.25 is reported as worse than linear.
+//! - Latency is the latency of the last subscriber. Numbers above 125 are measured once.
 //! - `program and libraries` are pages of the executable, which the machine holds only once. Touched shared memory is
-//!   the part of the samples that is in use, because the same few are used repeatedly.
+//! the part of the samples that is in use. It is small because the same few samples are used repeatedly.
 
 mod growth;
 mod many_subscribers;
@@ -68,7 +68,7 @@ fn measure(options: &Options) -> Outcome<()> {
     sensors::measure_lines(options)
 }
 
-/// Measures a crowd, and the effects of broken subscribers on the others.
+/// Measures many subscribers, and the effects of broken subscribers on the others.
 fn faults(options: &Options) -> Outcome<()> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate(&[SENSOR], 500_000)?;
@@ -78,7 +78,7 @@ fn faults(options: &Options) -> Outcome<()> {
     figures.extend(measure_kills(&environment, &hub)?);
     figures.extend(measure_stopped(&environment)?);
     figures.extend(fill_slots(&environment)?);
-    // A request for the status needs a slot, and the crowd has left by now.
+    // A request for the status needs a slot. After this time, the slots of the many subscribers are free.
     thread::sleep(CLEANUP_TIMEOUT);
     let failed = counter(&environment, Counter::LoanFailed)?;
     figures.push(figure("samples without memory", "1", failed, Target::Max(0.0)));
@@ -227,5 +227,5 @@ fn figure(name: &'static str, unit: &'static str, value: f64, target: Target) ->
 const SENSOR: &str = "front";
 const PROCESS_COUNT: usize = 4;
 const KILL_COUNT: usize = 20;
-/// Time after which the remains of dead processes are certainly removed: the hub does it every 5 s.
+/// Time after which the hub has certainly cleaned up after dead processes. The hub does this every 5 s.
 const CLEANUP_TIMEOUT: Duration = Duration::from_secs(12);

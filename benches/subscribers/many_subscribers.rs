@@ -1,5 +1,5 @@
-//! Cost of the subscribers of one sensor for the hub, time until the last of them has a scan, and memory of a hub with
-//! 200 subscribers. Subscribers sleep on the doorbell or on the event, and the sensor at the other end of a pty keeps
+//! Cost of one sensor's subscribers for the hub, time until the last of them has a scan, and memory of a hub with 200
+//! subscribers. Subscribers sleep on the doorbell or on the event. The sensor is at the other end of a pty and keeps
 //! its rate.
 
 use std::collections::BTreeMap;
@@ -39,14 +39,14 @@ pub(crate) fn measure_subscribers(options: &Options) -> Outcome<()> {
             quantities,
         );
         for _ in 0..options.pairs().min(3) {
-            // One hub for all numbers of subscribers: those that leave return their memory.
+            // One hub serves all numbers of subscribers, because subscribers that leave return their memory.
             let hub = environment.hub_with_many_slots(&[SENSOR])?;
             hub.wait_for_line("ready", STEP_TIMEOUT)?;
             let mut runs = Vec::new();
             for count in SUBSCRIBER_COUNTS {
                 match run(&environment, &hub, count, options.seconds(8), wait) {
                     Ok(values) => runs.push((count, values)),
-                    // An overloaded machine wakes too few of them in time.
+                    // An overloaded machine wakes too few subscribers in time.
                     Err(error) => eprintln!("{count} subscribers, waiting for the {wait}: {error}"),
                 }
             }
@@ -58,9 +58,9 @@ pub(crate) fn measure_subscribers(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` after each subscriber has a scan.
-/// Prints for each scan how many subscribers received it and its age at the last of them, `last SEQ COUNT AGE_NS`, and
-/// then `missed COUNT`.
+/// Subscribes `count` times to the scans of `sensor`. Receives for `seconds` after each subscriber has a scan. For each
+/// scan, prints `last SEQ COUNT AGE_NS`: the number of subscribers that received the scan, and its age at the last of
+/// them. Finally prints `missed COUNT`.
 pub(crate) fn subscribe_many(
     domain: &str,
     sensor: &str,
@@ -79,7 +79,7 @@ pub(crate) fn subscribe_many(
         all.wait();
         let mut scans = attached.map_err(|error| error.to_string())?;
         let words = |error: scanhub_client::Error| error.to_string();
-        // Samples that queued up, or were missed, while others attached do not count.
+        // Samples that were queued or missed while other subscribers attached do not count.
         while scans.try_next().map_err(words)?.is_some() {}
         let end = clock::now() + seconds * 1_000_000_000;
         let (mut ages, mut missed) = (Vec::with_capacity(50 * seconds as usize), 0);
@@ -184,7 +184,7 @@ const SENSOR: &str = "front";
 const SUBSCRIBER_COUNTS: [usize; 5] = [1, 4, 16, 64, 200];
 const PROCESS_COUNT: usize = 4;
 
-/// Number and bytes of files, by the extension of their names.
+/// Number of files and number of their bytes, by file name extension.
 type SegmentSizes = BTreeMap<String, (usize, f64)>;
 
 /// Measures the memory of a hub with two links and 100 subscribers to the scans of each.
@@ -194,7 +194,7 @@ pub(crate) fn measure_memory(options: &Options) -> Outcome<()> {
     let hub = environment.hub_with_many_slots(&SENSORS)?;
     hub.wait_for_line("ready", STEP_TIMEOUT)?;
     let alone = segments(&environment.domain)?;
-    // The subscribers run until they are ended, so that the first ones are still attached when the last ones are.
+    // The subscribers run until they are ended, so that the first ones are still attached when the last ones attach.
     let (seconds, long) = (options.seconds(8), 3600);
     let children: Vec<_> = SENSORS
         .iter()

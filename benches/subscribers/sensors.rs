@@ -1,5 +1,5 @@
-//! Costs of sensors for the hub: on lines at their own rate, and in virtual time as fast as they can be processed. Also
-//! measures the cost of beams.
+//! Costs of sensors for the hub: on lines at the sensors' own rate, and in virtual time as fast as the hub can process
+//! them. Also measures the cost of beams.
 
 use std::path::Path;
 use std::thread;
@@ -22,13 +22,13 @@ use crate::support::usage::{ResidentMemory, ThreadUsage, segments};
 use crate::support::{Options, Outcome, clock};
 use crate::virtual_hub::{VirtualLink, virtual_hub};
 
-/// Numbers of sensors on lines.
+/// Numbers of sensors on lines to measure with.
 const LINE_SENSOR_COUNTS: [usize; 5] = [1, 2, 4, 8, 16];
-/// Scans of a sensor on a line that do not count.
+/// Number of scans of a sensor on a line that do not count.
 const SKIPPED_SCANS: usize = 80;
 
-/// Measures 1 to 16 sensors, each with its own simulator at the other end of a pty and a subscriber to its scans. The
-/// rate shows whether simulators and hub, on the same processors, keep up with the sensors.
+/// Measures 1 to 16 sensors. Each sensor has its own simulator at the other end of a pty, and a subscriber to its
+/// scans. The rate shows whether simulators and hub keep up with the sensors on the same processors.
 pub(crate) fn measure_lines(options: &Options) -> Outcome<()> {
     let quantity = |name, unit, linear| Quantity { name, unit, linear };
     let quantities = vec![
@@ -107,9 +107,9 @@ fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
     ])
 }
 
-/// Measures 1 to 1,000 sensors in virtual time, to find how many sensors one core could serve if receiving their bytes
-/// cost nothing. Many sensors are distributed over several hubs, because a hub has at most 256 links and a process not
-/// enough descriptors for more.
+/// Measures 1 to 1,000 sensors in virtual time, to find how many sensors one core could serve if receiving bytes cost
+/// nothing. Many sensors are distributed over several hubs, because a hub has at most 256 links, and a process does not
+/// have enough descriptors for more sensors.
 pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
     let quantity = |name, unit, linear| Quantity { name, unit, linear };
     let quantities = vec![
@@ -132,7 +132,7 @@ pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
             });
             let (followed, alone) = match both {
                 Ok(both) => both,
-                // This machine does not have room for more.
+                // This machine does not have enough memory for more sensors.
                 Err(error) => {
                     eprintln!("{sensors} sensors in virtual time: {error}");
                     continue;
@@ -185,7 +185,7 @@ struct TelegramCost {
     descriptors: f64,
 }
 
-/// Runs `sensors` in several hubs, which start measuring together.
+/// Runs `sensors` in several hubs. All hubs start to measure at the same time.
 fn run_in_virtual_time(
     sensors: usize,
     variant: Variant,
@@ -232,7 +232,7 @@ fn runs(options: &Options) -> usize {
 
 const VIRTUAL_SENSOR_COUNTS: [usize; 6] = [1, 4, 16, 64, 250, MAX_SENSORS];
 const MAX_SENSORS: usize = 1000;
-/// Sensors of one hub. The descriptors of the hub and its subscribers belong to one process.
+/// Maximum number of sensors in one hub. One process has the descriptors of the hub and its subscribers.
 const SENSORS_PER_HUB: usize = 125;
 /// Scans per second of a sensor with 361 beams.
 const SCAN_RATE_HZ: f64 = 37.5;
@@ -299,7 +299,7 @@ struct TotalCost {
     received: usize,
 }
 
-/// Telegrams of the sensors. All of them see the same room, each at a different moment.
+/// Telegrams of the sensors. All sensors see the same room, each at a different time.
 struct SensorStreams {
     telegrams: Vec<Vec<u8>>,
     period: Nanos,
@@ -315,7 +315,7 @@ impl SensorStreams {
             let words = room.scan(variant, Unit::Mm, MODE, number * period);
             measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
         };
-        // A telegram that ends with a start byte would wait for the next one.
+        // The framer would hold a telegram that ends with a start byte until the next one arrives.
         let telegrams =
             (1..=TELEGRAM_COUNT).map(telegram).filter(|bytes| bytes.last() != Some(&STX)).collect();
         SensorStreams { telegrams, period, now: clock::now(), number: 0 }
@@ -415,12 +415,12 @@ fn cpu_ns() -> u64 {
     used.tv_sec as u64 * 1_000_000_000 + used.tv_nsec as u64
 }
 
-/// Time until a background is known: ten seconds, and some more.
+/// Time until a background is known. It is ten seconds and a margin.
 const LEARNING_TIME_NS: Nanos = 10_500_000_000;
 /// 13 bits of range, 3 of intensity.
 const MODE: Mode = Mode(1);
 /// Number of different telegrams.
 const TELEGRAM_COUNT: u64 = 512;
-/// Telegrams of each sensor before the subscribers take them. The shortest queue holds four samples, and a sample may
-/// be published later than its telegram.
+/// Number of telegrams of each sensor until the subscribers take the samples. The shortest queue holds four samples,
+/// and the hub may publish a sample later than its telegram.
 const TELEGRAMS_PER_TAKE: usize = 3;
