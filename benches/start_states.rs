@@ -2,7 +2,7 @@
 //!
 //! - at each of the four rates, idle, streaming or left in installation mode
 //! - just powered on, with quick replies. The baseline is a host that has the sensor's rate and sends no request for
-//! information
+//!   information
 //! - power-cycled in the middle of a scan while another sensor streams
 //!
 //! The bench does not measure how long a real sensor boots before it sends its boot message. That takes up to a minute.

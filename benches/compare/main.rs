@@ -12,21 +12,21 @@
 //!   neither.
 //! - In the targets, the column "baseline" is the baseline or the socket with which topics are compared.
 //! - With more receivers than processors, the last receiver waits until the others have used the processors. This is
-//! true for every mechanism.
+//!   true for every mechanism.
 //! - UDP datagrams hold 65,507 bytes, and Unix datagram sockets 65,536. Longer messages are sent in parts, and one
 //!   lost part loses the message.
 //! - At full speed, streams, pipes and Unix datagrams wait for their receivers; multicast and topics lose messages.
 //! - The baselines `futex` and `cache line` use the hub's own doorbell: one addition and one system call. The baseline
-//! `eventfd` uses no code of the hub.
+//!   `eventfd` uses no code of the hub.
 //! - Topics are a service with the hub's settings for messages of any length. For the scan there is also
 //!   `Subscriber::next`.
 //! - For each sample, the shared-memory library checks all possible subscriber slots three times. For one small message
-//! to one receiver, a pipe or a Unix socket needs less memory than the slots. At 37.5 Hz, the slots have left the
-//! caches before each message. For the same reason, spinning does not reach the microsecond that it reaches when
-//! messages arrive without a pause.
+//!   to one receiver, a pipe or a Unix socket needs less memory than the slots. At 37.5 Hz, the slots have left the
+//!   caches before each message. For the same reason, spinning does not reach the microsecond that it reaches when
+//!   messages arrive without a pause.
 //! - For the event, the library sends one datagram to each listener, and the listener needs one more system call to
-//! receive it. The event takes about twice as long as a futex. The doorbell wakes all sleeping subscribers at once, so
-//! they compete for two cores.
+//!   receive it. The event takes about twice as long as a futex. The doorbell wakes all sleeping subscribers at once, so
+//!   they compete for two cores.
 
 mod baselines;
 mod message;

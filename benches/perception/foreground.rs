@@ -38,7 +38,7 @@ const SCENES: [Scene; 11] = [
     Scene { name: "a crowd", world: "crowd", unit: Unit::Mm, mixed: true },
 ];
 
-/// Targets of `multi`: name of the figure, table row, table column, target.
+/// Targets of `multi`: name of the figure, row, table, target.
 const TARGETS: [(&str, &str, &str, Target); 11] = [
     ("recall in Fig. 8", "Fig. 8", RECALL_TABLE, Target::Min(0.99)),
     ("precision in Fig. 8", "Fig. 8", PRECISION_TABLE, Target::Min(0.95)),
