@@ -1,6 +1,7 @@
-//! CPU time of the picture in a browser, delay until it shows a scan, and bytes that are sent. Measured with `scanhub
-//! web` and a headless Chromium, and with viewers that draw nothing. The baseline is a page that draws as many points
-//! from memory as soon as the browser lets it. The bench does not measure the delay of a screen and a graphics card.
+//! CPU time of the picture in a browser, delay until the picture shows a scan, and number of bytes that are sent. The
+//! bench uses `scanhub web` and a headless Chromium, and also viewers that draw nothing. The baseline is a page that
+//! draws the same number of points from memory as soon as the browser permits. The bench does not measure the delay of
+//! a screen and a graphics card.
 
 #[path = "../tests/it/browser.rs"]
 #[allow(dead_code, reason = "the tests press keys and make pictures, too")]
@@ -9,7 +10,7 @@ mod support;
 #[path = "../tests/testkit/child.rs"]
 mod test_child;
 
-/// The part of the testkit that the driver of the browser needs.
+/// The part of the testkit that the browser's driver needs.
 mod testkit {
     pub(crate) use crate::support::environment::STEP_TIMEOUT as WAIT_TIMEOUT;
     pub(crate) use crate::test_child::{Child, spawn};
@@ -36,12 +37,12 @@ fn main() -> ExitCode {
     support::main(measure)
 }
 
-/// Figures of all runs, in order of their first value.
+/// Figures of all runs, in the order of their first values.
 #[derive(Default)]
 struct FigureList(Vec<Figure>);
 
 impl FigureList {
-    /// Adds the value of a run, and of its baseline if it has one.
+    /// Adds the value of a run, and the value of its baseline if it has one.
     fn push(
         &mut self,
         (name, unit, target): (&'static str, &'static str, Target),
@@ -99,7 +100,7 @@ fn measure_lms(series: &mut FigureList, span: Duration) -> Outcome<()> {
     }
     drop(page);
 
-    // CPU time of server and hub, and ages of scans, with no, one and sixteen viewers.
+    // CPU time of server and hub, and ages of scans, with zero, one and sixteen viewers.
     let names = [
         [
             ("no viewer: server", Target::None),
@@ -143,7 +144,7 @@ fn measure_lms(series: &mut FigureList, span: Duration) -> Outcome<()> {
     Ok(())
 }
 
-/// Measures two sensors of 3240 beams at 10 Hz, in a picture that rotates, so that all of it is drawn as often as
+/// Measures two sensors of 3240 beams at 10 Hz. The picture rotates, so that the page draws all of it as often as
 /// possible.
 fn measure_rotating(series: &mut FigureList, span: Duration) -> Outcome<()> {
     let environment = BenchEnvironment::new()?;
@@ -194,7 +195,8 @@ fn serve(environment: &BenchEnvironment) -> Outcome<(Child, String)> {
     Ok((web, url))
 }
 
-/// Returns the times from the receipt of a scan by a subscriber to the end of the frame that draws it, in ms, sorted.
+/// Returns the times from the receipt of a scan by a subscriber until the end of the frame that draws the scan, in ms,
+/// sorted.
 fn delays(environment: &BenchEnvironment, page: &mut Browser, span: Duration) -> Outcome<Vec<f64>> {
     let over = AtomicBool::new(false);
     let (received, shown) = thread::scope(|scope| {
@@ -224,7 +226,7 @@ fn delays(environment: &BenchEnvironment, page: &mut Browser, span: Duration) ->
 
 type ReceivedStamps = HashMap<i64, f64>;
 
-/// Returns the times at which scans of `sensor` arrived, in ms since 1970, by their stamps.
+/// Returns the times at which scans of `sensor` arrived, in ms since 1970. The keys are the stamps of the scans.
 fn receive(
     environment: &BenchEnvironment,
     sensor: &str,
@@ -244,7 +246,7 @@ fn receive(
     follow().map_err(|error| error.to_string())
 }
 
-/// Returns a stamp in ms, as the page has it, in units of 5 us.
+/// Returns the stamp `stamp_ms`, which the page has in ms, in units of 5 us.
 fn key(stamp_ms: f64) -> i64 {
     (stamp_ms * 200.0).round() as i64
 }
@@ -262,7 +264,7 @@ fn ages(environment: &BenchEnvironment, span: Duration) -> Outcome<Vec<f64>> {
     Ok(ages)
 }
 
-/// Returns the bytes per second of the topics of the default view as lines of `echo --json`.
+/// Returns the number of bytes per second of the topics in the default view, as lines of `echo --json`.
 fn echoed(environment: &BenchEnvironment, span: Duration) -> Outcome<f64> {
     let topics = ["*/scan", "*/foreground", "*/background", "*/marks", "*/zones", "*/status"];
     let run_for = format!("--for={}s", span.as_secs().max(1));
@@ -288,7 +290,7 @@ fn numbers(value: &Value) -> Vec<f64> {
     numbers
 }
 
-/// A page that needs no data, and draws 722 points as soon as it may, 37.5 times per second.
+/// A page that needs no data. It draws 722 points as soon as the browser permits, 37.5 times per second.
 const BLANK_SCRIPT: &str = "(() => {
     const canvas = document.createElement('canvas');
     [canvas.width, canvas.height] = [1280, 800];
@@ -318,7 +320,7 @@ const TURN_SCRIPT: &str = "(() => {
     };
     turn();
 })()";
-/// World with walls on all sides, so that every beam has a range.
+/// A world with walls on all sides, so that every beam has a range.
 const HALL_WORLD: &str =
     "[[thing]]\nline = [[6000, -6000], [6000, 6000], [-6000, 6000], [-6000, -6000], [6000, -6000]]\n";
 const NO_BROWSER: &str = "there is no browser (Debian: apt-get install chromium)";
@@ -326,7 +328,7 @@ const NO_BROWSER: &str = "there is no browser (Debian: apt-get install chromium)
 const SETTLE_TIME: Duration = Duration::from_secs(2);
 
 /// Runs a viewer without a picture. It subscribes to the same channels as the page, and reads as fast as possible for
-/// `span`. Returns the bytes of messages per second after the first second.
+/// `span`. Returns the number of bytes per second in messages after the first second.
 fn run_viewer(url: &str, span: Duration) -> Outcome<f64> {
     let mut socket = connect(url)?;
     let (started, mut bytes, mut since) = (Instant::now(), 0, None);
@@ -378,5 +380,5 @@ fn connect(url: &str) -> Outcome<WebSocket<TcpStream>> {
     Ok(socket)
 }
 
-/// Time at the start of a viewer that does not count.
+/// Time at the start of a viewer's run that does not count.
 const WARM_UP_TIME: Duration = Duration::from_secs(1);

@@ -1,11 +1,11 @@
 //! Minimal programs that the hub is compared with.
 //!
-//! [`run_baseline`] is a hub that only streams. It has the system calls that a late reader of a pty cannot avoid, and
-//! one wake-up of a sleeping process per telegram. It has no framing, no CRC, no counters and no shared memory. A
-//! telegram is the next 732 bytes after a pause that is longer than the one within a telegram.
+//! [`run_baseline`] is a hub that only streams. It makes the system calls that a late reader of a pty cannot avoid, and
+//! wakes a sleeping process once per telegram. It has no framing, no CRC, no counters and no shared memory. A telegram
+//! is the next 732 bytes after a pause. This pause is longer than the pause within a telegram.
 //!
-//! [`start_scanner`] is a hub that only starts a scanner whose rate it knows. It sends the requests and waits for the
-//! first scan. It does not search, and repeats a request only if it was lost.
+//! [`start_scanner`] is a hub that only starts a scanner whose rate it has from the beginning. It sends the requests
+//! and waits for the first scan. It does not search, and repeats a request only if the request was lost.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::Path;
@@ -24,9 +24,10 @@ use scanhub_drivers::lms::variant::Baud;
 use super::environment::GuardedProcess;
 use super::{Outcome, PART_WORD, clock, truth};
 
-/// Reads `count` telegrams (0: forever) from each of `ports` in a separate thread, and wakes one process per port. It
-/// wakes up `wake_ahead_ns` before the expected end of a telegram, or, with 0, as long before it as the hub does.
-/// Prints `ready` first. At the end, it prints the hash of each telegram and the time at which it was read.
+/// Reads `count` telegrams (0: forever) from each of `ports` in a separate thread, and wakes one process per port. Each
+/// thread wakes up `wake_ahead_ns` before the expected end of a telegram. With 0, it wakes up as long before the end as
+/// the hub does. Prints `ready` first. At the end, prints the hash of each telegram and the time at which the telegram
+/// was read.
 pub(crate) fn run_baseline(ports: &[&str], count: usize, wake_ahead_ns: u64) -> Outcome<()> {
     let mut sleepers = Vec::new();
     let mut ends = Vec::new();
@@ -51,8 +52,8 @@ pub(crate) fn run_baseline(ports: &[&str], count: usize, wake_ahead_ns: u64) -> 
     Ok(())
 }
 
-/// Sleeps on the eventfd that is its stdin until `count` telegrams were reported (0: forever), and then prints the time
-/// of each wake-up. With 0, it prints the first one at once.
+/// Sleeps on the eventfd that is its stdin until `count` telegrams were reported (0: forever). Then prints the time of
+/// each wake-up. With 0, prints the time of the first wake-up at once.
 pub(crate) fn run_sleeper(number: &str, count: usize) -> Outcome<()> {
     let wake = rustix::stdio::stdin();
     let mut times = Vec::with_capacity(count);
@@ -79,8 +80,8 @@ pub(crate) fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outco
     Ok(GuardedProcess::new(process))
 }
 
-/// Reads, and ends the whole process on an error, because the load of the baseline would be too low with one reader
-/// less.
+/// Reads a port. Ends the whole process on an error, because the load of the baseline would be too low without one of
+/// its readers.
 fn read_or_end(
     line: &SerialLine,
     wake: &OwnedFd,
@@ -93,8 +94,8 @@ fn read_or_end(
     })
 }
 
-/// Runs the read loop, and returns each telegram with the time at which it was complete. A telegram is stored after the
-/// wake-up, in the pause before the next one.
+/// Runs the read loop. Returns each telegram with the time at which it was complete. The loop stores a telegram after
+/// the wake-up, in the pause before the next one.
 fn read(
     line: &SerialLine,
     wake: impl AsFd,
@@ -123,7 +124,7 @@ fn read(
                     clock::sleep_until(
                         first + duration - if wake_ahead_ns > 0 { wake_ahead_ns } else { own_lead.nanos() },
                     );
-                    // As in the hub, bytes have certainly arrived, so there is no need to poll.
+                    // The bytes have certainly arrived, so there is no need to poll. The hub does the same.
                     filled += line.read(&mut telegram[filled..]).map_err(words)?;
                     reads_near_end = 1;
                 }
@@ -131,7 +132,7 @@ fn read(
         }
         let last = clock::now();
         if telegram[0] != lms::telegram::STX {
-            // The pause was not the one between two telegrams, because the sender was descheduled.
+            // The pause was not between two telegrams: the sender was descheduled.
             line.wait_for_pause(TELEGRAM_PAUSE_NS).map_err(words)?;
             continue;
         }
@@ -147,7 +148,7 @@ fn read(
     Ok(telegrams)
 }
 
-/// Duration of a telegram, estimated as in the hub: the minimum of several.
+/// Duration of a telegram, estimated like in the hub: the minimum of several durations.
 #[derive(Default)]
 struct TelegramDuration {
     duration_ns: Option<u64>,
@@ -172,19 +173,21 @@ impl TelegramDuration {
 const BAUD_RATE: u32 = 500_000;
 /// Length of a telegram of 361 beams, in bytes.
 const TELEGRAM_LEN: usize = 732;
-/// Time before the expected end of a telegram at which the baseline wakes up, in ns. The hub estimates its own. This
-/// one is constant, so that ratios can be compared with earlier ones.
+/// Time before the expected end of a telegram at which the baseline wakes up, in ns. The hub estimates its own time.
+/// The baseline's time is constant, so that ratios can be compared with earlier ones.
 pub(crate) const WAKE_AHEAD_NS: u64 = 600_000;
-/// Pause between two telegrams, in ns: longer than the 3.2 ms within a telegram and shorter than the 8.8 ms after it.
+/// Minimum pause between two telegrams, in ns. It is longer than the 3.2 ms within a telegram and shorter than the 8.8
+/// ms after a telegram.
 const TELEGRAM_PAUSE_NS: u64 = 6_000_000;
 
-/// Starts the scanner at `port`, which is at `rate`, as a hub that knew the rate would. Prints when the scanner had
-/// confirmed the stream and when the first scan had arrived.
+/// Starts the scanner at `port`, which has `rate`, like a hub that has this rate from the beginning. Prints the time at
+/// which the scanner had confirmed the stream, and the time at which the first scan had arrived.
 pub(crate) fn start_scanner(port: &Path, rate: u32) -> Outcome<()> {
     stream(port, rate, &[Request::Status], &[Request::Type, Request::Configuration])
 }
 
-/// Does the same without any request for information, which is the shortest possible dialog.
+/// Starts the scanner like [`start_scanner`], but without any request for information. This is the shortest possible
+/// dialog.
 pub(crate) fn start_scanner_unchecked(port: &Path, rate: u32) -> Outcome<()> {
     stream(port, rate, &[], &[])
 }
@@ -252,7 +255,7 @@ impl LmsHost {
 }
 
 const STREAM_BAUD: Baud = Baud::B500000;
-/// Gap between two bytes of a request, in ns. The scanner needs at least 55 us.
+/// Pause between two bytes of a request, in ns. The scanner needs at least 55 us.
 const BYTE_GAP_NS: u64 = 80_000;
 /// Pause after a change of the rate, in ns, as in the hub.
 const SETTLE_TIME_NS: u64 = 20_000_000;

@@ -1,4 +1,5 @@
-//! CLOCK_MONOTONIC, the clock of all stamps in the benches and in the hub, and functions that wait until a time of it.
+//! CLOCK_MONOTONIC, which is the clock of all stamps in the benches and in the hub, and functions that wait until a
+//! given time.
 
 use std::os::fd::AsFd;
 
@@ -17,7 +18,7 @@ pub(crate) fn sleep_until(until: u64) {
     let _ = poll(&mut [], Some(&span(until)));
 }
 
-/// Waits until `file` is readable or, if given, until `until`. Returns whether it is readable.
+/// Waits until `file` is readable, or until `until` if it is given. Returns whether `file` is readable.
 pub(crate) fn readable(file: impl AsFd, until: Option<u64>) -> Result<bool, Errno> {
     let mut fds = [PollFd::new(&file, PollFlags::IN)];
     match poll(&mut fds, until.map(span).as_ref()) {

@@ -1,5 +1,5 @@
-//! Environment of a bench: its own domain and directory, and the processes in it. The output of processes is read line
-//! by line, and they are ended by their ID, however the bench ends.
+//! Environment of a bench: its own domain, its own directory, and the processes in it. The output of processes is read
+//! line by line. However the bench ends, the processes are ended by their IDs.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -122,7 +122,7 @@ impl BenchEnvironment {
         self.hub_command_on(self, program, sensors)
     }
 
-    /// Returns the command that starts the hub with the sensors of another environment, `lines`.
+    /// Returns the command that starts the hub with the sensors of the environment `lines`.
     pub(crate) fn hub_command_on(
         &self,
         lines: &BenchEnvironment,
@@ -145,8 +145,8 @@ impl BenchEnvironment {
         self.start_part(&[&["consume", topic, self.domain.name(), sensor], words].concat())
     }
 
-    /// Starts this program as the baseline. It reads `count` telegrams from each port, and wakes up `wake_ahead_ns`
-    /// before the expected end of each, or with 0 as long before it as the hub does.
+    /// Starts this program as the baseline. The baseline reads `count` telegrams from each port. It wakes up
+    /// `wake_ahead_ns` before the expected end of each telegram, or with 0 as long before the end as the hub does.
     pub(crate) fn start_baseline(
         &self,
         sensors: &[&str],
@@ -183,11 +183,11 @@ impl Drop for BenchEnvironment {
 
 /// The two sensors of a vehicle.
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
-/// The sensors of a vehicle with one on each side.
+/// The sensors of a vehicle that has one sensor on each side.
 pub(crate) const ALL_AROUND: [&str; 4] = ["front", "rear", "left", "right"];
 /// Number of slots for subscribers to a topic with [`BenchEnvironment::hub_with_many_slots`].
 pub(crate) const MAX_SUBSCRIBERS: usize = 200;
-/// Timeout, far longer than any step takes.
+/// Timeout of a step. It is far longer than any step takes.
 pub(crate) const STEP_TIMEOUT: Duration = Duration::from_secs(20);
 /// The program of this build.
 pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
@@ -206,7 +206,7 @@ impl GuardedProcess {
         self.0.id()
     }
 
-    /// Ends the process as a crash would. Fails if it ended before.
+    /// Ends the process like a crash. Fails if the process has already ended.
     pub(crate) fn kill(mut self) -> Outcome<()> {
         if let Some(status) = self.0.try_wait()? {
             return Err(format!("process {} ended early: {status}", self.pid()).into());
@@ -260,7 +260,7 @@ impl OutputLine {
         self.text.split_whitespace().collect()
     }
 
-    /// Returns word number `i` as a number.
+    /// Returns the word with index `i` as a number.
     pub(crate) fn number(&self, i: usize) -> Outcome<u64> {
         let word =
             self.text.split_whitespace().nth(i).ok_or_else(|| format!("no word {i}: {}", self.text))?;

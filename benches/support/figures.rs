@@ -1,6 +1,6 @@
-//! Figures with their spread. A figure is a series of values, one per run, with those of the baseline and the ratios
-//! run by run. There are also figures of programs that ran at the same time, and cells of tables. All are printed as
-//! tables, or with `--json` as one line each (`SPREAD` is `{median, least, most}` or null):
+//! Figures with their spread. A figure is a series of values with one value per run, with the baseline's values, and
+//! with the ratio for each run. There are also figures of programs that ran at the same time, and cells of tables. All
+//! of them are printed as tables, or with `--json` as one line each (`SPREAD` is `{median, least, most}` or null):
 //!
 //! - `{class: "measurement", bench, name, unit, runs, hub: SPREAD, baseline: SPREAD, ratio: SPREAD, target, met}`
 //! - the same with more keys, one line for each program that ran at the same time as the hub: `sensors`, `program` (its
@@ -16,16 +16,16 @@ pub(crate) struct Figure {
     pub(crate) unit: &'static str,
     /// One value per run.
     pub(crate) hub: Vec<f64>,
-    /// One value per run of the baseline; empty if the figure has none.
+    /// Values of the baseline, one per run. Empty if the figure has no baseline.
     pub(crate) baseline: Vec<f64>,
     pub(crate) target: Target,
 }
 
-/// A figure of programs that ran at the same time. The first is the hub, the second the baseline.
+/// A figure of programs that ran at the same time. The first program is the hub, and the second one is the baseline.
 pub(crate) struct SimultaneousFigure {
     pub(crate) name: &'static str,
     pub(crate) unit: &'static str,
-    /// One series per program, with one value per round; empty if the program does not have the figure.
+    /// One series per program, with one value per round. A series is empty if the program does not have the figure.
     pub(crate) programs: Vec<Vec<f64>>,
     pub(crate) target: Target,
 }
@@ -37,7 +37,7 @@ pub(crate) struct Cell {
     pub(crate) row: String,
     pub(crate) column: String,
     pub(crate) unit: &'static str,
-    /// One value per run; empty if it could not be measured.
+    /// One value per run. Empty if the cell could not be measured.
     pub(crate) values: Vec<f64>,
 }
 
@@ -58,7 +58,7 @@ pub(crate) enum Target {
 pub(crate) struct Spread(f64, f64, f64);
 
 impl Spread {
-    /// Returns the spread of `values`, in any order; `None` if there are none.
+    /// Returns the spread of `values`, which may have any order. Returns `None` if there are no values.
     pub(crate) fn of(values: &[f64]) -> Option<Spread> {
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);
@@ -106,7 +106,7 @@ impl Figure {
         })
     }
 
-    /// Returns the text of target and result in tables.
+    /// Returns the target and the result as text for tables.
     fn verdict_text(&self) -> String {
         self.verdict().map_or(String::new(), |(words, is_met)| {
             format!("{words}: {}", if is_met { "met" } else { "MISSED" })
@@ -145,8 +145,8 @@ pub(crate) fn print(bench: &str, json: bool, figures: &[Figure]) {
 }
 
 impl SimultaneousFigure {
-    /// Returns the figure with program number `number` as baseline. Only the second program, the baseline, has a
-    /// target.
+    /// Returns the figure with the program with index `number` as baseline. The figure has a target only for the second
+    /// program, which is the usual baseline.
     fn against(&self, number: usize) -> Figure {
         Figure {
             name: self.name,
@@ -157,14 +157,14 @@ impl SimultaneousFigure {
         }
     }
 
-    /// Returns the mean of the differences between the hub's values and those of program number `number`.
+    /// Returns the mean of the differences between the hub's values and the values of the program with index `number`.
     fn difference(&self, number: usize) -> Option<Mean> {
         let pairs = self.programs[0].iter().zip(&self.programs[number]);
         Mean::of(&pairs.map(|(hub, program)| hub - program).collect::<Vec<_>>())
     }
 }
 
-/// Prints `figures` of programs that ran at the same time and have these names.
+/// Prints `figures` of programs that ran at the same time. `names` are the names of these programs.
 pub(crate) fn print_simultaneous(
     bench: &str,
     sensors: usize,
@@ -208,7 +208,7 @@ pub(crate) fn print_simultaneous(
 struct Mean(f64, Option<f64>);
 
 impl Mean {
-    /// Returns the mean of `values`; `None` if there are none.
+    /// Returns the mean of `values`, or `None` if there are no values.
     fn of(values: &[f64]) -> Option<Mean> {
         let count = values.len() as f64;
         let mean = values.iter().sum::<f64>() / count;
@@ -271,8 +271,8 @@ fn in_order_of_appearance<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'
     found
 }
 
-/// Returns the value below which `part` of the `sorted` values lie, by nearest rank. The median is the mean of the
-/// middle two.
+/// Returns the value below which a share `part` of the `sorted` values lies, by nearest rank. The median is the mean of
+/// the two values in the middle.
 pub(crate) fn percentile(sorted: &[f64], part: f64) -> Option<f64> {
     let last = sorted.len().checked_sub(1)?;
     if part == 0.5 {

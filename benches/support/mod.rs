@@ -1,6 +1,6 @@
-//! Shared code of the benches that start processes: an environment with simulator, hub and subscribers, minimal
-//! programs to compare them with, CPU time and memory of processes, and figures with their spread. A bench prints what
-//! it measured. A missed target is not an error.
+//! Shared code of the benches that start processes. It contains an environment with simulator, hub and subscribers, and
+//! minimal programs as baselines. It also contains CPU time and memory of processes, and figures with their spread. A
+//! bench prints what it measured. A missed target is not an error.
 
 #![allow(dead_code)] // Each bench uses only some items.
 
@@ -22,20 +22,20 @@ use rustix::process::{Signal, set_parent_process_death_signal};
 /// Result of a step of a bench. The error is a message.
 pub(crate) type Outcome<T> = Result<T, Box<dyn Error>>;
 
-/// Runs a bench. A bench starts itself as subscriber and as baseline, so it runs a part if the command line names one.
-/// Otherwise it measures.
+/// Runs a bench. A bench starts itself as subscriber and as baseline. If the command line names a part, this function
+/// runs the part; otherwise, it measures.
 pub(crate) fn main(measure: impl FnOnce(&Options) -> Outcome<()>) -> ExitCode {
     main_with(run_part, measure)
 }
 
-/// Runs a bench that has its own parts. It passes the parts that it does not know to [`run_part`].
+/// Runs a bench that has its own parts. The bench passes unknown parts to [`run_part`].
 pub(crate) fn main_with(
     run_part: impl FnOnce(&[&str]) -> Outcome<()>,
     measure: impl FnOnce(&Options) -> Outcome<()>,
 ) -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        // A part ends with the process that started it.
+        // A part ends when the process that started it ends.
         [PART_WORD, ref part @ ..] => set_parent_process_death_signal(Some(Signal::TERM))
             .map_err(Into::into)
             .and_then(|()| run_part(part)),
@@ -83,7 +83,7 @@ pub(crate) const PART_WORD: &str = "part";
 pub(crate) struct Options {
     /// Print one line of JSON per figure instead of tables.
     pub(crate) json: bool,
-    /// Measure less, in a few minutes, if a bench takes long.
+    /// Measure less, so that a long bench takes only a few minutes.
     pub(crate) quick: bool,
     pairs: Option<usize>,
     seconds: Option<u64>,
@@ -99,7 +99,7 @@ impl Options {
         let mut words = words.iter();
         while let Some(word) = words.next() {
             let mut value = || {
-                // Cargo passes --bench to every bench.
+                // Cargo passes `--bench` to every bench.
                 let value = words.next().filter(|value| *value != "--bench");
                 value.ok_or_else(|| format!("{word} needs a value"))
             };
@@ -122,8 +122,8 @@ impl Options {
         Ok(options)
     }
 
-    /// Returns the number of pairs, each a run of the hub and one of the baseline, or of rounds, in which all programs
-    /// run.
+    /// Returns the number of pairs or rounds. A pair is one run of the hub and one run of the baseline. In a round, all
+    /// programs run.
     pub(crate) fn pairs(&self) -> usize {
         self.pairs_or(5)
     }

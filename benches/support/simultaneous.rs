@@ -1,7 +1,7 @@
 //! Programs that are measured at the same time: the hub, two baselines and, with `--beside`, the hub of another build.
-//! Each has its own domain and its own simulated sensors. In every round they rotate: each program reads the lines that
-//! its neighbor read in the round before. The load of the machine, which all of them share, and differences between
-//! simulators therefore cancel out in differences between programs.
+//! Each program has its own domain and its own simulated sensors. In every round, each program reads the lines that its
+//! neighbor read in the previous round. All programs share the load of the machine. This load and the differences
+//! between simulators therefore cancel out in differences between programs.
 
 use std::process::Stdio;
 use std::time::Duration;
@@ -30,8 +30,8 @@ pub(crate) struct MeasuredProgram {
 pub(crate) enum ProgramKind {
     /// The hub of the program at this path.
     Hub(String),
-    /// The baseline that wakes up this long before the end of a telegram, in ns. With 0, it wakes up as long before it
-    /// as the hub does.
+    /// The baseline that wakes up this long before the end of a telegram, in ns. With 0, it wakes up as long before the
+    /// end as the hub does.
     Baseline(u64),
 }
 
@@ -43,8 +43,8 @@ struct SimulatedSensors {
 }
 
 impl Comparison {
-    /// Starts the simulators of `sensors` sensors for each program, and lets the hub start these sensors. From then on
-    /// they stream to any program that reads.
+    /// Starts the simulators of `sensors` sensors for each program, and lets the hub start these sensors. From then on,
+    /// the sensors stream to any program that reads.
     pub(crate) fn start(options: &Options, sensors: usize) -> Outcome<Comparison> {
         let sensors = ALL_AROUND.get(..sensors).ok_or("too many sensors")?;
         let mut kinds = vec![
@@ -102,7 +102,7 @@ impl Comparison {
 }
 
 impl MeasuredProgram {
-    /// Starts the program on `lines`. A baseline ends after `count` telegrams from each line (0: never).
+    /// Starts the program on `lines`. A baseline ends after it has read `count` telegrams from each line (0: never).
     pub(crate) fn start(&self, lines: &BenchEnvironment, sensors: &[&str], count: usize) -> Outcome<Child> {
         let child = match &self.program {
             ProgramKind::Hub(path) => {
@@ -120,8 +120,8 @@ impl MeasuredProgram {
         matches!(self.program, ProgramKind::Hub(_))
     }
 
-    /// Starts a subscriber to the scans of each sensor, and waits until every subscriber has received one. Only for
-    /// hubs.
+    /// Starts a subscriber to the scans of each sensor, and waits until every subscriber has received a scan. Only hubs
+    /// support this.
     pub(crate) fn subscribe_to_scans(&self, sensors: &[&str]) -> Outcome<Vec<Child>> {
         let start = |sensor: &&str| self.stage.start_subscriber("scan", sensor, &[]);
         let subscribers = sensors.iter().map(start).collect::<Outcome<Vec<_>>>()?;
@@ -134,8 +134,8 @@ impl MeasuredProgram {
 }
 
 /// Copies the program at `path` into the directory of `environment`, and returns the path of the copy. The simulators
-/// run from the program of this build. If a hub ran from the same file, they would keep its code in the processor's
-/// caches.
+/// run from the program of this build. If a hub ran from the same file, the simulators would keep the hub's code in the
+/// processor's caches.
 fn copy_program(path: &str, environment: &BenchEnvironment) -> Outcome<String> {
     let copy = environment.file("scanhub");
     std::fs::copy(path, &copy).map_err(|error| format!("{path}: {error}"))?;
@@ -144,6 +144,6 @@ fn copy_program(path: &str, environment: &BenchEnvironment) -> Outcome<String> {
 
 /// Name of the baseline in tables.
 const BASELINE_NAME: &str = "baseline";
-/// Time at the start of a round that does not count. The hub learns the background in 6.3 s and estimates the duration
-/// of a telegram in the first scans.
+/// Time at the start of a round that does not count. The hub learns the background in 6.3 s, and estimates the duration
+/// of a telegram from the first scans.
 pub(crate) const SETTLE_TIME: Duration = Duration::from_secs(8);

@@ -16,7 +16,7 @@ pub(crate) struct ScanSource {
     waker: WakeSender,
     next: u64,
     _service: TopicService<Scan>,
-    /// Every hub has this topic. A gateway would request it repeatedly if it did not exist.
+    /// The topic `status`, which every hub has. If it did not exist, a gateway would request it repeatedly.
     _status: TopicService<Status>,
     _node: Node,
     _lock: HubLock,
@@ -43,7 +43,7 @@ impl ScanSource {
         })
     }
 
-    /// Publishes a scan with this stamp of the wall clock, and wakes the subscribers.
+    /// Publishes a scan with `wall_ns` as its stamp of the wall clock, and wakes the subscribers.
     pub(crate) fn publish(&mut self, wall_ns: u64) -> Outcome<()> {
         let scan = scan();
         let loan = Scan::loan(&self.publisher, scan.bytes().len());

@@ -1,5 +1,5 @@
 //! Subscribers as separate processes. They receive a topic with the client library, sleep until they are woken, and
-//! print when a sample had arrived. In a crowd, many subscribers share a process, but each has its own thread,
+//! print the time at which a sample had arrived. Many subscribers can share a process, but each one has its own thread,
 //! membership, queue and wake-ups.
 
 use scanhub_drivers::lms;
@@ -39,9 +39,9 @@ pub(crate) fn print_scans(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Receives telegrams of `sensor` until `count` with measured data have arrived, and then prints them. With 0, receives
-/// forever and prints each at once. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH READ_NS`, with the
-/// hub's stamp of the last byte at its end.
+/// Receives telegrams of `sensor` until `count` telegrams with measured data have arrived, and then prints them. With
+/// 0, receives forever and prints each telegram at once. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH
+/// READ_NS`. READ_NS is the hub's stamp of the last byte.
 pub(crate) fn print_telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut telegrams = subscribe::<[u8]>(domain, sensor)?;
     let mut received = Vec::with_capacity(count);
@@ -68,8 +68,8 @@ pub(crate) fn print_telegrams(domain: &str, sensor: &str, count: usize) -> Outco
     Ok(())
 }
 
-/// Receives scans of `sensor` until `count` have arrived. Then prints for each the age of the telegram's last byte on
-/// receipt: `aged SENSOR NS`.
+/// Receives scans of `sensor` until `count` scans have arrived. Then prints `aged SENSOR NS` for each scan: the time
+/// from the telegram's last byte until the scan was received.
 pub(crate) fn print_ages(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut scans = subscribe::<Scan>(domain, sensor)?;
     let mut ages = Vec::with_capacity(count);
@@ -94,12 +94,12 @@ pub(crate) fn print_statuses(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Subscribes to a topic of the hub of this domain.
+/// Subscribes to a topic of the hub in this domain.
 pub(crate) fn subscribe<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outcome<Subscriber<P>> {
     Ok(builder(domain, sensor).open()?)
 }
 
-/// Returns the builder of a subscriber to a topic of the hub of this domain.
+/// Returns the builder of a subscriber to a topic of the hub in this domain.
 pub(crate) fn builder<P: Payload + ?Sized>(domain: &str, sensor: &str) -> SubscriberBuilder<P> {
     Subscriber::builder(sensor).domain(domain)
 }
@@ -118,8 +118,9 @@ fn write(out: &mut impl Write, sensor: &str, sample: &ReceivedSample) -> Outcome
     Ok(writeln!(out, "telegram {sensor} {now} {boot} {missed} {intact} {hash} {read}")?)
 }
 
-/// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` after each subscriber has a scan.
-/// Prints for each subscriber `followed RECEIVED MISSED PUBLISHED`, the last counted from its first sample to its last.
+/// Subscribes `count` times to the scans of `sensor`, and receives for `seconds` after each subscriber has a scan.
+/// Prints `followed RECEIVED MISSED PUBLISHED` for each subscriber. PUBLISHED counts from the subscriber's first sample
+/// to its last one.
 pub(crate) fn count_samples(domain: &str, sensor: &str, count: usize, seconds: u64) -> Outcome<()> {
     let all = Arc::new(Barrier::new(count + 1));
     let threads: Vec<_> = (0..count)
@@ -157,7 +158,8 @@ pub(crate) fn hold_samples(domain: &str, sensor: &str, count: usize) -> Outcome<
     }
 }
 
-/// Attaches `count` subscribers and keeps them. Prints their number, and the reason if one is refused.
+/// Attaches `count` subscribers and keeps them. Prints the number of attached subscribers, and the reason if one is
+/// refused.
 pub(crate) fn hold_slots(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut subscribers = Vec::new();
     for _ in 0..count {
@@ -196,7 +198,7 @@ fn count_scans(domain: &str, sensor: &str, all: &Barrier, seconds: u64) -> Outco
     // A subscriber that fails must not block the others.
     all.wait();
     let mut scans = attached?;
-    // Samples that queued up while others attached do not count.
+    // Samples that were queued while other subscribers attached do not count.
     while scans.try_next()?.is_some() {}
     let first = last(scans.next()?)?;
     let end = clock::now() + seconds * 1_000_000_000;

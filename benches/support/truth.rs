@@ -14,7 +14,7 @@ pub(crate) struct SentTelegram {
     pub(crate) hash: String,
     /// Index among all telegrams that the sensor sent.
     pub(crate) index: u64,
-    /// CLOCK_MONOTONIC after its last byte was written.
+    /// Time of CLOCK_MONOTONIC after the telegram's last byte was written.
     pub(crate) at_ns: u64,
 }
 
@@ -22,12 +22,12 @@ pub(crate) struct SentTelegram {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SensorTruth {
     pub(crate) sent: Vec<SentTelegram>,
-    /// Telegrams for which the host had no room, or not enough. The rest of a later telegram may complete such a
-    /// telegram.
+    /// Telegrams for which the host's buffer had no room or not enough room. The rest of a later telegram may complete
+    /// one of them.
     overrun: Vec<SentTelegram>,
     /// Times at which the sensor aborted a telegram of measured data to reply to a request.
     pub(crate) aborted_ns: Vec<u64>,
-    /// Number of EEPROM writes; known once the simulator has ended.
+    /// Number of EEPROM writes. It is `None` until the simulator has ended.
     pub(crate) eeprom_writes: Option<u64>,
 }
 
@@ -56,9 +56,9 @@ impl SensorTruth {
         Ok(truth)
     }
 
-    /// Returns the times at which each telegram was due, by its hash, and the total time in ns for which the sensor
-    /// could not send. The sensor sends one telegram every `every_ns`, and at least one of the neighbors of each
-    /// telegram was sent in time.
+    /// Returns the times at which each telegram was due, by the telegram's hash; and the total time in ns for which the
+    /// sensor could not send. The sensor sends one telegram every `every_ns`. For each telegram, the sensor sent at
+    /// least one of the telegram's neighbors in time.
     pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
         let mut all: Vec<&SentTelegram> = self.sent.iter().chain(&self.overrun).collect();
         all.sort_by_key(|sent| sent.index);
@@ -77,13 +77,13 @@ impl SensorTruth {
         (due, stood)
     }
 
-    /// Returns the number of telegrams sent from `from_ns` on and before `to_ns`.
+    /// Returns the number of telegrams that were sent at or after `from_ns` and before `to_ns`.
     pub(crate) fn count(&self, from_ns: u64, to_ns: u64) -> usize {
         self.sent.iter().filter(|sent| (from_ns..to_ns).contains(&sent.at_ns)).count()
     }
 }
 
-/// Number of neighbors on either side of a telegram. At least one of them was sent in time.
+/// Number of neighbors on either side of a telegram. The sensor sent at least one of them in time.
 const NEIGHBOR_COUNT: usize = 200;
 
 /// Returns the SHA-256 of `bytes` as the simulator writes it.

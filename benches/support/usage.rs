@@ -1,4 +1,4 @@
-//! CPU time and memory of a process and memory of its domain, as the kernel counts them.
+//! CPU time and memory of a process, and memory of its domain, as the kernel counts them.
 
 use std::collections::BTreeMap;
 use std::fs::{read_dir, read_to_string};
@@ -84,8 +84,8 @@ impl ResidentMemory {
     }
 }
 
-/// Returns number and bytes of the files of `domain` in /dev/shm, by the extension of their names, which shows their
-/// purpose.
+/// Returns the number and the bytes of the files of `domain` in /dev/shm, by file name extension. The extension shows a
+/// file's purpose.
 pub(crate) fn segments(domain: &Domain) -> Outcome<BTreeMap<String, (usize, f64)>> {
     let mut kinds = BTreeMap::<String, (usize, f64)>::new();
     for entry in read_dir("/dev/shm")? {

@@ -6,11 +6,12 @@ use scanhub_schema::datagram::{
     Announce, Datagram, DatagramError, DatagramPayload, HEADER_LEN, Head, MTU_ETHERNET,
 };
 
-/// Checks that each of the datagrams in `data` is counted once, that a refused datagram changes nothing else, and that
-/// an accepted datagram can be encoded again.
+/// Splits `data` into datagrams and checks three invariants. Each datagram is counted once. A refused datagram changes
+/// nothing else. An accepted datagram can be encoded again.
 ///
-/// A datagram in `data` starts with a mode byte and a length of two bytes. With an even mode, the bytes that follow are
-/// the datagram itself. With an odd mode, they are a short header and a payload, and the checksum is computed here.
+/// A datagram in `data` starts with a mode byte and a length of two bytes. With an even mode, the following bytes are
+/// the datagram itself. With an odd mode, they are a short header and a payload, and this function computes the
+/// checksum.
 pub(crate) fn lan(data: &[u8]) {
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
     let mut rest = data;
@@ -63,8 +64,8 @@ fn counters(table: &GatewayTable) -> (Vec<[u64; 4]>, EvictedTotals) {
     (rows.collect(), table.evicted())
 }
 
-/// Returns a datagram with a valid checksum, or `None` if `piece` is too short. It has one of few hubs, epochs and
-/// sensors, so that datagrams of the same stream are frequent.
+/// Returns a datagram with a valid checksum, or `None` if `piece` is too short. There are only few hubs, epochs and
+/// sensors, so datagrams of the same stream are frequent.
 fn sealed_datagram<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
     let (short, payload) = piece.split_first_chunk::<10>()?;
     let head = Head {
@@ -83,7 +84,7 @@ fn sealed_datagram<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
     head.seal(buffer, payload.len())
 }
 
-/// Checks that a payload that is decoded and encoded has the same contents when it is decoded again.
+/// Decodes a payload, encodes it and decodes it again. Checks that both decoded payloads have the same contents.
 fn can_be_reencoded(datagram: &Datagram<'_>) {
     fn reencode<T: DatagramPayload + ?Sized>(payload: &[u8])
     where
@@ -113,7 +114,8 @@ fn can_be_reencoded(datagram: &Datagram<'_>) {
     scanhub_schema::for_each_topic!(by_topic);
 }
 
-/// Checks that the checksum detects one to three changed bits. Its Hamming distance at these lengths is 4.
+/// Checks that the checksum detects one to three changed bits. The Hamming distance of the checksum at these lengths is
+/// 4.
 fn is_damage_detected(bytes: &[u8], offsets: &[u8]) {
     let mut damaged = bytes.to_vec();
     let mut at = 0;

@@ -8,7 +8,7 @@ use scanhub_schema::{ArrayFlags, Background, Foreground, MAX_BEAMS, MAX_ZONES, M
 
 use super::scans::{Bytes, fill, layout};
 
-/// Reads settings from `data`, and then processes one scan after the other until no bytes are left.
+/// Reads settings from `data`, and then processes one scan after another until no bytes are left.
 pub(super) fn processors(data: &[u8]) {
     let mut bytes = Bytes(data);
     // Some scans have more beams than this limit.

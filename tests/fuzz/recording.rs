@@ -1,4 +1,4 @@
-//! Invariants for recordings: any file is refused, or it can be read to its end twice with the same result, and its
+//! Invariants for recordings. A file is either refused, or can be read to its end twice with the same result. Its
 //! telegrams are valid.
 
 use std::fs;
@@ -27,7 +27,7 @@ pub(crate) fn recording(data: &[u8]) {
     assert!(contents.scans <= contents.telegrams);
 }
 
-/// Reads all telegrams and returns their number, which must match the number in the table of contents.
+/// Reads all telegrams and checks that their number matches the number in the table of contents. Returns the number.
 fn read(recording: &Recording) -> u64 {
     let (contents, encoding) = (recording.contents(), Encoding { unit: Unit::Mm, mode: Mode(1) });
     let mut telegrams = 0;

@@ -3,7 +3,7 @@
 use scanhub_schema::{ArrayFlags, Family, MAX_BEAMS, Pose, Scan, ScanArrays, ScanHead};
 
 /// Changes the layout of the scan: the number and angles of its beams, its unit and its longest range. Some layouts are
-/// those of a real scanner.
+/// the layouts of real scanners.
 pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     let variant =
         [(361, -90_000, 500), (181, -90_000, 1000), (401, -50_000, 250)].get(usize::from(bytes.u8()));
@@ -28,8 +28,8 @@ pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     scan.begin(head);
 }
 
-/// Fills the scan with groups of neighboring beams that have the same reading, until all beams are set or no bytes are
-/// left.
+/// Fills the scan with groups of neighboring beams that have the same reading. Stops when all beams are set or no bytes
+/// are left.
 pub(super) fn fill(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     let ScanArrays { angles, ranges, wide, upper } = scan.arrays();
     let mut end = 0;
@@ -47,7 +47,7 @@ pub(super) fn fill(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     }
 }
 
-/// The remaining bytes of the input. At its end, all values are zero.
+/// The remaining bytes of the input. When no bytes are left, all values are zero.
 pub(super) struct Bytes<'a>(pub(super) &'a [u8]);
 
 impl Bytes<'_> {
@@ -82,7 +82,7 @@ impl Bytes<'_> {
         i32::from_le_bytes(self.take())
     }
 
-    /// Returns any number, including infinities and NaN. Most numbers are in the range of coordinates of a sensor.
+    /// Returns any number, including infinities and NaN. Most numbers are in the range of a sensor's coordinates.
     pub(super) fn number(&mut self) -> f64 {
         match self.u8() {
             0 => f64::from_bits(u64::from_le_bytes(self.take())),

@@ -10,7 +10,7 @@ use scanhub_schema::{ArrayFlags, Foreground, Lines, MAX_BEAMS, Motion, MotionMet
 
 use super::scans::{Bytes, fill, layout};
 
-/// Reads settings from `data`, and then processes one scan after the other until no bytes are left.
+/// Reads settings from `data`, and then processes one scan after another until no bytes are left.
 pub(super) fn surroundings(data: &[u8]) {
     let mut bytes = Bytes(data);
     let maximum = TopicLimits::default().beams;
@@ -114,14 +114,15 @@ fn assert_motion(scan: &Scan, before: &Motion, motion: &Motion, settings: &motio
                 assert!((of(row, column) - of(column, row)).abs() <= 1e-5 * maximum, "{motion:?}");
                 assert!(of(row, column).abs() <= (1.0 + 1e-5) * maximum, "{motion:?}");
             }
-            // The variance if all beams measured the same wall without any other uncertainty.
+            // The variance if all beams measured the same wall and there were no other uncertainty.
             let surest = MIN_VARIANCE / scan.beams() as f64;
             assert!(of(0, 0) >= surest && of(1, 1) >= surest && of(2, 2) > 0.0, "{motion:?}");
         }
     }
 }
 
-/// Fills the scan with walls: the range changes by the same amount from each beam to the next, plus noise.
+/// Fills the scan with walls. On a wall, the range changes by the same amount from each beam to the next one. Noise is
+/// added.
 fn walls(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     let ranges = scan.arrays().ranges;
     let mut end = 0;
@@ -137,7 +138,7 @@ fn walls(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     }
 }
 
-/// Settings of the background of a moving robot, apart from those that the input changes.
+/// Settings of the background of a moving robot. The input changes some of them.
 const MAP_SETTINGS: Settings = Settings {
     method: Method::Moving,
     threshold_mm: None,
@@ -147,8 +148,8 @@ const MAP_SETTINGS: Settings = Settings {
     start: Start::Empty,
     no_return_is_far: None,
 };
-/// A hundredth of the minimum variance of a range, (5 mm)^2. A beam that grazes its wall has a twentieth of that
-/// variance.
+/// A hundredth of the minimum variance of a range, which is (5 mm)^2. A beam that grazes its wall has a twentieth of
+/// the minimum variance.
 const MIN_VARIANCE: f64 = 2.5e-7;
-/// Maximum number of scans, because the background of a moving robot takes long to forget.
+/// Maximum number of scans. It is small because the background of a moving robot takes long to drop.
 const SCANS: usize = 40;

@@ -1,6 +1,6 @@
-//! Fuzz targets: one function for each point at which the hub and its clients read bytes from outside. The fuzzer calls
-//! them with generated input, and `tests/it/fuzzed.rs` with the corpus and with seeded noise. They check invariants
-//! only, not expected outputs.
+//! Fuzz targets: one function for each input from outside that the hub and its clients read. The fuzzer calls the
+//! functions with generated input. `tests/it/fuzzed.rs` calls them with the corpus and with seeded noise. The functions
+//! check only invariants, not expected outputs.
 
 mod lan;
 mod processors;
@@ -40,12 +40,12 @@ pub const TARGETS: [Target; 8] = [
 ];
 
 /// Passes any bytes to the framer, in pieces. Each delivered telegram is at the reported position and has a valid
-/// checksum, telegrams arrive in order, and no byte disappears.
+/// checksum. Telegrams arrive in order, and no byte disappears.
 ///
 /// The first byte selects the expected headers, and the second one is the size of the pieces.
 pub fn framer(data: &[u8]) {
     let [expects, piece, bytes @ ..] = data else { return };
-    // A session takes the header of a stream from a telegram that it received, so its length is valid.
+    // A session copies the header of a stream from a telegram that it received, so the header's length is valid.
     let head = bytes.first_chunk().filter(|head: &&[u8; 7]| head[3] < 3);
     let expect = match (expects & 3, head) {
         (1, Some(&header)) => ExpectedHeaders::Stream { header, reply: None },
@@ -86,7 +86,7 @@ fn drain(framer: &mut Framer, bytes: &[u8], checked_len: &mut usize) {
     assert_eq!(read, in_telegrams + acknowledge + discarded + framer.buffered() as u64);
 }
 
-/// Decodes any data in a telegram with a valid checksum, as a request and as a reply. Everything that can be decoded
+/// Decodes any data in a telegram with a valid checksum, as a request and as a reply. If decoding succeeds, the result
 /// can be encoded again.
 pub fn replies(data: &[u8]) {
     let [address, command, rest @ ..] = data else { return };
@@ -121,7 +121,7 @@ pub fn replies(data: &[u8]) {
 }
 
 /// Runs an LMS session with any sequence of events: received bytes, elapsed time, and transmitted or pending bytes. The
-/// input is a program of two-byte instructions after two bytes of settings.
+/// input has two bytes of settings, followed by a program of two-byte instructions.
 pub fn session(data: &[u8]) {
     let [variant, baud, program @ ..] = data else { return };
     let settings = Settings {
@@ -165,7 +165,7 @@ pub fn session(data: &[u8]) {
         let known = tally.in_telegrams + tally.acknowledge + tally.discarded + session.stats().buffered;
         assert_eq!((tally.read, known), (read, read), "bytes vanished");
         match what & 3 {
-            // Receive bytes of the program itself.
+            // Receive bytes that are part of the program.
             0 => {
                 let spare = session.read_buffer();
                 let len = rest.len().min(usize::from(*much)).min(spare.len());
@@ -189,7 +189,7 @@ pub fn session(data: &[u8]) {
                 const CONTROLS: [Control; 3] = [Control::Pause, Control::Resume, Control::Resync];
                 session.control(CONTROLS[usize::from(*much) % CONTROLS.len()], now);
             }
-            // Receive a reply with a valid checksum and data from the program.
+            // Receive a reply with a valid checksum. Its data are part of the program.
             _ => {
                 let len = rest.len().min(usize::from(*much)).min(120);
                 let (reply, after) = rest.split_at(len);
@@ -221,7 +221,8 @@ fn assert_harmless(request_bytes: &[u8]) {
 
 /// Loads any text as flags and as a configuration file. The configuration is accepted, or refused with a remedy.
 ///
-/// The text is split at zero bytes: the first part is the file, the others are values of `--set` and `--link` in turn.
+/// The text is split at zero bytes. The first part is the file. The other parts are values of `--set` and `--link`,
+/// alternating.
 pub fn configuration(data: &[u8]) {
     use scanhub_config::{Config, Sources};
     let text = String::from_utf8_lossy(data);
