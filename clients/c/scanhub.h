@@ -1,6 +1,6 @@
 /*
- * Reader of the datagrams of `scanhub gateway` for programs in C: it checks a datagram and decodes its payload. The program
- * receives the datagrams, and detects gaps by `sequence`. C99, one header, no heap; docs/datagram.md has the bytes.
+ * Reader for the datagrams of `scanhub gateway` in C: checks a datagram and decodes its payload. The program receives
+ * the datagrams and counts lost ones. C99, one header, no heap. docs/datagram.md describes the bytes.
  *
  *     struct scanhub_datagram datagram;
  *     struct scanhub_scan scan;
@@ -8,8 +8,8 @@
  *         for (unsigned i = 0; i < scan.count; i++)
  *             use(scanhub_scan_m(&scan, i), scanhub_scan_angle(&scan, i));
  *
- * Results point into the datagram, and are valid as long as its bytes exist. The bytes may be hostile: after SCANHUB_OK, no
- * function reads outside of them, as long as each index is below its count.
+ * Results point into the datagram and are valid as long as its bytes are. The bytes may be hostile: after SCANHUB_OK,
+ * no function reads outside of them if each index is below the count in the same result.
  */
 #ifndef SCANHUB_H
 #define SCANHUB_H
@@ -155,7 +155,7 @@ enum scanhub_flag {
 };
 /* End of wire. */
 
-/* Reasons for which a datagram is refused, in the order of the checks. */
+/* Results of the functions. The reasons for a refusal are in the order of the checks. */
 enum scanhub_result {
     SCANHUB_OK = 0,
     SCANHUB_BAD_SHORT,   /* fewer bytes than a header */
@@ -175,7 +175,7 @@ enum scanhub_result {
     SCANHUB_BAD_PAYLOAD  /* shorter than its counts require, contradictory, without a revision, or a part */
 };
 
-/* A datagram whose header, lengths and checksum are right. scanhub_key.h checks the MAC. */
+/* A datagram with a valid header, lengths and checksum. scanhub_key.h checks its MAC. */
 struct scanhub_datagram {
     uint8_t topic;
     uint8_t flags;
@@ -186,7 +186,8 @@ struct scanhub_datagram {
     uint8_t sensor;     /* position of the sensor in the hub's configuration */
     uint8_t part;       /* index of this part of the sample, from 0 */
     uint8_t parts;      /* number of parts, mostly 1. To read a sample of several parts, append the `payload` of
-                         * all parts of one sequence, point `payload` of one of them to the result, and set `parts` to 1 */
+                         * payloads with the same `sequence`, point `payload` and `payload_len` of one part to the
+                         * result, and set its `parts` to 1 */
     uint8_t family;     /* family of the scanner, see enum scanhub_family */
     uint16_t revision;  /* revision of the payload: a greater one only appends fields */
     uint32_t counter;   /* the same in all datagrams of one telegram */
@@ -220,8 +221,8 @@ static inline double scanhub_f64(const uint8_t *at)
     return value;
 }
 
-/* Continues a CRC-32C (polynomial 1EDC6F41h, reflected) over `len` bytes. Start with FFFFFFFFh; the result is the
- * complement. It takes half a byte at a time, with a table of 64 bytes instead of one of 1024. */
+/* Updates a CRC-32C (polynomial 1EDC6F41h, reflected) with `len` bytes. Start with FFFFFFFFh; the checksum is the
+ * complement of the last result. It processes half a byte at a time, with a table of 64 bytes instead of 1024. */
 static inline uint32_t scanhub_crc(uint32_t crc, const uint8_t *bytes, size_t len)
 {
     static const uint32_t nibble[16] = {
@@ -235,7 +236,7 @@ static inline uint32_t scanhub_crc(uint32_t crc, const uint8_t *bytes, size_t le
     return crc;
 }
 
-/* Checks `len` bytes, a complete datagram as it was received. */
+/* Checks a received datagram of `len` bytes. */
 static inline enum scanhub_result scanhub_read(const void *bytes, size_t len, struct scanhub_datagram *out)
 {
     static const uint8_t no_crc[4] = {0, 0, 0, 0};
@@ -278,7 +279,7 @@ static inline enum scanhub_result scanhub_read(const void *bytes, size_t len, st
     return SCANHUB_OK;
 }
 
-/* Checks that the datagram has this topic, and that its payload is complete, has a revision and at least `least` bytes. */
+/* Checks that a datagram has this topic and a revision, is not a part, and has a payload of at least `least` bytes. */
 static inline enum scanhub_result scanhub_expect(const struct scanhub_datagram *datagram, uint8_t topic, size_t least)
 {
     if (datagram->topic != topic)
@@ -288,14 +289,14 @@ static inline enum scanhub_result scanhub_expect(const struct scanhub_datagram *
     return datagram->payload_len < least ? SCANHUB_BAD_PAYLOAD : SCANHUB_OK;
 }
 
-/* Copies text that may fill its field. `out` is one byte longer than the field. */
+/* Copies text, which may fill its field. `out` must have a byte more than the field. */
 static inline void scanhub_text(char *out, const uint8_t *field, size_t len)
 {
     memcpy(out, field, len);
     out[len] = 0;
 }
 
-/* Announcement of a sensor and its topics, sent once a second. */
+/* An announcement, sent once a second: name and type of a sensor, and its topics. */
 struct scanhub_announce {
     uint64_t boot;       /* ID of the hub's run */
     char sensor[33];     /* name of the sensor: 1 to 24 of a-z, 0-9, _ and - */
@@ -334,7 +335,7 @@ static inline enum scanhub_result scanhub_read_announce(const struct scanhub_dat
     }
     return SCANHUB_OK;
 }
-/* Returns announced topic i, i below `count`. */
+/* Returns topic i of an announcement; i is below `count`. */
 static inline struct scanhub_announced scanhub_announced(const struct scanhub_announce *announce, unsigned i)
 {
     const uint8_t *at = announce->topics + SCANHUB_ANNOUNCED_AT_END * (size_t)i;
@@ -346,7 +347,7 @@ static inline struct scanhub_announced scanhub_announced(const struct scanhub_an
     return out;
 }
 
-/* Bytes of a sensor as they arrived: for an LMS a telegram, from STX to CRC; for other families complete packets that arrived
+/* Bytes that a scanner sent: from an LMS a telegram, STX to CRC; from other families complete packets that arrived
  * together. */
 struct scanhub_telegram {
     const uint8_t *bytes;

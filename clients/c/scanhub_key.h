@@ -1,6 +1,7 @@
 /*
- * Authentication of datagrams for programs in C: it checks that the sender has the key, and that a datagram is not a replayed
- * recording. C99, no heap, no library; SHA-256 is included. docs/datagram.md has the rules of a listener with a key.
+ * Authentication of datagrams in C: checks that the sender has the key, and that the datagram is not a replay. The
+ * program reads the key file. C99, no heap, no library; SHA-256 is included. docs/datagram.md describes what a listener
+ * with a key accepts.
  *
  *     static struct scanhub_guard guard;
  *     struct scanhub_key key;
@@ -18,7 +19,7 @@
 extern "C" {
 #endif
 
-/* State of a SHA-256 (FIPS 180-4): the hash so far, and the bytes of the incomplete block. */
+/* State of a SHA-256 (FIPS 180-4), and the bytes of the incomplete block. */
 struct scanhub_sha {
     uint32_t state[8];
     uint64_t len;
@@ -97,7 +98,7 @@ static inline void scanhub_sha_end(struct scanhub_sha *sha, uint8_t out[32])
         out[i] = (uint8_t)(sha->state[i / 4] >> (24 - 8 * (i % 4)));
 }
 
-/* A key, as the two hashes with which a MAC begins (HMAC, RFC 2104). */
+/* A key, as the initial states of the two hashes of a MAC (HMAC, RFC 2104). */
 struct scanhub_key {
     struct scanhub_sha inner, outer;
 };
@@ -107,8 +108,8 @@ static inline int scanhub_key_digit(uint8_t c)
     return c >= '0' && c <= '9' ? c - '0' : c >= 'a' && c <= 'f' ? c - 'a' + 10 : c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
 }
 
-/* Takes the content of a key file: 32 bytes, or 64 hex digits, with or without an end of line. 0 if it is none. Read it
- * only if its mode leaves it to your user alone. */
+/* Converts the content of a key file: 32 bytes, or 64 hex digits, with or without an end of line. Returns 1, or 0 if it
+ * is not a key. Check first that no other user can read the file. */
 static inline int scanhub_key_of(struct scanhub_key *key, const void *file, size_t len)
 {
     const uint8_t *bytes = (const uint8_t *)file;
@@ -139,8 +140,8 @@ static inline int scanhub_key_of(struct scanhub_key *key, const void *file, size
     return 1;
 }
 
-/* Whether the last 16 of these bytes, a datagram that scanhub_read took and that has a MAC, are its MAC of this key. It
- * takes as long whatever they are. */
+/* Returns whether the last 16 bytes of a datagram are its MAC for this key. scanhub_read must have accepted the
+ * datagram, and it must have a MAC. The comparison takes constant time. */
 static inline int scanhub_is_of(const struct scanhub_key *key, const void *bytes, size_t len)
 {
     static const uint8_t no_crc[4] = {0, 0, 0, 0};
@@ -160,8 +161,8 @@ static inline int scanhub_is_of(const struct scanhub_key *key, const void *bytes
     return differs == 0;
 }
 
-/* Checks a datagram as scanhub_read does, and that it was sent with `key`. It accepts replayed recordings, which
- * scanhub_guard_take refuses. */
+/* Checks a datagram like scanhub_read, and that it was sent with `key`. It does not detect replays: call
+ * scanhub_guard_take. */
 static inline enum scanhub_result scanhub_read_with(const struct scanhub_key *key, const void *bytes, size_t len,
                                                     struct scanhub_datagram *out)
 {
@@ -184,8 +185,8 @@ struct scanhub_run {
     uint32_t epoch;
 };
 
-/* Sequence numbers of one topic of a sensor: the highest one that arrived, if `any` did, the ones that arrived among the 1024
- * up to it, and the first one that is accepted. */
+/* Sequence numbers of a sensor's topic. `highest` is valid if `any` is 1. `seen` has a bit for each of the 1024 numbers
+ * up to `highest`. Numbers below `first` are refused. */
 struct scanhub_stream {
     uint64_t hub;
     uint8_t sensor, topic, any;
@@ -193,8 +194,8 @@ struct scanhub_stream {
     uint8_t seen[128];
 };
 
-/* State of a reader with the key. Start with all bytes 0. To refuse older runs of gateways after a restart of your program,
- * too, save `runs`, and start with them. 40 kB. */
+/* State of a reader with the key. Start with all bytes 0. To refuse older runs of gateways after a restart of your
+ * program, too, save `runs`, and start with them. 40 kB. */
 struct scanhub_guard {
     struct scanhub_run runs[SCANHUB_HUBS];
     uint8_t run_count;
@@ -214,7 +215,7 @@ static inline struct scanhub_stream *scanhub_guard_find(struct scanhub_guard *gu
     return NULL;
 }
 
-/* Starts to count `topic` from `first` on, if it is not counted yet and there is room. */
+/* Returns the stream of `topic`. A new stream starts with `first`. Returns NULL if all streams are in use. */
 static inline struct scanhub_stream *scanhub_guard_begin(struct scanhub_guard *guard, uint64_t hub, uint8_t sensor,
                                                          uint8_t topic, uint32_t first)
 {
@@ -230,7 +231,7 @@ static inline struct scanhub_stream *scanhub_guard_begin(struct scanhub_guard *g
     return stream;
 }
 
-/* Returns whether a sequence number is accepted. If `is_taken` is set, records that it arrived. */
+/* Checks a sequence number, and stores it as received if `is_taken`. */
 static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *stream, uint32_t number, int is_taken)
 {
     uint8_t bit = (uint8_t)(1u << number % 8), *byte = stream->seen + number / 8 % 128;
@@ -241,7 +242,7 @@ static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *str
     if (is_behind && *byte & bit)
         return SCANHUB_DUPLICATE;
     if (!is_behind && is_taken) {
-        /* The numbers in between have not arrived. */
+        /* The numbers between were not received. */
         uint32_t leave = stream->any && number - stream->highest < 1024 ? number - stream->highest : 1024;
         for (i = 0; i < leave; i++)
             stream->seen[(number - i) / 8 % 128] &= (uint8_t) ~(1u << (number - i) % 8);
@@ -255,8 +256,9 @@ static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *str
     return SCANHUB_OK;
 }
 
-/* Checks at `wall_ns`, ns since 1970, whether a datagram that scanhub_read_with accepted is new and not a replayed recording.
- * Parts are checked but not counted: pass the complete sample, with `parts` 1, as well. */
+/* Checks that a datagram is new and not replayed, after scanhub_read_with has accepted it. `wall_ns` is the current
+ * time in ns since 1970. A part is checked but not stored: when the sample is complete, call this again for it, with
+ * `parts` 1. */
 static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard, const struct scanhub_datagram *datagram,
                                                      uint64_t wall_ns)
 {

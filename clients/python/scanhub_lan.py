@@ -84,7 +84,7 @@ def group(topic: str) -> str:
 
 @dataclass(frozen=True)
 class Announced:
-    """One topic in an announcement: the last byte of its group, and the number of its next datagram."""
+    """A topic in an announcement: the last byte of its group's address, and the `sequence` of its next sample."""
 
     topic: int
     group: int
@@ -668,7 +668,7 @@ Payload = Union[
 
 @dataclass(frozen=True)
 class Datagram:
-    """A datagram whose header, lengths and checksum are right.
+    """A datagram with a valid header, lengths and checksum.
 
     - `hub` is the number of the gateway, and `epoch` that of its run. A greater epoch ends the run before.
     - `sequence` is the number of the sample in its sensor and topic, modulo 2^32. A gap means lost samples.
@@ -777,9 +777,10 @@ class Guard:
 
     def __init__(self, epochs: "Optional[dict[int, int]]" = None):
         self.epochs: "dict[int, int]" = dict(epochs or {})
-        # By hub, sensor and topic: the lowest accepted number, the highest that arrived, and those of the window that arrived.
+        # By hub, sensor and topic: the lowest sequence number that is accepted, the highest received, those received in
+        # the window.
         self._streams: "dict[tuple[int, int, int], tuple[int, Optional[int], set[int]]]" = {}
-        # By hub: the epoch to which the streams belong.
+        # By hub: the epoch of its streams.
         self._lives: "dict[int, int]" = {}
 
     def take(self, datagram: Datagram, wall_ns: Optional[int] = None) -> Datagram:
@@ -820,7 +821,7 @@ class Guard:
     def _count(self, datagram: Datagram) -> None:
         key = datagram.hub, datagram.sensor, datagram.number
         lowest, highest, seen = self._streams[key]
-        # The number without wrapping is the one nearest to the known numbers.
+        # Extends the number beyond 32 bits: the value nearest to the known one.
         known = lowest if highest is None else highest
         number = known + (datagram.sequence - known + 0x80000000) % 0x100000000 - 0x80000000
         if number < lowest:
@@ -837,7 +838,7 @@ class Guard:
         self._streams[key] = lowest, highest, seen
 
 
-# Sequence numbers up to the highest one that are distinguished. Older ones are stale.
+# Number of sequence numbers, up to the highest, for which duplicates are detected.
 _WINDOW = 1024
 
 
@@ -853,7 +854,7 @@ class Parts:
         if datagram.parts == 1:
             return datagram
         head = replace(datagram, part=0, parts=1, payload=b"")
-        # The sample that has waited for longest is first.
+        # Removed and inserted again, so that the sample that has waited longest is first.
         parts = self._unfinished.pop((head, datagram.parts), {})
         parts[datagram.part] = datagram.payload
         if len(parts) == datagram.parts:
@@ -872,7 +873,7 @@ class Parts:
 
 
 def crc32c(data: bytes) -> int:
-    """CRC-32C (iSCSI): of b"123456789" it is E3069283h."""
+    """Returns the CRC-32C (iSCSI). That of b"123456789" is E3069283h."""
     crc = 0xFFFFFFFF
     for byte in data:
         crc = crc >> 8 ^ _CRC[(crc ^ byte) & 0xFF]

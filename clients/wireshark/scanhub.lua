@@ -1,10 +1,11 @@
--- Shows the datagrams of `scanhub gateway` in Wireshark and tshark: every field by its name, checksums and MACs checked, gaps,
--- duplicates and datagrams out of order flagged per hub, epoch, sensor and topic. docs/datagram.md has the bytes.
+-- Dissector of the datagrams of `scanhub gateway` for Wireshark and tshark. It shows all fields, and checks checksums
+-- and MACs. It flags gaps, duplicates and datagrams out of order, for each hub, epoch, sensor and topic.
+-- docs/datagram.md describes the bytes.
 --
 --   tshark -X lua_script:scanhub.lua -f 'udp port 22200' -Y scanhub.lost
 --   tshark -X lua_script:scanhub.lua -o scanhub.key_file:KEY -Y 'scanhub.mac_status == "wrong"'
 --
--- or copy it to where Help, About, Folders shows the personal Lua plugins.
+-- Or copy it to the directory of personal Lua plugins, which Help > About > Folders shows.
 
 local PORT = 22200
 local WINDOW = 1024
@@ -76,10 +77,10 @@ local FOREGROUND_HEAD = 24
 local SEGMENT = 16
 -- End of wire.
 
--- Of families that send packets: how many bytes one has.
+-- Length of a packet in bytes, by family.
 local PACKET = { 47 }
 local CODES = { [0] = "not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error" }
--- From the greatest value of an LMS's measuring mode down.
+-- Codes of an LMS, by their distance from the greatest value of its measuring mode.
 local OF_LMS = { [0] = "no_return", [1] = "too_bright", [4] = "weak", [5] = "error", [8] = "beyond" }
 
 -- Fields -----------------------------------------------------------------------------------------------------------
@@ -370,7 +371,7 @@ end
 
 -- Keys -------------------------------------------------------------------------------------------------------------
 
--- Of SHA-256 (FIPS 180-4).
+-- Round constants of SHA-256 (FIPS 180-4).
 local ROUNDS = {
     0x428a2f98, 0x71374491, 0xb5c0fbcf, 0xe9b5dba5, 0x3956c25b, 0x59f111f1, 0x923f82a4, 0xab1c5ed5,
     0xd807aa98, 0x12835b01, 0x243185be, 0x550c7dc3, 0x72be5d74, 0x80deb1fe, 0x9bdc06a7, 0xc19bf174,
@@ -386,7 +387,7 @@ local BEGIN = {
 }
 local turn, unpack = bits.rrotate or bits.ror, table.unpack or unpack
 
--- SHA-256 of a string, as one.
+-- Returns the SHA-256 of a string, as a string of 32 bytes.
 local function sha256(text)
     local bxor, band, bnot, rshift = bits.bxor, bits.band, bits.bnot, bits.rshift
     local len = #text
@@ -422,7 +423,7 @@ local function sha256(text)
     return table.concat(out)
 end
 
--- The key in a file as the beginnings of the two hashes of a MAC, or nothing and why.
+-- Returns the first blocks of the two hashes of a MAC, for the key in a file; or nil and the reason.
 local function read_key(path)
     local file, why = io.open(path, "rb")
     if not file then return nil, why end
@@ -441,7 +442,8 @@ end
 
 local key, key_path, no_key
 
--- Whether the MAC of a datagram, which it may not have, is of the key: `right`, `wrong`, `none`, or why nobody knows.
+-- Returns whether the MAC of a datagram belongs to the key: `right`, `wrong`, `none` if the datagram has no MAC, or the
+-- reason why there is no key.
 local function mac_status(tvb, has_mac)
     local path = scanhub.prefs.key_file
     if path ~= key_path then
@@ -461,17 +463,18 @@ end
 local streams, epochs, names, findings
 
 function scanhub.init()
-    -- By hub, epoch, sensor and topic: the highest number and those seen in the window below it.
+    -- By hub, epoch, sensor and topic: the highest sequence number, and those received in the window below it.
     streams = {}
     -- By hub: the latest epoch.
     epochs = {}
-    -- By hub and sensor: its name.
+    -- By hub and sensor: the sensor's name.
     names = {}
-    -- By number of the frame, from the first pass: what to flag.
+    -- By frame number: the result of `judge`. Only the first pass fills it, because later passes are not in order.
     findings = {}
 end
 
--- What a datagram is beside those before it: the field to show and its value, or nothing.
+-- Compares a datagram with earlier ones. Returns the field to show and its value, or nil if the datagram is the
+-- expected one.
 local function judge(hub, epoch, sensor, topic, sequence)
     if epochs[hub] and epoch < epochs[hub] then
         return { "retired", epochs[hub] }
@@ -485,7 +488,7 @@ local function judge(hub, epoch, sensor, topic, sequence)
     end
     local ahead = (sequence - stream.highest) % 0x100000000
     if ahead > 0 and ahead < 0x80000000 then
-        -- What leaves the window is forgotten, at most the whole window.
+        -- Removes the numbers that leave the window.
         for behind = 0, math.min(ahead, WINDOW) - 1 do
             stream.seen[(stream.highest - WINDOW + 1 + behind) % 0x100000000] = nil
         end
@@ -508,8 +511,8 @@ local function judge(hub, epoch, sensor, topic, sequence)
 end
 
 -- Payloads ---------------------------------------------------------------------------------------------------------
--- Each adds its fields to the tree and answers a few words for the Info column; `nil` if the payload is shorter than its
--- own counts say.
+-- Each function adds the fields of a payload to the tree, and returns text for the Info column, or nil if the payload
+-- is invalid or too short for its counts.
 
 local unpack_payload = {}
 
@@ -538,7 +541,7 @@ end
 
 unpack_payload[1] = function(payload, tree, _, _, family)
     local len, words = payload:len(), ""
-    -- Of an LMS it says its length; of other families it is all of the payload.
+    -- The telegram of an LMS contains its length. Packets of other families fill the payload.
     if family == 0 then
         if len < 4 or payload(0, 1):uint() ~= 2 then return nil end
         len = payload(2, 2):le_uint() + 6
@@ -1008,7 +1011,7 @@ unpack_payload[15] = function(payload, tree)
 end
 -- End of payloads.
 
--- What a value stands for that is no range.
+-- Returns the name of a code.
 local function code_of(value, family, no_return)
     if value ~= 0xFFFF and family == 0 then return OF_LMS[no_return - value] or "overflow" end
     return CODES[math.min(0xFFFF - value, 7)]
@@ -1197,7 +1200,7 @@ function scanhub.dissector(tvb, pinfo, root)
     if not words then
         return add_refusal(tree, pinfo, unpack and "payload" or "skipped")
     end
-    -- A number is that of the whole sample: its first part stands for it.
+    -- All parts of a sample have its sequence number, so only the first part counts.
     if not pinfo.visited and part == 0 then
         findings[pinfo.number] = judge(hub, epoch, sensor, topic, sequence)
     end
