@@ -1,4 +1,5 @@
-/* Publishes the angles of a mount, here one that swings by half a radian in two seconds: mount [NAME]. Needs POSIX clocks. */
+/* Publishes the angles of a simulated mount, which swings by half a radian in two seconds: mount [NAME]. Needs POSIX
+ * clocks. */
 #define _POSIX_C_SOURCE 200112L
 #include <scanhub/attach.h>
 #include <stdio.h>
@@ -12,7 +13,7 @@ static uint64_t now_ns(void)
     return (uint64_t)now.tv_sec * 1000000000 + (uint64_t)now.tv_nsec;
 }
 
-/* Asks the encoder: radians, right-handed around the axis. */
+/* Returns the angle of the encoder in radians, right-handed around the axis. */
 static double angle_rad(uint64_t at_ns)
 {
     const double phase = (double)(at_ns % 2000000000) / 1e9;

@@ -1,4 +1,4 @@
-/* The nearest beam of every scan: nearest [SENSOR] [COUNT]. */
+/* Prints the nearest beam of every scan: nearest [SENSOR] [COUNT]. */
 #include <scanhub/attach.h>
 #include <stdio.h>
 #include <stdlib.h>

@@ -1,5 +1,5 @@
-// Whether the robot may go, said when it changes, until stdin ends: stop [SENSOR]... Waits for both with one poll, as a
-// program does that has other things to wait for.
+// Prints whether the robot may go, at every change, until stdin ends: stop [SENSOR]... One poll waits for samples and
+// stdin, as in a program that also waits for other descriptors.
 #include <scanhub/attach.hpp>
 
 #include <cerrno>
@@ -27,7 +27,7 @@ try {
     for (;;) {
         if (poll(fds, 2, -1) < 0 && errno != EINTR)
             return 1;
-        // Take all waiting samples. Otherwise, poll does not sleep again.
+        // Take all samples, because the descriptor is readable until then.
         while (scanhub::Sample sample = robot.take()) {
             const scanhub_robot &now = sample.as<scanhub_robot>();
             if (now.verdict != last)

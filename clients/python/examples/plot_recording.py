@@ -1,4 +1,4 @@
-"""Plots a scan of a recording and the background that the hub learns from it, as a robot sees them: x ahead and y to the left.
+"""Plots a scan of a recording and the background that the hub learns from it, x ahead and y to the left.
 
     python plot_recording.py walk.mcap                    # a window
     python plot_recording.py walk.mcap --sensor front --at 30 --out picture.png
@@ -32,7 +32,7 @@ def scan_and_background(
     """Returns the scan at `at_s` seconds after the first one, or the last one before, and the background at that time."""
     scan, background, begin_ns = None, None, None
     with scanhub.read(file, topics=["scan", "background"], sensor=sensor, config=config) as recording:
-        # Without a choice, the first sensor.
+        # Without --sensor, the first sensor of the recording is used.
         chosen = recording.sensors[0]
         for sample in recording:
             if begin_ns is None:
@@ -70,7 +70,7 @@ def main() -> None:
         print("the background is not learned yet: --config FILE with a smaller background.scans learns it earlier")
     else:
         ahead, left = points_m(background.ranges_m, background.angles)
-        # Infinite: far away.
+        # An infinite range means that the background is out of range.
         is_near = np.isfinite(ahead)
         axes.plot(left[is_near], ahead[is_near], "-", color="silver", linewidth=4, label="background")
     ahead, left = points_m(scan.ranges_m, scan.angles)

@@ -1,4 +1,4 @@
-"""Draws scans as a robot sees them, x ahead and y to the left, as they come, or one of them into a file.
+"""Draws scans as they arrive, x ahead and y to the left, or saves one scan as a picture.
 
     python plot_scan.py front                    # a window, until it is closed
     python plot_scan.py front --output scan.png
@@ -53,7 +53,7 @@ def main() -> None:
         if options.output:
             figure.savefig(options.output, dpi=120)
             break
-        # Drawing takes longer than a scan period. Scans that arrive in the meantime count as missed.
+        # Drawing takes longer than a scan. Scans that arrive in the meantime are missed, which does not slow the hub.
         plt.pause(0.001)
         if not plt.fignum_exists(figure.number):
             break

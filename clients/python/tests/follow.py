@@ -65,7 +65,7 @@ def marks(sample: scanhub.Marks) -> dict:
 
 def lines(sample: scanhub.Lines) -> dict:
     def metres(value: float) -> float:
-        # Halves away from 0, as Rust rounds.
+        # Rounds halves away from 0, as Rust does.
         return math.copysign(math.floor(abs(value) * 1e6 + 0.5), value) / 1e6
 
     said = {"readings": sample.readings, "points": sample.on_lines, "noise_m": metres(sample.noise_m)}
@@ -94,7 +94,7 @@ def motion(sample: scanhub.Motion) -> dict:
     said["overlap"] = millionths(sample.overlap)
     for name in ("covariance", "pose_covariance"):
         covariance = getattr(sample, name)
-        # The shortest number that is this one of 32 bits.
+        # The shortest decimal number that rounds to this 32-bit value.
         said[name] = None if covariance is None else [float(str(value)) for value in covariance.flat]
     return said
 

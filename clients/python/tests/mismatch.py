@@ -1,4 +1,4 @@
-"""A hub that uses another layout for `front/scan`: arguments are domain and root."""
+"""Subscribes to `front/scan` of a hub that uses another layout. Arguments are domain and root."""
 
 import asyncio
 import sys

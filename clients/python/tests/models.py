@@ -1,4 +1,4 @@
-"""Background models and the flow of data on request: arguments are domain and root. `front` has to stream."""
+"""Requests background models, and controls a link. Arguments are domain and root. `front` must stream."""
 
 import sys
 import time

@@ -1,5 +1,5 @@
-"""A callback that fails at the end of the hub: arguments are domain and root. `front` publishes its status, and its hub ends
-when this has printed a line. It reads a line before and after that."""
+"""Subscribes with a callback that fails when the hub ends. Arguments are domain and root. `front` publishes its status,
+and its hub ends after this program has printed a line. The program reads a line before and after that."""
 
 import select
 import sys

@@ -1,5 +1,6 @@
-"""Publishes the angles of a mount: arguments are domain, root and its name. Each line of stdin is a sample: angle, rate and
-stamp, 0 for now. Says so when it publishes, and after each sample; ends with stdin."""
+"""Publishes the angles of a mount. Arguments are domain, root and the name of the mount. Each line of stdin is a
+sample: angle, rate and stamp, 0 for now. It prints a line when it publishes and after each sample, and exits at the end
+of stdin."""
 
 import math
 import os
@@ -28,7 +29,7 @@ try:
         child = os.fork()
         if child == 0:
             refused(scanhub.Failure, lambda: mount.send(0.0))
-            # And ends as any program does: nothing of it is the child's.
+            # Exits as any program does. The publication belongs to the parent.
             sys.exit()
         assert os.waitpid(child, 0)[1] == 0
         print('{"class": "open"}', flush=True)

@@ -1,5 +1,5 @@
-"""Recordings. Arguments are `dump FILE CONFIG`, which prints every sample, or `check` with an MCAP file of two sensors, a CARMEN log,
-a stream of packets and a directory for other files."""
+"""Reads recordings. Arguments are `dump FILE CONFIG`, which prints every sample, or `check` with an MCAP file of two
+sensors, a CARMEN log, a stream of packets and a directory for other files."""
 
 import hashlib
 import json

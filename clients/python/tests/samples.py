@@ -1,4 +1,4 @@
-"""Samples of golden bytes of `schema`: the argument is the directory with them."""
+"""Checks samples that are made from golden bytes of `schema`. The argument is the directory of these bytes."""
 
 import sys
 from pathlib import Path
@@ -15,7 +15,7 @@ def golden(name: str) -> bytes:
 
 
 def sample(topic: str, name: str, cut: "int | None" = None):
-    """A sample with golden header and payload, as one that was pickled."""
+    """Returns a sample with golden header and payload, restored as a pickled sample is."""
     state = (5, True, False)
     return scanhub._scanhub._restore("front", topic, golden("header"), golden(name)[:cut], state)
 

@@ -1,5 +1,5 @@
-"""Checks memory and lifetime of arrays, and threads, tasks and processes: arguments are domain and root, and `uvloop` to check only
-the tasks, in a loop of uvloop. `front` has to stream."""
+"""Checks memory and lifetime of arrays, and threads, tasks and processes. Arguments are domain and root, and `uvloop`
+to check only the tasks, in a loop of uvloop. `front` must stream."""
 
 import asyncio
 import contextlib
@@ -73,7 +73,7 @@ def a_view_keeps_its_sample(scans: scanhub.Subscriber) -> None:
     kept, before = scan.ranges[100:200], scan.ranges[100:200].copy()
     seq = scan.topic_seq
     del scan
-    # Far more than the hub has slots, unless they are released in between. The sample's own slot is not one of them.
+    # The hub has far fewer slots, so they must be reused. The slot of the kept sample must not be.
     for scan in scans:
         assert scan.ranges.ctypes.data + 200 != kept.ctypes.data
         if scan.topic_seq > seq + 60:
@@ -107,8 +107,8 @@ def other_threads_run_meanwhile(scans: scanhub.Subscriber) -> None:
         while time.monotonic() - begin < 0.5:
             next(scans)
         used = time.process_time() - used
-        # They would hardly run while the lock of the interpreter is held over a wait; and who sleeps uses no time. A
-        # machine that is full gives neither, for a while.
+        # The other thread would hardly run if a wait held the lock of the interpreter. A thread that sleeps uses no CPU
+        # time. On a busy machine, neither may hold for a while.
         if turns[0] > 50 and used < 0.4:
             break
         assert time.monotonic() < give_up_at, (turns, used)
@@ -122,7 +122,7 @@ def a_child_takes_nothing_from_its_parent(scans: scanhub.Subscriber) -> None:
     child = os.fork()
     if child == 0:
         del scan, kept, scans
-        # Ends as a program does, not as multiprocessing lets it.
+        # Exits as a program does. multiprocessing would skip the interpreter's shutdown.
         sys.exit(0)
     assert os.waitpid(child, 0)[1] == 0
     for _ in range(20):
@@ -155,7 +155,7 @@ def other_threads_drop_samples(scans: scanhub.Subscriber) -> None:
         thread = threading.Thread(target=lambda: (kept.clear(), views.clear()))
         thread.start()
         thread.join()
-        # Four places are free again.
+        # Four slots are free again.
         kept = [next(scans) for _ in range(4)]
         kept.clear()
 
@@ -201,7 +201,7 @@ def two_threads_at_a_time_are_refused(scans: scanhub.Subscriber) -> None:
     may_continue.set()
     thread.join()
     assert "another thread" in said and "nobody" in refused[0], (said, refused)
-    # One after the other may use it.
+    # Threads may use the object one after the other.
     next(scans)
     thread = threading.Thread(target=lambda: refused.append(next(scans).sensor))
     thread.start()

@@ -1,14 +1,14 @@
-"""Samples of a scanhub on this machine, from shared memory and without a copy.
+"""Client library for a hub on this machine: reads samples from shared memory, without a copy.
 
     import scanhub
 
     for scan in scanhub.subscribe("front/scan"):
         print(scan.seq, scan.ranges_m[180])
 
-`scan.ranges_m` has meters, NaN without a reading. `scan.ranges` is a read-only numpy view of the hub's memory, in device units
-and with codes. A subscription waits for a hub that does not run yet, and continues after its restart. `scanhub.robot()`
-follows the verdict of all sensors, `scanhub.publish("mount/tilt")` publishes the angles of a mount, and
-`scanhub.read("walk.mcap")` reads a recording. docs/python.md describes the rest.
+`scan.ranges_m` has meters, NaN without a reading. `scan.ranges` is a read-only numpy view of the hub's memory, in
+device units and with codes. A subscription waits for a hub that does not run yet, and continues after its restart.
+`scanhub.robot()` returns the verdicts of all sensors, `scanhub.publish("mount/tilt")` publishes the angles of a mount,
+and `scanhub.read("walk.mcap")` reads a recording. docs/python.md describes the rest.
 """
 
 from __future__ import annotations
@@ -139,8 +139,8 @@ __all__ = [
 ]
 
 def _release_names() -> None:
-    """Closes the locks of names that the parent publishes. A child that kept them would keep the names after the parent was
-    killed."""
+    """Closes the locks of names that the parent process publishes. Otherwise, the names would stay taken while the
+    child runs, even if the parent is killed."""
     for descriptor in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):
             _, name = os.path.split(os.readlink(f"/proc/self/fd/{descriptor}"))
@@ -155,7 +155,7 @@ Shown = Background
 
 
 async def _next(follower: _scanhub.Subscriber | _scanhub.RobotSubscriber) -> Any:
-    """Waits for the next item. A task that is canceled meanwhile loses none: each is received just before the return."""
+    """Waits for the next item. A canceled task loses no item, because an item is received just before the return."""
     loop = asyncio.get_running_loop()
     if follower in _waiting:
         raise Failure("another task waits for this object", "make one for each task")
@@ -167,7 +167,7 @@ async def _next(follower: _scanhub.Subscriber | _scanhub.RobotSubscriber) -> Any
             return item
         if until is not None and loop.time() >= until:
             raise follower._silence()
-        # Without a hub, the descriptor may never be readable, but the warning is due.
+        # Without a hub, the descriptor may never become readable, but the warning has a deadline.
         due = follower._warning_due
         ends = [end for end in (until, None if due is None else loop.time() + due) if end is not None]
         await _readable(follower, loop, descriptor, min(ends, default=None))
@@ -210,8 +210,8 @@ def _end_wait(follower: _Follower) -> None:
 
 
 def _close(follower: _Follower, close: Callable[[], None]) -> None:
-    """Calls `close` after the loop has forgotten the descriptor of `follower`: in the thread of the loop, so later if another
-    thread closes it."""
+    """Calls `close` after the descriptor of `follower` is removed from its loop. That happens in the thread of the
+    loop: if another thread closes the object, `close` is called later."""
     waiting = _waiting.get(follower)
     if waiting is not None:
         try:
@@ -226,8 +226,8 @@ def _close(follower: _Follower, close: Callable[[], None]) -> None:
 
 
 class Subscriber(_scanhub.Subscriber):
-    """Iterates over the samples of its topics, with `for` or with `async for`. Made by `scanhub.subscribe`. The iteration ends
-    only if the subscription is closed."""
+    """Iterates over the samples of its topics, with `for` or with `async for`. Made by `scanhub.subscribe`. The
+    iteration ends only if the subscription is closed."""
 
     def __aiter__(self) -> Subscriber:
         return self
@@ -247,8 +247,8 @@ class Subscriber(_scanhub.Subscriber):
 
 
 class RobotSubscriber(_scanhub.RobotSubscriber):
-    """Iterates over the verdicts of the robot, with `for` or with `async for`. Made by `scanhub.robot`. The iteration ends only
-    if it is closed."""
+    """Iterates over the verdicts of the robot, with `for` or with `async for`. Made by `scanhub.robot`. The iteration
+    ends only if it is closed."""
 
     def __aiter__(self) -> RobotSubscriber:
         return self
@@ -275,11 +275,11 @@ def subscribe(
     timeout: float | None = None,
     on_notice: Callable[[str], object] | None = None,
 ) -> Subscriber:
-    """Subscribes to `topics`, each `SENSOR/TOPIC` as in `front/scan`, in `domain` (None: the value of SCANHUB_DOMAIN, or
-    `scanhub`) below the directory `root` (None: all locations in which a hub may be).
+    """Subscribes to `topics`, each `SENSOR/TOPIC` as in `front/scan`, in `domain` (None: the value of SCANHUB_DOMAIN,
+    or `scanhub`) below the directory `root` (None: all locations in which a hub may be).
 
-    Iterate over the result. With `timeout`, a silence of this number of seconds raises NoHub or Silent. `on_notice` is called
-    with `hub_gone` and `hub_back`. Raises NoTopic or Impossible if a name is invalid.
+    Iterate over the result. With `timeout`, a silence of this number of seconds raises NoHub or Silent. `on_notice` is
+    called with `hub_gone` and `hub_back`. Raises NoTopic or Impossible if a name is invalid.
     """
     return Subscriber(topics, domain, root, timeout, on_notice)
 
@@ -287,12 +287,12 @@ def subscribe(
 def robot(
     *sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None, early: bool = False
 ) -> RobotSubscriber:
-    """Follows the verdict over the zones of `sensors`. Without names, it follows all sensors of the hub; in a domain without
-    a hub, those of other machines that are published there. With `early`, the verdict becomes worse before a scan is complete,
-    and better again if the warning is withdrawn.
+    """Subscribes to the verdict over the zones of `sensors`. Without names, it uses all sensors of the hub; in a domain
+    without a hub, the remote sensors that are published there. With `early`, the verdict becomes worse before a scan is
+    complete, and better again if the warning is withdrawn.
 
-    Iterate over the result, or call `now()` in a loop of your own. The verdict becomes `unknown` if no recent data arrives.
-    Raises Impossible if a name is invalid.
+    Iterate over the result, or call `now()` in a loop of your own. The verdict becomes `unknown` if no recent data
+    arrives. Raises Impossible if a name is invalid.
     """
     return RobotSubscriber(sensors, domain, root, early)
 
@@ -300,10 +300,11 @@ def robot(
 def publish(
     topic: str, *, domain: str | None = None, root: str | os.PathLike[str] | None = None
 ) -> Publication:
-    """Publishes the angles of a mount as `topic`, `NAME/tilt` as in `mount/tilt`. No hub is needed. The name has no dot.
+    """Publishes the angles of a mount as `topic`, `NAME/tilt` as in `mount/tilt`. No hub is needed. The name has no
+    dot.
 
-    Raises Taken if another process publishes as NAME, a program or the hub; Impossible if the name or the topic is invalid;
-    Denied, Short, Mismatch or Failure.
+    Raises Taken if another process publishes as NAME, a program or the hub; Impossible if the name or the topic is
+    invalid; Denied, Short, Mismatch or Failure.
     """
     return Publication(topic, domain, root)
 
@@ -318,14 +319,14 @@ def read(
     set: str | Iterable[str] = (),
     system_config: bool = True,
 ) -> Recording:
-    """Reads `topics` of a recording: an MCAP file, a CARMEN log or a stream of telegrams. No hub is needed. The samples equal
-    those of `scanhub replay --rate max`, with the settings in the file `config` and those in `set`, as in
+    """Reads `topics` of a recording: an MCAP file, a CARMEN log or a stream of telegrams. No hub is needed. The samples
+    equal those of `scanhub replay --rate max`, with the settings in the file `config` and those in `set`, as in
     `set=["link.front.mode=1"]`. With `system_config=False`, the files in /etc/scanhub are not read.
 
-    Iterate over the result, or call its `to_numpy()`. `sensor` selects one of several sensors, or names the sensor of a recording
-    without names. `family` is the family of the scanner that sent a stream (None: recognized by the bytes). Warns with
-    RecordingWarning if something is missing in the file. Raises Unreadable, NoTopic, or Impossible for a wrong configuration.
-    The iteration raises Unreadable at its end if the file became shorter in the meantime.
+    Iterate over the result, or call its `to_numpy()`. `sensor` selects one of several sensors, or names the sensor of a
+    recording without names. `family` is the family of the scanner that sent a stream (None: recognized by the bytes).
+    Warns with RecordingWarning if something is missing in the file. Raises Unreadable, NoTopic, or Impossible for a
+    wrong configuration. The iteration raises Unreadable at its end if the file became shorter in the meantime.
     """
     names = (topics,) if isinstance(topics, str) else tuple(topics)
     settings = (set,) if isinstance(set, str) else tuple(set)
@@ -348,8 +349,8 @@ def sensors(*, domain: str | None = None, root: str | os.PathLike[str] | None = 
 def background(
     sensor: str, order: str = "show", *, domain: str | None = None, root: str | os.PathLike[str] | None = None
 ) -> Background:
-    """Returns the background model of `sensor`, after `order` was carried out: `show`, `reset` (learn again), `freeze` or
-    `thaw`. Raises Refused if the hub refuses it, NoTopic if there is no such sensor, NoHub, Silent or Short."""
+    """Returns the background model of `sensor`, after `order` was carried out: `show`, `reset` (learn again), `freeze`
+    or `thaw`. Raises Refused if the hub refuses it, NoTopic if there is no such sensor, NoHub, Silent or Short."""
     _check_order(order, ("show", "reset", "freeze", "thaw"))
     if order != "show":
         _scanhub._request(sensor, order, domain, root)

@@ -16,12 +16,13 @@ class Failure(Exception):
 
 
 class SilenceWarning(UserWarning):
-    """Nothing was received for two seconds after the start. The text names the reason: there is no hub, a sensor or topic is
-    missing, or a scanner is paused or absent."""
+    """Nothing was received for two seconds after the start. The text names the reason: there is no hub, a sensor or
+    topic is missing, or a scanner is paused or absent."""
 
 
 class RecordingWarning(UserWarning):
-    """A recording is damaged, or does not contain what is needed to read its values. The text names the missing part."""
+    """A recording is damaged, or does not contain what is needed to read its values. The text names the missing
+    part."""
 
 
 class Unreadable(Failure, OSError):
