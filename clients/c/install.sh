@@ -1,11 +1,11 @@
 #!/bin/sh
-# Puts the library for C and C++ in place, or takes it away again. Build it first: cargo build --release -p scanhub-c
+# Installs the library for C and C++, or removes it. Build it first: cargo build --release -p scanhub-c
 #
-#   clients/c/install.sh [--prefix DIR] [--library DIR]   install below /usr/local, or DIR; the library is taken from
-#                                                         where Cargo puts it if no other place is named
-#   clients/c/install.sh [--prefix DIR] --remove          take away all that this script puts in place
+#   clients/c/install.sh [--prefix DIR] [--library DIR]   install below DIR, by default /usr/local; --library is
+#                                                         the library's directory, by default Cargo's
+#   clients/c/install.sh [--prefix DIR] --remove          remove all files that this script installs
 #
-# DESTDIR=DIR puts everything below DIR, for those who make packages.
+# DESTDIR=DIR installs below DIR, for packages.
 set -eu
 # Debian's users do not have ldconfig in PATH.
 PATH=$PATH:/usr/sbin:/sbin
@@ -33,7 +33,7 @@ version=$(sed -n 's/^version = "\(.*\)"/\1/p' "$here/../../Cargo.toml" | head -n
 
 put() { # source, destination, mode
     mkdir -p "$(dirname "$root/$2")"
-    # Under another name first: a program may have the old one open.
+    # First under another name, because a program may have the old file open.
     cp "$1" "$root/$2.new"
     chmod "$3" "$root/$2.new"
     mv "$root/$2.new" "$root/$2"

@@ -1,11 +1,11 @@
 #!/bin/sh
-# Puts the hub in place as a service of this machine, or takes it away again.
+# Installs the hub as a system service, or removes it.
 #
-#   hub/dist/install.sh [--program FILE]     install; the program is target/release/scanhub, or that in CARGO_TARGET_DIR, if
-#                                            no other is named
-#   hub/dist/install.sh --remove             take away all that this script puts in place; configuration stays
+#   hub/dist/install.sh [--program FILE]     install the program FILE; the default is target/release/scanhub, or
+#                                            release/scanhub in CARGO_TARGET_DIR
+#   hub/dist/install.sh --remove             remove all files that this script installs, but no configuration
 #
-# DESTDIR=DIR puts everything below DIR and starts nothing, for those who make packages.
+# DESTDIR=DIR installs below DIR and changes no services, for packages.
 set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
@@ -30,7 +30,7 @@ if [ -z "$root" ] && [ "$(id -u)" != 0 ]; then
     exit 1
 fi
 
-# What goes where, with which mode; the source last, for there may be blanks in it.
+# Destination, mode and source of each file. The source is last, because it may contain blanks.
 files="
 usr/local/bin/scanhub 755 $program
 etc/systemd/system/scanhub.service 644 $here/scanhub.service
@@ -47,7 +47,7 @@ each() { # calls $1 with source, destination and mode of each file
 }
 put() {
     mkdir -p "$(dirname "$2")"
-    # Under another name first: a program that runs cannot be written to.
+    # First under another name, because a running program cannot be overwritten.
     cp "$1" "$2.new"
     chmod "$3" "$2.new"
     mv "$2.new" "$2"
@@ -56,7 +56,7 @@ put() {
 take() {
     [ ! -e "$2" ] || { rm "$2"; echo "removed $2"; }
 }
-# What the program itself says of its command line; one for another processor cannot say it here.
+# Manual pages and completions, which the program prints. A program for another processor does not run here.
 man=usr/local/share/man/man1
 completions="
 bash usr/local/share/bash-completion/completions/scanhub
@@ -86,7 +86,7 @@ take_generated() {
     done
 }
 has() { command -v "$1" > /dev/null 2>&1; }
-# Only a machine that runs systemd has services to tell.
+# Returns whether this machine runs systemd, and files are installed into it.
 runs() { [ -z "$root" ] && [ -d /run/systemd/system ]; }
 udev() { if runs && has udevadm; then udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=usb-serial; fi; }
 
