@@ -44,7 +44,7 @@ pub(crate) struct Demo {
     /// Seed of rooms and people
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Family of the sensors; mixed: one of each family
+    /// Family of the sensors; mixed: one sensor of each family
     #[arg(long, default_value = Family::ALL[0].name(), value_name = "FAMILY", value_parser = families())]
     family: Families,
 }

@@ -26,7 +26,7 @@ while [ $# -gt 0 ]; do
 done
 case $prefix in
 /*) ;;
-*) echo "install.sh: --prefix $prefix: say it from the root, as in /usr/local" >&2; exit 2 ;;
+*) echo "install.sh: --prefix $prefix: write an absolute path, as in /usr/local" >&2; exit 2 ;;
 esac
 root=${DESTDIR:-}$prefix
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' "$here/../../Cargo.toml" | head -n 1)

@@ -31,7 +31,7 @@ enum ConfigCommand {
     /// Print a configuration to start from, with all default values
     #[command(after_help = "Example:\n  scanhub config default > scanhub.toml")]
     Default,
-    /// Check the configuration; if it has an error, show the place and exit with 78
+    /// Check the configuration; if it has an error, show its position and exit with 78
     #[command(after_help = "Example:\n  scanhub config check scanhub.toml")]
     Check {
         /// Check only this file

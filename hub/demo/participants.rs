@@ -83,7 +83,7 @@ impl World {
             }
             (World::House, Families::Mixed) => {
                 let names: Vec<_> = Family::ALL.into_iter().map(Family::name).collect();
-                let hint = format!("all sensors of the house are of one family: {}", names.join(", "));
+                let hint = format!("all sensors of the house have the same family: {}", names.join(", "));
                 Err(Failure::new(Kind::Usage, "--world house with --family mixed", hint))
             }
         }

@@ -65,7 +65,7 @@ fn reports_byte_rate_of_a_scanner_of_another_family() {
         assert!((100..50_000).contains(&rate), "{info}");
         let outcome = hub.end(TERM);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
-        for wrong in ["no answer", "power, cable"] {
+        for wrong in ["no reply", "power, cable"] {
             assert!(!outcome.stderr.contains(wrong), "{outcome}");
         }
     });
@@ -75,9 +75,9 @@ fn reports_byte_rate_of_a_scanner_of_another_family() {
 fn a_silent_line_may_have_another_scanner() {
     check_each_scanner(&IDLE_SCANNERS, |simulated, family| {
         let message = match family {
-            "lms" => "no answer at 9600, 19200, 38400 or 500000 baud",
+            "lms" => "no reply at 9600, 19200, 38400 or 500000 baud",
             "ld" => "no packets at 230400 and 921600 baud",
-            _ => "no answer at 115200, 256000, 460800 and 1000000 baud",
+            _ => "no reply at 115200, 256000, 460800 and 1000000 baud",
         };
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], simulated);

@@ -60,7 +60,7 @@ fn reopens_a_port_by_name_on_each_new_device() {
         };
         let absent = subscriber.await_line("absent", |line| line["state"] == "absent");
         let error = absent["last_error"].as_str().unwrap_or_default();
-        assert!(error.contains("front went away: the line hung up"), "{absent}");
+        assert!(error.contains("front became unavailable: the line hung up"), "{absent}");
         assert_eq!(number(&absent["counters"], "reconnects"), u64::from(plugged), "{absent}");
     }
     line.wait_for_request();

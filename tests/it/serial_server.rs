@@ -172,7 +172,7 @@ fn a_serial_server_that_is_set_to_another_rate() {
     let _simulator = env.simulator(&["line"], &["--baud=9600"]);
     let server = Server::new(&env, "line", 38_400);
     let _hub = env.hub(&[&server.link(), "--set=link.front.baud=38400"]);
-    let message = "no answer at 38400 baud, the rate set in the serial server";
+    let message = "no reply at 38400 baud, the rate set in the serial server";
     let has_message = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(message));
     env.await_info("front", has_message);
 }

@@ -267,7 +267,9 @@ fn refusals_have_a_remedy() {
     }
     let garbled = telegram(&["decode", "--json"], b"02 00 0q");
     assert_eq!(garbled.status.code(), Some(66));
-    assert!(lines(&garbled)[0]["message"].as_str().expect("a message").contains("line 1: \"0q\" is no byte"));
+    assert!(
+        lines(&garbled)[0]["message"].as_str().expect("a message").contains("line 1: \"0q\" is not a byte")
+    );
 }
 
 /// Status byte of a scanner without a fault.

@@ -97,7 +97,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     // Requests to the hub, and their results.
     watch.press("F");
     watch.wait_for_text("front: background is frozen");
-    watch.wait_for_text("lost 0  frozen");
+    watch.wait_for_text("missed 0  frozen");
     let model = env.run(&["background", "front", "show"]);
     assert!(String::from_utf8_lossy(&model.stdout).contains("frozen"), "{model}");
     watch.press("F");

@@ -53,7 +53,7 @@ fn page_reports_missing_remote_sensors() {
         let listener = env.start(&["listen", "--json", "--publish"]).ready();
         let (_server, host) = web(&env, &[]);
         page.open(&format!("http://{host}/"));
-        wait_for_reason(&mut page, "no sensor of another machine is published here yet", "scanhub gateway");
+        wait_for_reason(&mut page, "no remote sensor is published here yet", "scanhub gateway");
         assert_eq!(listener.end(INT).exit_code, Some(0));
     });
 }

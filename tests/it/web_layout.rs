@@ -55,8 +55,8 @@ fn check(page: &mut Browser, description: &str) {
             page.mouse("mouseMoved", (x.next().expect("an endless sequence"), 330.0), false);
             page.ask("document.querySelector('#readout').innerText !== ''") == true
         });
-        // The page shows the report of skipped messages only for a moment, so set it here.
-        let report = "62 messages skipped: the server was too late, its machine may be busy";
+        // The page shows the report of missed messages only for a moment, so set it here.
+        let report = "62 messages missed: the server was too late, its machine may be busy";
         let script = format!("(document.querySelector('#news').textContent = '{report}', {BREACHES_SCRIPT})");
         assert_eq!(page.ask(&script), Value::Array(Vec::new()), "{description}{layers}");
         page.press("l");

@@ -78,10 +78,10 @@ fn send_request(
         }
         if !is_hub_running {
             let hint = "the result is not known: `scanhub info` shows the sensor's state";
-            return Err(Error::new(Kind::NoHub, "the hub went away before it answered", hint));
+            return Err(Error::new(Kind::NoHub, "the hub stopped before it replied", hint));
         }
         if stop.load(Ordering::Relaxed) {
-            return Err(Error::new(Kind::Interrupted, "interrupted before the hub answered", ""));
+            return Err(Error::new(Kind::Interrupted, "interrupted before the hub replied", ""));
         }
         if Instant::now() >= deadline {
             let message =

@@ -57,7 +57,7 @@ pub struct GatewayArgs {
     /// Authenticate every datagram with the key in this file, for `listen --key-file`. `scanhub key new` creates one
     #[arg(long, value_name = "FILE", conflicts_with = "bare")]
     pub key_file: Option<PathBuf>,
-    /// How many networks datagrams to the groups may cross, including the first one [default: 1]
+    /// Maximum number of networks that datagrams to the groups cross, including the first one [default: 1]
     #[arg(long, value_name = "N")]
     pub ttl: Option<u8>,
     /// Send the background also at this interval, not only when it is new, for example 10s

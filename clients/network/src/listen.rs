@@ -59,7 +59,7 @@ pub struct ListenArgs {
     /// can use them like sensors of a hub
     #[arg(long)]
     publish: bool,
-    /// Places for subscribers of each published topic, 1 to 250
+    /// Maximum number of subscribers of each published topic, 1 to 250
     #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
     subscribers: u16,
     /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is
@@ -240,7 +240,7 @@ impl Listener<'_> {
     /// Returns the result of a run that `stop` has ended.
     fn end_of_stop(&self) -> Result<(), ExitReason> {
         if self.args.limits.is_bounded() {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
+            return Err(Failure::new(Kind::Interrupted, "interrupted before the end", "").into());
         }
         Ok(())
     }

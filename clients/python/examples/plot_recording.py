@@ -64,7 +64,7 @@ def main() -> None:
     import matplotlib.pyplot as plt
 
     if not options.out and plt.get_backend().lower() == "agg":
-        sys.exit("plot_recording.py: no window can be shown here: say --out FILE")
+        sys.exit("plot_recording.py: no window can be shown here: use --out FILE")
     figure, axes = plt.subplots()
     if background is None or background.angles is None or background.known_beams == 0:
         print("the background is not learned yet: --config FILE with a smaller background.scans learns it earlier")

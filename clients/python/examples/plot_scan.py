@@ -37,7 +37,7 @@ def main() -> None:
     import matplotlib.pyplot as plt
 
     if not options.output and plt.get_backend().lower() == "agg":
-        sys.exit("plot_scan.py: no window can be shown here: say --output FILE")
+        sys.exit("plot_scan.py: no window can be shown here: use --output FILE")
     figure, axes = plt.subplots()
     (dots,) = axes.plot([], [], ".", markersize=3)
     axes.plot([0], [0], "^", color="black")

@@ -80,7 +80,8 @@ fn request(
     root: Option<PathBuf>,
 ) -> PyResult<Option<Py<PyAny>>> {
     check_any_sensor(sensor).map_err(Error::from)?;
-    let invalid = || Error::new("Impossible", format!("no order {order:?}"), "docs/python.md lists them");
+    let invalid =
+        || Error::new("Impossible", format!("unknown order {order:?}"), "docs/python.md lists them");
     let verb = Verb::parse(order).ok_or_else(invalid)?;
     let (request, stop) = (Request::new(sensor, verb), Arc::new(AtomicBool::new(false)));
     let domain_options = DomainOptions { domain, root };

@@ -161,7 +161,7 @@ impl Watcher<'_> {
             }
             match command {
                 Some(ViewCommand::Interrupt) if self.is_bounded => {
-                    return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
+                    return Err(Failure::new(Kind::Interrupted, "interrupted before the end", "").into());
                 }
                 Some(ViewCommand::Quit | ViewCommand::Interrupt) => return Err(ExitReason::ReaderClosed),
                 Some(ViewCommand::Reset) => self.request(Verb::Reset, now),

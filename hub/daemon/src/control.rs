@@ -193,7 +193,7 @@ impl ControlServer {
         let request =
             incoming.request().and_then(|request| Some((request.sensor, request.verb?, request.model)));
         let (sensor, verb, model) = request.ok_or_else(|| {
-            let hint = "client and hub are of different versions";
+            let hint = "client and hub have different versions";
             Failure::new(Kind::Failed, "the request is not known to this hub", hint)
         })?;
         self.commands.enqueue(&sensor, verb, model.unwrap_or_default())

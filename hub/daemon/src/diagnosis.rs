@@ -347,7 +347,7 @@ impl<'a> Diagnosis<'a> {
         if let Some((missing, rate)) = session.missing_transmission().zip(rate) {
             return self.unrecognized_bytes(missing, rate);
         }
-        // Soon the rate of the bytes gives a better message than "no answer".
+        // Soon the rate of the bytes gives a better message than "no reply".
         if session.missing_transmission().is_some() && self.byte_rate.is_settling(self.now, stats.read) {
             return self.message.clone();
         }

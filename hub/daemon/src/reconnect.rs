@@ -295,7 +295,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         self.core.platform.release(&self.core.link.name);
         self.core.stats.reconnects += 1;
         self.empty_connections = if has_received { 0 } else { self.empty_connections + 1 };
-        let message = format!("{} went away: {error}", source.name());
+        let message = format!("{} became unavailable: {error}", source.name());
         self.core.diagnosis.note_empty_connection(if has_received { String::new() } else { message.clone() });
         let failures = self.empty_connections;
         self.schedule_retry(PortUnavailable { failures, ..PortUnavailable::missing(message) });

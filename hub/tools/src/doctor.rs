@@ -38,14 +38,14 @@ pub struct DoctorArgs {
     /// configuration, or all ports if there are none, and the links of the running hub
     #[arg(value_name = "PORT")]
     ports: Vec<String>,
-    /// First remove what dead processes left in this domain; removes nothing while a hub runs there
+    /// First remove what dead processes left in this domain, unless a hub runs there
     #[arg(long)]
     clean: bool,
     /// Router that a bridge of this machine connects to, as in `scanhub bridge --connect`: checks whether that would
     /// work. Can be repeated
     #[arg(long, value_name = "ADDRESS")]
     bridge: Vec<String>,
-    /// The same by Zenoh's own configuration, as in `scanhub bridge --config`
+    /// Configuration of Zenoh to check, as in `scanhub bridge --config`
     #[arg(long, value_name = "FILE")]
     bridge_config: Option<PathBuf>,
 }

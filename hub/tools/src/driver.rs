@@ -438,7 +438,7 @@ fn port_lost(port: &Port, error: &std::io::Error) -> Failure {
     }
     Failure::new(
         Kind::PortMissing,
-        format!("the port went away: {error}"),
+        format!("the port became unavailable: {error}"),
         "was it unplugged? plug it in and try again",
     )
 }

@@ -453,11 +453,11 @@ fn no_reply(source: &PortSpec, first: u32, streams_at: Option<u32>, bytes: u64) 
              client already may let this one wait: end that program first",
         ),
         (None, _) if bytes == 0 => (
-            format!("{name}: no answer at {rates}; {received_text}"),
+            format!("{name}: no reply at {rates}; {received_text}"),
             "check power, cable, jumper 7-8 for RS-422; after power-on a sensor takes up to a minute",
         ),
         (None, _) => (
-            format!("{name}: no answer at {rates}; {received_text}"),
+            format!("{name}: no reply at {rates}; {received_text}"),
             "another device, a line that damages the bytes (ground, RS-232 instead of RS-422), or a missing wire?",
         ),
     };
@@ -601,7 +601,7 @@ mod tests {
     fn names_only_rates_that_the_port_has() {
         let message = |first| no_reply(&PortSpec::Tty("/dev/ttyS0".into()), first, None, 0).message;
         assert!(message(HIGHEST_RATE).contains("38400 or 500000 Bd; no byte"));
-        assert!(message(COMMON_RATE).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
+        assert!(message(COMMON_RATE).contains("no reply at 9600, 19200 or 38400 Bd; no byte"));
     }
 
     fn link(port: &str, settings: &[(&'static str, &str)]) -> SuggestedLink {

@@ -270,7 +270,7 @@ fn open_recording(path: &Path, sensor: Option<&str>) -> Result<RecordingInput, F
     }
     let contents = recording.contents();
     if !contents.is_lms() {
-        let family = recording.family().map_or("that is not known here", Family::name);
+        let family = recording.family().map_or("that this version does not have", Family::name);
         let message = format!(
             "{} has packets of a scanner of family {family}, not telegrams of an LMS",
             path.display()

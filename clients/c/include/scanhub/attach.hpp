@@ -89,7 +89,7 @@ public:
     template <typename Payload> const Payload &as() const
     {
         if (sample_.length < sizeof(Payload) || topic_ != TopicOf<Payload>::number)
-            throw std::logic_error("the sample is none, or of another topic");
+            throw std::logic_error("there is no sample, or it belongs to another topic");
         return *static_cast<const Payload *>(sample_.payload);
     }
 

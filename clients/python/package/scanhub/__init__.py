@@ -356,7 +356,7 @@ def background(
         _scanhub._request(sensor, order, domain, root)
     model = _scanhub._request(sensor, "show", domain, root)
     if model is None:
-        raise Failure("the hub's answer has no model", "hub and client are of different versions")
+        raise Failure("the hub's reply has no model", "hub and client have different versions")
     return model
 
 
@@ -370,4 +370,4 @@ def control(
 
 def _check_order(order: str, orders: tuple[str, ...]) -> None:
     if order not in orders:
-        raise Impossible(f"no order {order!r}", f"there are {', '.join(orders)}")
+        raise Impossible(f"unknown order {order!r}", f"the orders are {', '.join(orders)}")

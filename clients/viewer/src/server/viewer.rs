@@ -275,9 +275,8 @@ impl ReplacedMessages {
     /// Returns the report for the viewer.
     fn text(self) -> String {
         let ReplacedMessages { by_viewer, by_server } = self;
-        let viewer = format!("{by_viewer} messages skipped: this viewer or its network is too slow");
-        let server =
-            format!("{by_server} messages skipped: the server was too late, its machine may be busy");
+        let viewer = format!("{by_viewer} messages missed: this viewer or its network is too slow");
+        let server = format!("{by_server} messages missed: the server was too late, its machine may be busy");
         match (by_viewer, by_server) {
             (_, 0) => viewer,
             (0, _) => server,
@@ -334,11 +333,11 @@ mod tests {
         let (newest, report) = loop {
             match receive() {
                 Ok(number) => break (number, receive().unwrap_err()),
-                Err(other) => assert!(!other.contains("skipped"), "{other}"),
+                Err(other) => assert!(!other.contains("messages missed"), "{other}"),
             }
         };
         assert_eq!((newest, viewer.replaced_count()), (40, 39));
-        assert!(report.contains("39 messages skipped: the server was too late"), "{report}");
+        assert!(report.contains("39 messages missed: the server was too late"), "{report}");
         // The viewer does not read, so the buffers of the sockets fill.
         let (mut last, now) = (40, now + REPORT_INTERVAL);
         while !viewer.is_pending() {
@@ -361,7 +360,7 @@ mod tests {
         }
         let received = numbers.len() as u64;
         assert!(numbers.is_sorted() && received + viewer.replaced_count() == u64::from(last), "{numbers:?}");
-        let expected = format!("{} messages skipped: this viewer", viewer.replaced_count() - 39);
+        let expected = format!("{} messages missed: this viewer", viewer.replaced_count() - 39);
         assert!(viewer.replaced_count() > 39 && report.contains(&expected), "{report}");
         // A viewer that never reads is disconnected.
         while !viewer.is_pending() {

@@ -146,7 +146,7 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
     } else {
         let mut fields = vec![format!(" {hz:>5} Hz")];
         fields.extend(loss.iter().map(|loss| format!("  {loss}")));
-        fields.extend([format!(" {age:>5} ms"), format!("  lost {}", sensor.missed)]);
+        fields.extend([format!(" {age:>5} ms"), format!("  missed {}", sensor.missed)]);
         if sensor.is_frozen() {
             fields.push("  frozen".to_owned());
         }

@@ -185,7 +185,7 @@ fn frozen_picture_has_the_current_verdict() {
     now.sensor("rear").missed = 7;
     let stop = rows(&now);
     assert!(stop[0].starts_with(" STOP  HELD  front, nearest 0.41 m"), "{stop:#?}");
-    assert!(stop[18].contains("lost 7"), "{stop:#?}");
+    assert!(stop[18].contains("missed 7"), "{stop:#?}");
     now.on_hub_exit();
     let gone = rows(&now);
     assert!(

@@ -222,7 +222,7 @@ fn problem(scene: &Scene, locations: &[Domain]) -> Option<Problem> {
         Some(DomainHolder::Hub) => return None,
         Some(DomainHolder::Listener) => Failure::new(
             Kind::NoTopic,
-            "no sensor of another machine is published here yet",
+            "no remote sensor is published here yet",
             "on that machine: scanhub gateway --interface NAME; here, scanhub listen shows who sends",
         ),
     };

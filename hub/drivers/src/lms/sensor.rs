@@ -56,11 +56,11 @@ impl fmt::Display for Problem {
         match self {
             Problem::NoReply { baud: None, seconds } => write!(
                 f,
-                "no answer at 9600, 19200, 38400 or 500000 baud for {seconds} s: power, cable, RS-422 jumper?"
+                "no reply at 9600, 19200, 38400 or 500000 baud for {seconds} s: power, cable, RS-422 jumper?"
             ),
             Problem::NoReply { baud: Some(baud), .. } => write!(
                 f,
-                "no answer at {} baud, the rate set in the serial server: power, cable, rate?",
+                "no reply at {} baud, the rate set in the serial server: power, cable, rate?",
                 baud.rate()
             ),
             Problem::Unanswered(request) => write!(f, "no reply to {request:?} in several tries"),

@@ -735,7 +735,7 @@ impl fmt::Display for Problem {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Problem::NoResponse { baud, seconds } => {
-                f.write_str("no answer at ")?;
+                f.write_str("no reply at ")?;
                 match baud {
                     Some(baud) => write!(f, "{baud}")?,
                     None => f.write_str("115200, 256000, 460800 and 1000000")?,

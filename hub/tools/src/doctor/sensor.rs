@@ -236,7 +236,7 @@ fn reported_health(introduction: &DeviceInfo, scanner: &DetectedScanner) -> Find
             let problem = scanner.problem.as_deref().unwrap_or("it does not measure");
             Finding::failed(NAME, problem, remedy)
         }
-        ReportedHealth::Unknown => Finding::warning(NAME, "it does not say how it is", remedy),
+        ReportedHealth::Unknown => Finding::warning(NAME, "it does not report its health", remedy),
         ReportedHealth::Good => Finding::ok(NAME, introduction.health.clone()),
         ReportedHealth::Warning => Finding::warning(NAME, introduction.health.clone(), remedy),
         ReportedHealth::Error => Finding::failed(NAME, introduction.health.clone(), remedy),
@@ -251,7 +251,7 @@ fn model(scanner: &DetectedScanner, link: Option<&Link>) -> Finding {
             format!("{:.0} points a second, {:.0} in a turn", scanner.points_per_second, scanner.points())
         }
         (Some(_), Some(model)) => format!("up to {} points in a turn", model.beams),
-        (Some(_), None) => "a model that is not known here".to_owned(),
+        (Some(_), None) => "a model that this version does not have".to_owned(),
     };
     let Some((model, link)) = scanner.model.zip(link) else { return Finding::ok(NAME, text) };
     let (set, name) = (link.scanner.model(), &link.name);
@@ -280,7 +280,7 @@ fn model(scanner: &DetectedScanner, link: Option<&Link>) -> Finding {
 fn rotation(scanner: &DetectedScanner) -> Finding {
     const NAME: &str = "health";
     if scanner.revolutions_per_second > 0.0 {
-        return Finding::ok(NAME, format!("{:.1} turns a second", scanner.revolutions_per_second));
+        return Finding::ok(NAME, format!("{:.1} revolutions a second", scanner.revolutions_per_second));
     }
     let what = scanner.problem.as_deref().unwrap_or("packets arrive, but no revolution was complete");
     let (what, _) = what.split_once(": ").unwrap_or((what, ""));
