@@ -80,7 +80,7 @@ local SEGMENT = 16
 -- Length of a packet in bytes, by family.
 local PACKET = { 47 }
 local CODES = { [0] = "not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error" }
--- Codes of an LMS, by their distance from the greatest value of its measuring mode.
+-- Codes of an LMS, by their distance from the highest value of its measuring mode.
 local OF_LMS = { [0] = "no_return", [1] = "too_bright", [4] = "weak", [5] = "error", [8] = "beyond" }
 
 -- Fields -----------------------------------------------------------------------------------------------------------

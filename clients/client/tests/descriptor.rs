@@ -1,5 +1,5 @@
-//! Tests of pollable subscribers: the descriptor is readable while an item waits, and not readable after it was taken,
-//! across restarts of the hub.
+//! Tests of pollable subscribers: the descriptor is readable while there is a sample, and not after the program has
+//! taken it, even over restarts of the hub.
 
 mod fake;
 
@@ -24,10 +24,11 @@ fn scans(test_domain: &TestDomain) -> PollableSubscriber<Scan> {
     Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap()
 }
 
-/// Timeout that is far longer than any step on a busy machine.
+/// Timeout that only a hang exceeds, even on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Period with which a verdict is valid for more than a second, in us, so that a busy machine reads it before its end.
+/// Period of the scans, in us. A verdict is then valid for more than a second, so that a busy machine receives it in
+/// time.
 const LONG_PERIOD_US: u32 = 500_000;
 
 /// Polls until a scan arrives. Returns its number, whether the hub restarted, and its beams.
@@ -80,7 +81,7 @@ fn idle_hub_rarely_wakes_the_subscriber() {
             looks += 1;
         }
     }
-    // There are ten checks in the first second, in which the hub may send the history to a late joiner.
+    // Ten wake-ups in the first second, in which a late joiner may receive a sample.
     assert!((1..=20).contains(&looks), "{looks}");
 }
 
@@ -176,7 +177,7 @@ fn a_pollable_subscriber_can_wait_too() {
     assert!(is_readable(&scans, WAIT_TIMEOUT), "the event is still to be taken");
 }
 
-/// Counts the wake-ups in 5 s of a program that takes all items, and the timeouts of `poll`.
+/// Returns the number of wake-ups of a program that takes all samples for 5 s, and the number of timeouts of `poll`.
 fn wake_ups_and_timeouts(scans: &PollableSubscriber<Scan>) -> (u32, u32) {
     let (started, mut wake_ups, mut timeouts) = (Instant::now(), 0, 0);
     while started.elapsed() < Duration::from_secs(5) {
@@ -195,8 +196,8 @@ fn without_a_hub_poll_times_out() {
     let scans = scans(&test_domain);
     assert!(is_readable(&scans, WAIT_TIMEOUT), "it must look for a hub first");
     assert!(scans.try_next().unwrap().is_none());
-    // If the monitor could not watch the directories, it would check every 2 s. The test takes no item, so one check
-    // would keep the descriptor readable.
+    // The monitor checks every 2 s if it cannot watch the directories. This test takes nothing, so the descriptor would
+    // stay readable after one check.
     assert!(!is_readable(&scans, Duration::from_secs(5)), "no timer wakes it");
 }
 

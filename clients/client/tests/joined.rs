@@ -1,4 +1,4 @@
-//! Tests of subscribers that return the samples of two topics in pairs.
+//! Tests of joined subscriptions: samples of two topics with the same `seq`.
 
 mod fake;
 
@@ -7,7 +7,7 @@ use std::time::Duration;
 use fake::{FakeHub, FakeSensor, TestDomain, wait_until};
 use scanhub_client::{Error, Foreground, JoinedSubscriber, Scan, Silence};
 
-/// Timeout that is far longer than any step on a busy machine.
+/// Timeout that only a hang exceeds, even on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Returns a subscriber of both topics that has attached to the hub.
@@ -26,7 +26,7 @@ fn await_subscribers(pairs: &mut JoinedSubscriber<Scan, Foreground>, hub: &mut F
     });
 }
 
-/// Returns number and missed pairs of the next pair.
+/// Returns the `seq` of the next pair, and the number of missed pairs before it.
 fn next_pair(pairs: &mut JoinedSubscriber<Scan, Foreground>) -> (u64, u64) {
     let pair = pairs.next().unwrap().expect("a pair");
     assert_eq!(pair.first.header().seq, pair.second.header().seq);
@@ -105,7 +105,7 @@ fn a_sample_waits_for_one_period() {
     assert!(pairs.try_next().unwrap().is_none());
     std::thread::sleep(Duration::from_millis(40));
     assert!(pairs.try_next().unwrap().is_none());
-    // The partner of the dropped sample is too late now.
+    // The other sample of the pair would arrive too late now.
     hub.front_sensor().publish_foreground(2, 1);
     hub.front_sensor().wake();
     assert!(pairs.try_next().unwrap().is_none());
@@ -122,7 +122,7 @@ fn pairs_continue_after_a_restart_of_the_hub() {
     hub.front_sensor().period_us = 60_000_000;
     hub.front_sensor().publish_scan_with_foreground(1, &[1000]);
     assert_eq!(next_pair(&mut pairs), (1, 0));
-    // Half of a pair is left when the hub ends.
+    // One sample of a pair has arrived when the hub ends.
     hub.front_sensor().publish_scan(&[1000]);
     assert!(pairs.try_next().unwrap().is_none());
     drop(hub);

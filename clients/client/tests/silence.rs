@@ -1,4 +1,4 @@
-//! Tests of the reasons for a silence, as a program gets them that checks once a second.
+//! Tests of the reasons for a silence, for a program that requests the reason once a second.
 
 mod fake;
 
@@ -18,7 +18,7 @@ fn scans(test_domain: &TestDomain, sensor: &str) -> Subscriber<Scan> {
     builder.timeout(Duration::from_millis(100)).open().unwrap()
 }
 
-/// Waits for an expected reason, as a program that calls `next` gets it after at most two seconds.
+/// Calls `next`, and returns the reason within two seconds.
 fn await_reason(scans: &mut Subscriber<Scan>, is_expected: impl Fn(&Silence) -> bool) -> Silence {
     let started = Instant::now();
     loop {
@@ -77,7 +77,7 @@ fn the_state_of_the_link_is_the_reason() {
             && silence.to_string().contains("no such port")
     });
     is(State::Streaming, &|silence| *silence == Silence::Waiting);
-    // The status follows only during a silence, and is not a sample of the topic.
+    // The subscription to the status exists only during a silence. A status is not a sample of the topic.
     assert_eq!(hub.front_sensor().status.subscribers(), 1);
     let silent_for = scans.silent_for();
     hub.front_sensor().publish_status(|_| {});
@@ -200,7 +200,7 @@ fn the_state_of_the_last_hub_is_not_the_reason() {
         assert!(scans.try_next().unwrap().is_none());
         scans.hub_is_running()
     });
-    // The new hub has not sent a status.
+    // The sensor sends no status.
     assert_eq!(scans.why_silent(), Silence::Waiting);
 }
 

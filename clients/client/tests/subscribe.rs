@@ -1,4 +1,4 @@
-//! Tests of subscribers of one topic: their options and their results.
+//! Tests of the options and results of a subscriber of one topic.
 
 mod fake;
 
@@ -8,7 +8,7 @@ use fake::{FakeHub, TestDomain, wait_until};
 use scanhub_client::{Error, ErrorKind, Scan, Subscriber, SubscriberBuilder, Telegram, Wait};
 use scanhub_schema::limits::MAX_BORROWED_SAMPLES;
 
-/// Timeout that is far longer than any step on a busy machine.
+/// Timeout that only a hang exceeds, even on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 #[test]

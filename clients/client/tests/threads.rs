@@ -1,4 +1,4 @@
-//! Tests of subscribers, samples and publications in other threads than the one that created them.
+//! Tests that use subscribers, samples and publications in other threads than the one that created them.
 
 mod fake;
 
@@ -14,7 +14,7 @@ use scanhub_client::{
 use scanhub_schema::limits::MAX_BORROWED_SAMPLES;
 use scanhub_shm::{LocalService, Payload, Role, Service, ThreadSafeService};
 
-/// Timeout that is far longer than any step on a busy machine.
+/// Timeout that only a hang exceeds, even on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 fn is_send<T: Send>() {}

@@ -21,7 +21,7 @@ use scanhub_shm::Domain;
 use tokio::io::unix::AsyncFd;
 use tokio::time::timeout;
 
-/// Timeout that is far longer than any step on a busy machine.
+/// Timeout that only a hang exceeds, even on a busy machine.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 fn scans(test_domain: &TestDomain) -> PollableSubscriber<Scan> {

@@ -11,7 +11,7 @@ use scanhub_schema::{Background, Marks, Topic, Zones};
 /// Hub, epoch, sensor, topic.
 type StreamKey = (u64, u32, u8, u8);
 
-/// A datagram with its content, whose numbers do not wrap.
+/// Content of a datagram, with numbers that do not wrap.
 #[derive(Clone)]
 struct SentDatagram {
     key: StreamKey,
@@ -54,7 +54,7 @@ struct ExpectedCounters {
     reordered: u64,
 }
 
-/// Table of gateways that keeps everything.
+/// Slow model of the table of gateways, which keeps all numbers.
 #[derive(Default)]
 struct TableModel {
     rows: BTreeMap<StreamKey, ExpectedCounters>,

@@ -70,12 +70,12 @@ fn zones() -> Vec<u8> {
     buffer[..len].to_vec()
 }
 
-/// Returns an announcement that is sent at `at_s`.
+/// Returns an announcement of three topics that is sent at `at_s`.
 fn announcement(epoch: u32, sequence: u32, at_s: u64, next: [u32; 3]) -> Vec<u8> {
     announcement_of(epoch, sequence, at_s, ANNOUNCED.into_iter().zip(next))
 }
 
-/// An announcement of topics and their next numbers that is sent at `at_s`.
+/// Returns an announcement of topics and their next numbers that is sent at `at_s`.
 fn announcement_of(
     epoch: u32,
     sequence: u32,
@@ -126,7 +126,7 @@ fn vector_list() -> String {
         &sealed_datagram(&key(), head(Topic::Marks, 0), &[0; 4]),
         "untimely",
     );
-    // Around the ends of the blocks of the hash: 48 bytes of the header come before.
+    // Lengths near the ends of the hash's blocks. The 48 bytes of the header are in front of the payload.
     for (sequence, len) in [6, 7, 8, 15, 16, 17, 71, 72, 814].into_iter().enumerate() {
         let head = Head { family: Family::Ld as u8, ..head(Topic::Telegram, sequence as u32) };
         let payload: Vec<u8> = (0..len).map(|at| at as u8).collect();
@@ -232,7 +232,7 @@ fn golden_datagram(name: &str) -> Vec<u8> {
     unhex(vector["bytes"].as_str().expect("bytes"))
 }
 
-/// The payload of the golden scan.
+/// Returns the payload of the golden scan.
 fn scan() -> Vec<u8> {
     golden_datagram("scan").split_off(HEADER_LEN)
 }

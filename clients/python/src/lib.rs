@@ -69,7 +69,7 @@ fn topic_names(
     Ok(py.detach(|| client::topics(&DomainOptions { domain, root }))?)
 }
 
-/// Sends a request to the hub, and returns the background model of its answer.
+/// Sends a request to the hub, and returns the background model in its reply, if it has one.
 #[pyfunction]
 #[pyo3(name = "_request")]
 fn request(
@@ -152,7 +152,7 @@ impl Publication {
         Ok(Publication(mount))
     }
 
-    /// Publishes that the mount was at `angle_rad` at `stamp_ns` of `time.monotonic_ns()`, by default now.
+    /// Publishes the angle of the mount at `stamp_ns` of `time.monotonic_ns()`, by default now.
     #[pyo3(signature = (angle_rad, *, rate_rad_s = None, stamp_ns = None))]
     fn send(
         &self,

@@ -217,7 +217,7 @@ follower! {
         Ok(RobotSubscriber { source: Arc::new(ForkSafeCell::new(verdicts)), timeout: None, notice: None })
     }
 
-    /// Returns what is known now. Never waits.
+    /// Returns the current verdict. Never waits.
     fn now(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let _reserved = self.source.reserve()?;
         let verdict = self.source.with(Verdicts::now).transpose()?;

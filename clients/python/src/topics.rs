@@ -281,7 +281,7 @@ getters! {
     zones: List<'py> = values(slf.py(), zones.zones().iter(), |zone| {
             value(slf.py(), "Zone", (zone.radius_mm, zone.violated == 1, zone.beams))
         });
-    /// Number of beams without a reading that see into the largest zone.
+    /// Number of beams without a reading that cross the largest zone.
     invalid_beams: u16 = zones.invalid_beams;
     /// Whether there were fewer scans than a violation requires.
     provisional: bool = zones.flags & client::Zones::PROVISIONAL != 0;

@@ -177,7 +177,7 @@ fn rejected_rate_is_logged_once_and_scanner_is_found() {
             let status = Status::open(&node, "a").expect("a topic").expect("is there");
             let status = Status::subscriber(&node, &status).expect("a subscriber");
             links[0].reject(&[500_000, 921_600, 256_000]);
-            // The bytes do not come from a scanner, for several rounds of the search.
+            // For several rounds of the search, the bytes are not from a scanner.
             for read in 1..=200 {
                 links[0].read(read * 50_000_000, &[0x55; 5]);
             }

@@ -1,4 +1,4 @@
-//! Fake hub without scanners: the lock, the topics, and the samples that a test publishes. Each one has its own domain,
+//! Fake hub: it holds the lock of a domain, and publishes the samples that a test sends. Each test has its own domain,
 //! which is removed at the end of the test.
 #![allow(dead_code)] // Every test file takes what it needs.
 
@@ -32,7 +32,7 @@ impl TestDomain {
     pub(crate) fn new() -> TestDomain {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let name = format!("c{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
-        // Do not use TMPDIR, because root and prefix of a domain must be short.
+        // The path in TMPDIR may be too long for the root of a domain.
         let directory = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
         let base = directory.path().to_owned();
         TestDomain { domain: Domain::at(&name, &base).unwrap(), base, _directory: directory }
@@ -54,7 +54,7 @@ impl Drop for TestDomain {
     }
 }
 
-/// Topic with its own sequence numbers.
+/// Publisher of a topic, with its sequence numbers.
 pub(crate) struct TopicPort<P: Payload + ?Sized> {
     pub(crate) service: TopicService<P>,
     pub(crate) publisher: Publisher<P>,
@@ -85,7 +85,7 @@ impl<P: Payload + ?Sized> TopicPort<P> {
     }
 }
 
-/// One sensor of the fake hub.
+/// Sensor of a fake hub.
 pub(crate) struct FakeSensor {
     pub(crate) telegram: TopicPort<[u8]>,
     pub(crate) scan: TopicPort<Scan>,
@@ -99,7 +99,7 @@ pub(crate) struct FakeSensor {
     /// Flags of the headers.
     pub(crate) flags: u8,
     pub(crate) seq: u64,
-    /// CLOCK_MONOTONIC at its first telegram, in ns. By default, it is long before any subscriber.
+    /// Stamp of its first telegram, in ns of CLOCK_MONOTONIC. By default, it is long before any subscriber.
     pub(crate) start_ns: u64,
     /// Period of the scans in us.
     pub(crate) period_us: u32,
@@ -239,7 +239,7 @@ impl FakeHub {
         &mut self.sensors[0]
     }
 
-    /// Sends the last status to new subscribers until `is_done` returns true.
+    /// Sends the last status to late joiners until `done` returns true.
     pub(crate) fn serve_history(&self, is_done: impl Fn() -> bool) {
         wait_until("history taken", || {
             for sensor in &self.sensors {
@@ -250,7 +250,7 @@ impl FakeHub {
     }
 }
 
-/// Verb that runs in its own thread, with its output.
+/// Verb that runs in its own thread, and its output so far.
 pub(crate) struct RunningVerb {
     pub(crate) out: OutputFile,
     pub(crate) notes: OutputFile,
@@ -277,7 +277,7 @@ impl RunningVerb {
         self.thread.is_finished()
     }
 
-    /// Waits for the end of the verb. Returns its result, its standard output and its standard error.
+    /// Waits for the end of the verb.
     pub(crate) fn join(self) -> (Result<(), Failure>, String, String) {
         wait_until("the verb's end", || self.thread.is_finished());
         (self.thread.join().unwrap(), self.out.text(), self.notes.text())
@@ -313,7 +313,7 @@ impl OutputFile {
     }
 }
 
-/// Waits until `is_done` returns true. The time limit is only reached if the test hangs.
+/// Waits until `done` returns true. Only a hang exceeds the limit.
 pub(crate) fn wait_until(description: &str, mut is_done: impl FnMut() -> bool) {
     let give_up_at = Instant::now() + Duration::from_secs(180);
     while !is_done() {

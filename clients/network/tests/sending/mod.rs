@@ -176,7 +176,7 @@ impl SendingMachine {
         of_sensors.fold(restart_at.min(announce_at), Nanos::min)
     }
 
-    /// Does what is due.
+    /// Performs all actions that are due.
     pub(crate) fn step(&mut self, now: Nanos, network: &mut Network) {
         if now >= self.hub.changes_at {
             self.switch_hub(now);

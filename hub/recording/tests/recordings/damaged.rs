@@ -152,8 +152,8 @@ fn resumes_at_next_chunk_after_impossible_length() {
         let last = 1 + 7;
         for (number, chunk) in whole.chunks.iter().enumerate() {
             let next = whole.chunks.get(number + 1).map_or(whole.bytes.len(), |next| next.start);
-            // The length of the chunk contradicts its fields; the length of the next record leads beyond the end of the file;
-            // no record has opcode 0.
+            // The length of the chunk contradicts its fields; the length of the next record leads beyond the end of the
+            // file; no record has opcode 0.
             for (start, at, is_chunk) in [
                 (chunk.start, chunk.start + 1, true),
                 (chunk.start, chunk.start + last, true),
@@ -380,7 +380,7 @@ fn file_without_its_beginning_is_refused() {
         assert!(failure.message.ends_with("is the end of an MCAP file, without its beginning"), "{failure}");
         assert_eq!(failure.kind.exit_code(), 66);
     }
-    // A piece without beginning and end: messages, or a chunk of which nothing can be read.
+    // A part from the middle of a file: messages, or a chunk that cannot be read.
     let packed = IntactRecording::new(20, Compression::Zstd);
     let middle =
         |whole: &IntactRecording| whole.bytes[whole.chunks[1].start + 40..whole.chunks[3].end].to_vec();
