@@ -307,7 +307,7 @@ mod tests {
         let expired_at = Instant::now().checked_sub(2 * LOCK_POLL_INTERVAL);
         (finder.checked_at, finder.queried_at) = (expired_at, expired_at);
         finder.note_ring();
-        assert_eq!(finder.check(), Change::default(), "nobody holds that place");
+        assert_eq!(finder.check(), Change::default(), "no process holds that location");
         assert!(finder.checked_at() > expired_at && finder.queried_at == expired_at);
         (finder.checked_at, finder.rang_at) = (expired_at, expired_at);
         assert_eq!(finder.check(), Change { ended: Some(DomainHolder::Hub), started: None });

@@ -401,7 +401,7 @@ mod tests {
     #[test]
     fn remote_sensors_yield_to_a_hub_but_not_vice_versa() {
         let mut source = RobotSource::new(&[]);
-        assert!(!source.switch_to_hub(Some(DomainHolder::Hub)), "nobody is followed yet");
+        assert!(!source.switch_to_hub(Some(DomainHolder::Hub)), "there is no sensor yet");
         source.origin = SensorOrigin::All(Some(DomainHolder::Listener));
         source.follow("robot1.front");
         source.is_complete = true;

@@ -359,7 +359,7 @@ mod tests {
     #[test]
     fn the_time_makes_it_readable_once() {
         let poll_descriptor = PollDescriptor::new().unwrap();
-        assert!(is_readable(&poll_descriptor, TEST_TIMEOUT), "nobody has looked yet");
+        assert!(is_readable(&poll_descriptor, TEST_TIMEOUT), "it was not checked yet");
         poll_descriptor.set_timer(Some(TEST_TIMEOUT)).unwrap();
         assert!(!is_readable(&poll_descriptor, Duration::ZERO));
         poll_descriptor.set_timer(Some(Duration::from_millis(1))).unwrap();

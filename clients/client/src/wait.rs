@@ -377,7 +377,7 @@ mod tests {
         let started = Instant::now();
         drop(first);
         wakeups.wait(&node, TEST_TIMEOUT).unwrap();
-        assert!(wakeups.sensors[0].doorbell.is_none(), "nobody rings it any more");
+        assert!(wakeups.sensors[0].doorbell.is_none(), "its hub has ended");
         wakeups.wait(&node, Duration::ZERO).unwrap();
         let second = WakeSender::new(&hub, "front").unwrap();
         wakeups.wait(&node, TEST_TIMEOUT).unwrap();

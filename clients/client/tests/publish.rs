@@ -1,4 +1,4 @@
-//! Tests of topics that a program publishes. Programs subscribe to them like to a hub's topics, with and without a hub.
+//! Tests of topics that a program publishes. Subscribers receive them like topics of a hub, with and without a hub.
 
 mod fake;
 
@@ -59,7 +59,7 @@ fn publishes_without_a_hub_and_skips_count_as_missed() {
         assert!(sample.header().stamp_first_ns >= before_ns && sample.header().quality == 0);
         drop((session, near));
     }
-    assert_eq!(publisher_pid(test_domain.domain.root()), Ok(None), "the domain is held by nobody");
+    assert_eq!(publisher_pid(test_domain.domain.root()), Ok(None), "no process holds the domain");
 }
 
 /// `send_with` wakes no program. A subscriber sleeps until `wake`, which the program calls once for several samples.
@@ -103,7 +103,7 @@ fn another_life_begins_again() {
     assert_eq!(next_sample(&mut subscriber), (0, false, 0, 1));
     drop(near);
     let mut near = open();
-    // The subscriber must find the topic first.
+    // The subscriber must find the publisher first.
     wait_until("the consumer", || {
         let _ = subscriber.try_next().unwrap();
         near.subscribers() == 1
@@ -187,7 +187,7 @@ fn named_programs_publish_with_and_without_a_hub() {
     let house = open_named("house").unwrap();
     let mut tracks = house.topic::<Tracks>().unwrap();
     let mut yard = open_named("yard").unwrap().topic::<Event>().unwrap();
-    assert_eq!(publisher_pid(test_domain.domain.root()), Ok(None), "nobody holds the domain");
+    assert_eq!(publisher_pid(test_domain.domain.root()), Ok(None), "no process holds the domain any more");
     let again = open_named("house").map(drop).unwrap_err();
     assert_eq!(again.kind(), ErrorKind::NameHeld);
     let held = |name: &str| format!("the name {name} is published by process {} (", std::process::id());

@@ -230,7 +230,7 @@ mod tests {
             assert_eq!(
                 send(&mut senders, from, boot, 60_000),
                 SenderMatch::Twin,
-                "nobody stands in for the first one"
+                "no sender replaces the first one"
             );
         }
         assert_eq!(
