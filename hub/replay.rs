@@ -38,10 +38,10 @@ pub(crate) struct Replay {
     /// Speed relative to the recording, 0.015625 to 64, or max: as fast as it can be read
     #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = parse_rate)]
     rate: PlaybackRate,
-    /// Start again at the end, until Ctrl-C; each lap forgets what was learned
+    /// Start again at the end, until Ctrl-C. Each pass discards what the hub has learned
     #[arg(long = "loop", conflicts_with = "hold")]
     is_looped: bool,
-    /// Start publishing here, for example 90s; the part before it is only learned from
+    /// Start publishing here, for example 90s. The hub only learns from the part before it
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     start: Option<Duration>,
     /// Stop publishing here

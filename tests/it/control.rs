@@ -97,7 +97,7 @@ fn absent_sensor_can_be_paused_before_it_appears() {
     let refused = control(&env, "front", "resync");
     let error = &refused.of_class("error")[0];
     assert_eq!((refused.exit_code, &error["kind"]), (Some(1), &"failed".into()), "{refused}");
-    assert_eq!(error["message"], "front: the port is away");
+    assert_eq!(error["message"], "front: the port is unavailable");
     let simulator = env.simulator(&["front"], &["--seed=33", "--baud=500000"]);
     await_state(&env, "front", "paused");
     // The scanner is disconnected and connected again.

@@ -105,7 +105,7 @@ fn hub_out_of_descriptors_keeps_serving_subscribers() {
     let refused = env.run(&["control", "front", "resync", "--json"]);
     let error = &refused.of_class("error")[0];
     assert_eq!((refused.exit_code, &error["kind"]), (Some(3), &"timeout".into()), "{refused}");
-    assert_eq!(error["message"], "the hub did not answer for front in 5 s");
+    assert_eq!(error["message"], "the hub did not reply for front in 5 s");
     for other in others {
         assert_eq!(other.end(INT).exit_code, Some(0));
     }

@@ -256,7 +256,7 @@ fn ignores_configured_links_that_were_not_recorded() {
     assert_eq!(env.info("front")["pose"]["x_m"], 0.25);
     let outcome = player.end(INT);
     assert_eq!(outcome.of_class("ready")[0]["sensors"], Value::from(vec!["front"]));
-    assert!(outcome.stderr.contains("rear: not in the recording, left out"), "{outcome}");
+    assert!(outcome.stderr.contains("rear: not in the recording, ignored"), "{outcome}");
 }
 
 #[test]

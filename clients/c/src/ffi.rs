@@ -57,7 +57,7 @@ pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallEr
     // SAFETY: the address is not NULL, and the header requires a text that ends with 0 and does not change during the
     // call. No caller in this crate keeps the text longer.
     let text = unsafe { CStr::from_ptr(address) };
-    let not_text = CallError::Argument("a name is not UTF-8", "names are made of a-z, 0-9, _ and -");
+    let not_text = CallError::Argument("a name is not UTF-8", "names consist of a-z, 0-9, _ and -");
     text.to_str().map(Some).map_err(|_| not_text)
 }
 
@@ -106,7 +106,10 @@ fn check<T>(address: *mut T) -> Result<(), CallError> {
     }
     match address.is_aligned() {
         true => Ok(()),
-        false => Err(CallError::Argument("an address is not aligned", "give that of a variable of the type")),
+        false => Err(CallError::Argument(
+            "an address is not aligned",
+            "give the address of a variable of the type",
+        )),
     }
 }
 

@@ -79,7 +79,7 @@ impl<T: Subscribe + ?Sized> Port<T> {
         match self {
             Port::Pollable(pollable) => Ok(pollable.as_raw_fd()),
             Port::Sleeping(_) => {
-                let hint = "make it wait by event: a bell has no descriptor";
+                let hint = "open it with SCANHUB_WAIT_EVENT: only then is there a descriptor";
                 Err(Failure::new(Kind::Configuration, "no descriptor to wait on", hint).into())
             }
         }
@@ -456,5 +456,5 @@ pub(crate) fn remove<T: Any>(handle: *mut Opaque) -> Result<(), CallError> {
 
 const UNKNOWN_HANDLE: CallError = CallError::Argument(
     "this thread has no such handle",
-    "a handle is used from when it was opened until it is closed, by the thread that opened it; a child opens its own",
+    "use a handle only until it is closed, and only in the thread that opened it; a child opens its own",
 );

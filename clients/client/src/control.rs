@@ -85,9 +85,9 @@ fn send_request(
         }
         if Instant::now() >= deadline {
             let message =
-                format!("the hub did not answer for {} in {} s", request.sensor, RESPONSE_TIMEOUT.as_secs());
+                format!("the hub did not reply for {} in {} s", request.sensor, RESPONSE_TIMEOUT.as_secs());
             let hint = format!(
-                "its log says whether something is short; `scanhub info {}` shows its state",
+                "its log says whether it lacks a resource; `scanhub info {}` shows its state",
                 request.sensor
             );
             return Err(Error::new(Kind::Timeout, message, hint));

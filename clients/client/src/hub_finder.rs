@@ -237,7 +237,7 @@ fn no_hub(
         None => {
             let roots: Vec<_> =
                 locations.iter().map(|location| location.root().display().to_string()).collect();
-            hints.push(format!("start one with `scanhub run`; looked at {}", roots.join(", ")));
+            hints.push(format!("start one with `scanhub run`; searched {}", roots.join(", ")));
         }
     }
     Failure::new(Kind::NoHub, message, hints.join("; "))
@@ -341,7 +341,7 @@ mod tests {
         };
         let (message, hint) = failure_text(&hubs(&[]), None);
         assert_eq!(message, "no hub in domain scanhub");
-        assert!(hint.starts_with("start one with `scanhub run`; looked at /run/scanhub/scanhub, "), "{hint}");
+        assert!(hint.starts_with("start one with `scanhub run`; searched /run/scanhub/scanhub, "), "{hint}");
 
         let (message, hint) = failure_text(&hubs(&[(7, 0, "run")]), None);
         assert_eq!(message, "no hub of this user in domain scanhub");

@@ -109,7 +109,7 @@ impl GatewayArgs {
     fn selection(&self) -> Result<Selection, Failure> {
         let selection = Selection::parse(&self.topics, self.bare)?;
         if self.bare && self.background_every.is_some() {
-            let what = "no background is sent where only telegrams are";
+            let what = "background_every is set, but bare sends only telegrams";
             return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every out"));
         }
         if self.bare && self.key_file.is_some() {
@@ -301,7 +301,9 @@ impl<'a> Report<'a> {
         let Some(Groups { interface, .. }) = &network.destinations.groups else { return Ok(()) };
         match interface.is_up() {
             true => self.link(interface.name(), "up", None),
-            false => self.link(interface.name(), "down", Some("no carrier, no IPv4 address, or not there")),
+            false => {
+                self.link(interface.name(), "down", Some("no carrier, no IPv4 address, or no such interface"))
+            }
         }
     }
 
@@ -482,8 +484,7 @@ struct LinkJson<'a> {
 }
 
 /// Reason for which a gateway has another number than the stored one.
-const RENUMBERED_REASON: &str =
-    "a new number, because the one that is kept here was drawn on another machine";
+const RENUMBERED_REASON: &str = "a new number, because the saved one belongs to another machine";
 /// Note of a gateway without a key.
 const NO_KEY_NOTE: &str = "receivers cannot know who sends; see `scanhub key new` and --key-file";
 /// Moves the cursor to the start of the line, and clears it (ECMA-48).

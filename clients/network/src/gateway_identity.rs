@@ -43,7 +43,7 @@ impl GatewayIdentity {
         machine: Option<u64>,
     ) -> Result<GatewayIdentity, Failure> {
         let unkept = |failure: Failure| {
-            let message = format!("cannot keep the gateway's number: {}", failure.message);
+            let message = format!("cannot save the gateway's number: {}", failure.message);
             Failure { kind: Kind::Output, message, ..failure }
         };
         let state_directory = Directory::create_state(directory, 1).map_err(unkept)?;
@@ -125,7 +125,7 @@ impl StoredIdentity {
 /// Returns [`Kind::Configuration`] if the environment names none.
 fn directory() -> Result<PathBuf, Failure> {
     StateDirectory::base().ok_or_else(|| {
-        let what = "no place for the gateway's number: neither XDG_STATE_HOME nor HOME is set";
+        let what = "no directory for the gateway's number: neither XDG_STATE_HOME nor HOME is set";
         Failure::new(Kind::Configuration, what, "set XDG_STATE_HOME to a directory that can be written")
     })
 }

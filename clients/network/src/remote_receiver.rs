@@ -101,7 +101,7 @@ const OTHER_VERSION: &str =
 const NEWER_TOPIC: &str = "samples of topics that this version does not know were left out: install the same version of \
                            scanhub on both machines";
 const NO_ROOM: &str = "samples of remote sensors were not published, because these need more shared memory than --memory \
-                       allows: use a greater --memory; if someone invents sensors, use --key-file, or --hub to receive only \
+                       allows: use a greater --memory; if a machine invents sensors, use --key-file, or --hub to receive only \
                        those that it names";
 const CLOCK_AHEAD: &str = "a gateway with the right key was refused because its clock is more than 5 s ahead of this \
                            machine's: synchronize the clocks";

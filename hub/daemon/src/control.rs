@@ -202,7 +202,7 @@ impl ControlServer {
     fn reply(&self, incoming: IncomingRequest, outcome: Outcome) {
         let response = Response(outcome.map(|shown| shown.map(|shown| *shown)));
         if let Err(failure) = self.server.respond(incoming, &response) {
-            tracing::debug!(%failure, "a client was not answered");
+            tracing::debug!(%failure, "a reply did not reach its client");
         }
     }
 }
@@ -255,7 +255,9 @@ impl ControlQueue {
                 }
                 return Ok(());
             }
-            PauseTarget::NoPort if control == Control::Resync => return Err(self.refusal("the port is away")),
+            PauseTarget::NoPort if control == Control::Resync => {
+                return Err(self.refusal("the port is unavailable"));
+            }
             PauseTarget::NoPort => {}
             PauseTarget::Session(session) => session.control(control, now),
         }

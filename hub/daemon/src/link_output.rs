@@ -436,7 +436,7 @@ fn log_reset(link: &str, reason: BackgroundReset) {
 
 #[cold]
 fn log_blind(link: &str) {
-    tracing::warn!("{link}: zones unknown: too few beams see into the largest circle");
+    tracing::warn!("{link}: zones unknown: too few beams with a reading cross the largest zone");
 }
 
 /// Writes `raw` into `scan`, which is reallocated once if it is too short.

@@ -52,7 +52,7 @@ pub fn replay(
     let (links, missing_names) =
         (set.config.links.len(), links_without_sensor(sources, &set.sensors, &set.config)?);
     for name in missing_names {
-        tracing::info!("{name}: not in the recording, left out");
+        tracing::info!("{name}: not in the recording, ignored");
     }
     let mounts = match set.origin {
         Some(origin) => mounts(&set.recording, replay.sensor, origin, &set.config)?,
@@ -206,7 +206,9 @@ fn mounts(
         let is_taken = config.links.iter().any(|link| link.name == name)
             || mounts.iter().any(|mount| mount.name() == name);
         if is_taken {
-            tracing::warn!("the angles of mount {recorded} are not played: something else is called {name}");
+            tracing::warn!(
+                "the angles of mount {recorded} are not played: a link or another mount has the name {name}"
+            );
             continue;
         }
         mounts.push(RecordedMount::new(&recorded, name, recording, origin));

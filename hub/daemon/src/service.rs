@@ -24,7 +24,7 @@ impl Service {
     /// opened.
     pub(crate) fn of_process() -> Service {
         let passed = sd_listen_fds::get().unwrap_or_else(|error| {
-            tracing::warn!(%error, "ports that the service manager kept cannot be taken over");
+            tracing::warn!(%error, "ports that the service manager kept cannot be used");
             Vec::new()
         });
         let named = passed.into_iter().filter_map(|(name, line)| Some((name?, line.into_std())));

@@ -261,7 +261,7 @@ impl Platform for System<'_> {
         let slots = medium.subscriber_capacity();
         if slots < max_subscribers {
             tracing::warn!(
-                "{sensor}/{topic} has places for {slots} subscribers, not for {max_subscribers}: those of an earlier hub keep it; stop \
+                "{sensor}/{topic} has slots for {slots} subscribers, not for {max_subscribers}: those of an earlier hub keep it; stop \
                  them, then start the hub again"
             );
         }

@@ -472,7 +472,7 @@ impl Output {
         }
         let id = |path: &Path| path.metadata().map(|metadata| (metadata.dev(), metadata.ino())).ok();
         if id(path).is_some_and(|output| id(input) == Some(output)) {
-            let hint = "write into another file, look at it, and then replace the first one";
+            let hint = "write into another file, check it, and then replace the first one";
             let message = format!("{} is both read and written", path.display());
             return Err(Failure::new(Kind::Output, message, hint));
         }

@@ -103,7 +103,7 @@ impl ConfigureArgs {
         let rate = if let PortSpec::Tcp { .. } = source { None } else { Some(first) };
         let inquiry = Inquiry::begin(rate, clock::now());
         let report = request_report(&port, first, inquiry, (&source, true), stop, |rate| {
-            progress.show(&format!("looking at {rate} Bd"))
+            progress.show(&format!("trying {rate} Bd"))
         })?;
         let name = source.name();
         let Some(mut plan) = Plan::from_report(&report) else {
@@ -384,7 +384,7 @@ fn failure(port: &str, plan: &Plan, outcome: &Outcome, step: Step, failing: Chan
     }
     let eeprom_state = match outcome.configuration {
         _ if !outcome.written => "nothing was written".into(),
-        None => format!("the settings in the EEPROM are not known now; before: {}", hex(plan.old.bytes())),
+        None => format!("the settings in the EEPROM are unknown; before: {}", hex(plan.old.bytes())),
         Some(kept) if kept == plan.old && plan.old != plan.new => {
             "the EEPROM has the old configuration".into()
         }

@@ -152,7 +152,7 @@ pub(crate) fn detect(
     let Detection { packets, period, points_per_second, introduction, .. } = detection;
     let is_error = |introduction: &DeviceInfo| introduction.condition == HealthStatus::Error;
     if packets == 0 && introduction.as_ref().is_some_and(|introduction| !is_error(introduction)) {
-        problem.get_or_insert_with(|| "it answers, but does not begin to measure".to_owned());
+        problem.get_or_insert_with(|| "it replies, but does not start to measure".to_owned());
     }
     let (stats, model) = (session.stats(), session.model());
     let model_text = session.model_text().map(|text| text.to_lowercase());

@@ -65,7 +65,7 @@ impl ProbeArgs {
         let locations = locations()?;
         let mut progress = Progress::on_stderr();
         let found =
-            probe(&source(port)?, &locations, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
+            probe(&source(port)?, &locations, stop, |rate| progress.show(&format!("trying {rate} Bd")));
         if found.is_err() {
             progress.keep_text();
         }

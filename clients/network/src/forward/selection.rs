@@ -107,21 +107,21 @@ impl Entry {
             None => (text, NonZeroU64::MIN),
             Some((name, every)) => {
                 let every = every.strip_prefix("every=").and_then(|number| number.parse().ok());
-                (name, every.ok_or_else(|| refuse(text, "cannot be thinned so", EVERY_FORM))?)
+                (name, every.ok_or_else(|| refuse(text, "has an invalid thinning factor", EVERY_FORM))?)
             }
         };
         let pattern = TopicPattern::parse(name)?;
         if pattern.sensor.as_deref() == Some(ROBOT) {
-            return Err(refuse(text, "is a fold", "*/zones sends the zones of each sensor"));
+            return Err(refuse(text, "is a combined verdict", "*/zones sends the zones of each sensor"));
         }
         if pattern.sensor.as_deref().is_some_and(is_remote) {
             let hint = "a gateway sends what the hub of its own machine publishes";
-            return Err(refuse(text, "is another machine's", hint));
+            return Err(refuse(text, "belongs to another machine", hint));
         }
         if every > NonZeroU64::MIN
             && pattern.topic.is_none_or(|topic| topic.spec().publish_rate != PublishRate::Scan)
         {
-            return Err(refuse(text, "is not only of each telegram, and cannot be thinned", name));
+            return Err(refuse(text, "cannot be thinned: it is not published once per scan", name));
         }
         Ok(Entry { pattern, every })
     }

@@ -451,7 +451,7 @@ impl<'a> PublishedJson<'a> {
     fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
         let PublishedJson { unnamed, unannounced, late, capacity, shortage, .. } = self;
         let PublishedJson { unproven, no_room, loan_failed, .. } = self;
-        write!(line, "published: {}; left out: {unnamed} unnamed, ", self.sensors.join(", "))?;
+        write!(line, "published: {}; not published: {unnamed} unnamed, ", self.sensors.join(", "))?;
         write!(line, "{unproven} in a gateway's first second, ")?;
         write!(line, "{unannounced} unannounced, {late} late, {capacity} beyond capacity, ")?;
         write!(line, "{no_room} beyond --memory, {shortage} for lack of room, {loan_failed} without memory")

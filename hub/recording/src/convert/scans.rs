@@ -154,7 +154,8 @@ impl Sensor {
             return Ok(());
         }
         let message = format!("{} does not contain the measuring mode of {name}", recording.path().display());
-        let hint = "set it with --mode, such as --mode 0x01; `scanhub doctor PORT` asks the sensor for it";
+        let hint =
+            "set it with --mode, such as --mode 0x01; `scanhub doctor PORT` requests it from the scanner";
         Err(Failure::new(Kind::Configuration, message, hint))
     }
 

@@ -247,7 +247,7 @@ pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
         }
         Ok(VersionMatch::Other(None)) => "a program that does not report its version".to_owned(),
         Err(error) if error.kind() == ErrorKind::NotFound => {
-            let text = format!("{at} starts {}, which is not there", program.display());
+            let text = format!("{at} starts {}, which does not exist", program.display());
             return Finding::failed(NAME, text, INSTALL_REMEDY);
         }
         // A program that only root can read is not a problem.
@@ -494,7 +494,7 @@ mod tests {
             "etc/systemd/system/scanhub.service.d/own.conf",
             "[Service]\nExecStart=\nExecStart=-/opt/scanhub run\n",
         );
-        assert!(of(None).finding.contains("/opt/scanhub, which is not there"), "{}", of(None));
+        assert!(of(None).finding.contains("/opt/scanhub, which does not exist"), "{}", of(None));
         fs::remove_file(temp.path("etc/systemd/system/scanhub.service")).unwrap();
         temp.link("/dev/null", "etc/systemd/system/scanhub.service");
         assert!(of(None).finding.contains("masked"), "{}", of(None));

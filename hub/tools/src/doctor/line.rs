@@ -376,10 +376,10 @@ fn line_loss(status: &Status) -> Finding {
     let all = match status.lost_on_line() {
         // Damaged scans are lost, too, but too few arrive to count them.
         Some(0) if is_mostly_damaged(status) => {
-            format!("how many {} are lost is not known", status.transmission_name())
+            format!("the number of lost {} is unknown", status.transmission_name())
         }
         Some(lost) => format!("{lost} of {due} {} lost since the hub's start", status.transmission_name()),
-        None => format!("how many {} are lost is not known", status.transmission_name()),
+        None => format!("the number of lost {} is unknown", status.transmission_name()),
     };
     let text =
         format!("{:.2} % of the bytes damaged in the last 10 s, {all}", 100.0 * status.damaged_share());

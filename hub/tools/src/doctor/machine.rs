@@ -236,7 +236,7 @@ pub(crate) fn domain(state: &MachineState) -> Finding {
             let links = state.links_without_status.join(", ");
             let text =
                 format!("{root}: the hub, process {pid}, does not publish: no status of {links} arrived");
-            return Finding::failed(NAME, text, format!("look at its log, then restart it: kill {pid}"));
+            return Finding::failed(NAME, text, format!("read its log, then restart it: kill {pid}"));
         }
         Ok(Some(pid)) => return Finding::ok(NAME, format!("{root}: a hub runs, process {pid}")),
         Ok(None) => {}
@@ -246,12 +246,12 @@ pub(crate) fn domain(state: &MachineState) -> Finding {
             Finding::ok(NAME, format!("{root}: does not exist yet, can be created"))
         } else {
             let text = format!("{root} cannot be created: nothing can be created in {at}");
-            Finding::failed(NAME, text, "name another place with --root")
+            Finding::failed(NAME, text, "name another directory with --root")
         };
     }
     if !directory.writable {
         let text = format!("{at}: nothing can be created there, mode {:04o}", directory.mode);
-        return Finding::failed(NAME, text, format!("chmod 700 {at}, or name another place with --root"));
+        return Finding::failed(NAME, text, format!("chmod 700 {at}, or name another directory with --root"));
     }
     Finding::ok(NAME, format!("{root}: free, yours, mode {:04o}", directory.mode))
 }

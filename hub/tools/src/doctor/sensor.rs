@@ -213,7 +213,7 @@ pub(crate) fn check_rotating(scanner: &DetectedScanner, link: Option<&Link>) -> 
     findings.push(loss(scanner));
     let is_reported = scanner.introduction.is_some();
     if scanner.is_unreliable() && !is_reported {
-        let why = "not judged: the line damages most bytes";
+        let why = "not checked: the line damages most bytes";
         findings.extend(["settings", "health"].map(|name| Finding::skipped(name, why)));
         return findings;
     }
@@ -248,9 +248,13 @@ fn model(scanner: &DetectedScanner, link: Option<&Link>) -> Finding {
     const NAME: &str = "settings";
     let text = match (&scanner.introduction, scanner.model) {
         (None, _) => {
-            format!("{:.0} points a second, {:.0} in a turn", scanner.points_per_second, scanner.points())
+            format!(
+                "{:.0} points a second, {:.0} per revolution",
+                scanner.points_per_second,
+                scanner.points()
+            )
         }
-        (Some(_), Some(model)) => format!("up to {} points in a turn", model.beams),
+        (Some(_), Some(model)) => format!("up to {} points per revolution", model.beams),
         (Some(_), None) => "a model that this version does not have".to_owned(),
     };
     let Some((model, link)) = scanner.model.zip(link) else { return Finding::ok(NAME, text) };
@@ -300,7 +304,7 @@ fn loss(scanner: &DetectedScanner) -> Finding {
     }
     let packets = match lost {
         // Damaged packets are lost, too, but too few arrive to count them.
-        0 if scanner.is_unreliable() => "how many packets are lost is not known".to_owned(),
+        0 if scanner.is_unreliable() => "the number of lost packets is unknown".to_owned(),
         lost => format!("{lost} of {} packets lost", scanner.stats.due),
     };
     let text = format!("{damaged:.1} % of the bytes damaged, {packets}");
@@ -557,7 +561,7 @@ mod tests {
         let most = DetectedScanner { stats: account, ..still };
         assert_eq!(said(&most), unreliable);
         let text = check_rotating(&most, None)[1].to_string();
-        assert!(text.contains("how many packets are lost is not known"), "{text}");
+        assert!(text.contains("the number of lost packets is unknown"), "{text}");
     }
 
     #[test]

@@ -150,7 +150,7 @@ impl fmt::Display for Description {
         };
         let (kind, number) = (self.kind.as_deref(), self.number.as_deref());
         row("family", Some(self.family.to_owned()))?;
-        row("type", kind.map(|kind| format!("{kind}, number {}", number.unwrap_or("not told"))))?;
+        row("type", kind.map(|kind| format!("{kind}, number {}", number.unwrap_or("not reported"))))?;
         row("firmware", self.firmware.clone())?;
         row("rate", self.baud.map(|baud| format!("{baud} Bd")))?;
         let power_on = |permanent| if permanent { "as set in its EEPROM, not 9600 Bd" } else { "9600 Bd" };
