@@ -222,7 +222,7 @@ fn people_are_followed_from_room_to_room_in_the_house() {
     });
     check_summaries(&outcome, &["hall", "hall-door", "kitchen", "kitchen-door"]);
     let refused = demo(&["--world", "house", "--family", "mixed", "--headless"], Program::wait);
-    assert!(refused.exit_code == Some(2) && refused.stderr.contains("one family"), "{refused}");
+    assert!(refused.exit_code == Some(2) && refused.stderr.contains("the same family"), "{refused}");
 }
 
 #[test]

@@ -243,7 +243,11 @@ fn refuses_recordings_of_another_family() {
         "set link.front.family = \"ld\"",
     );
     let outcome = env.run(&["convert", &recording, &env.path_argument("x.log")]);
-    assert_eq!((outcome.exit_code, outcome.stderr.contains("no place")), (Some(66), true), "{outcome}");
+    assert_eq!(
+        (outcome.exit_code, outcome.stderr.contains("cannot contain its scans")),
+        (Some(66), true),
+        "{outcome}"
+    );
     let outcome = env.run(&["telegram", "decode", &recording]);
     assert_eq!((outcome.exit_code, outcome.stderr.contains("of family ld")), (Some(66), true), "{outcome}");
     let port = format!("--port={}", env.path_argument("other"));

@@ -82,7 +82,7 @@ static void handles(const char *sensor)
     MUST(scanhub_close((struct scanhub_attachment *)&on_the_stack) == SCANHUB_REFUSED_ARGUMENT);
     MUST(scanhub_close(NULL) == 0);
     MUST(scanhub_fd(handle) == SCANHUB_REFUSED_CONFIGURATION);
-    SAYS("by event");
+    SAYS("SCANHUB_WAIT_EVENT");
     MUST(scanhub_take(handle, NULL) == SCANHUB_REFUSED_ARGUMENT);
     MUST(scanhub_take(handle, (struct scanhub_sample *)((char *)&handle + 1)) == SCANHUB_REFUSED_ARGUMENT);
     SAYS("aligned");
@@ -196,14 +196,14 @@ static void *elsewhere(void *handle)
 {
     MUST(strcmp(scanhub_error(), "") == 0);
     refused_as_a_handle(handle);
-    SAYS("by the thread that opened it");
+    SAYS("in the thread that opened it");
     return NULL;
 }
 
 static void *releases(void *sample)
 {
     MUST(scanhub_release(sample) == SCANHUB_REFUSED_ARGUMENT);
-    SAYS("by the thread that opened it");
+    SAYS("in the thread that opened it");
     return NULL;
 }
 
