@@ -525,7 +525,7 @@ mod tests {
         status.counters[Counter::LostOnLine] = 0;
         status.counters[Counter::LostPpm] = 0;
         let unknown = line_loss(&status).finding;
-        assert!(unknown.ends_with("how many scans are lost is not known"), "{unknown}");
+        assert!(unknown.ends_with("the number of lost scans is unknown"), "{unknown}");
         for word in ["cable", "FIFO", "adapter", "termination"] {
             assert!(now.remedy.contains(word), "{now}");
         }
