@@ -78,7 +78,7 @@ if [ "$action" = remove ]; then
 fi
 
 if [ ! -f "$library/libscanhub.so" ]; then
-    echo "install.sh: there is no $library/libscanhub.so; cargo build --release -p scanhub-c" >&2
+    echo "install.sh: $library/libscanhub.so does not exist; run cargo build --release -p scanhub-c" >&2
     exit 1
 fi
 put "$library/libscanhub.so" lib/libscanhub.so."$version" 755

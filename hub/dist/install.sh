@@ -26,7 +26,7 @@ while [ $# -gt 0 ]; do
 done
 root=${DESTDIR:-}
 if [ -z "$root" ] && [ "$(id -u)" != 0 ]; then
-    echo "install.sh: it takes root to install a service: sudo $0" >&2
+    echo "install.sh: only root can install a service: sudo $0" >&2
     exit 1
 fi
 
@@ -96,12 +96,12 @@ if [ "$action" = remove ]; then
     take_generated
     if runs; then systemctl daemon-reload; fi
     udev
-    echo "what is left: the user scanhub, /etc/scanhub, /var/lib/scanhub"
+    echo "not removed: the user scanhub, /etc/scanhub, /var/lib/scanhub"
     exit 0
 fi
 
 if [ ! -f "$program" ]; then
-    echo "install.sh: there is no $program: cargo build --release, or --program FILE" >&2
+    echo "install.sh: $program does not exist: run cargo build --release, or use --program FILE" >&2
     exit 1
 fi
 each put

@@ -42,7 +42,7 @@ extern "C" {
 #define SCANHUB_REFUSED_ARGUMENT (-1)      /* NULL, an unknown handle or number, a fifth sample */
 #define SCANHUB_REFUSED_CONFIGURATION (-2) /* an invalid name, a descriptor without SCANHUB_WAIT_EVENT */
 #define SCANHUB_REFUSED_SHORT (-3)         /* no memory, descriptor or subscriber slot is left: try later */
-#define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, a taken name, or another reason */
+#define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, a taken name, or other */
 #define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
 
 /* Methods of scanhub_wait. */
