@@ -100,8 +100,8 @@ fn segments_are_those_of_the_formula() {
             assert_eq!(Some(segment.nearest), beams.iter().map(|beam| beam.1).min());
             let points = || beams.iter().map(|&(i, range)| point(&scan, &pose, i, range));
             let mean = |part: fn((f64, f64)) -> f64| points().map(part).sum::<f64>() / beams.len() as f64;
-            let width = distance(point(&scan, &pose, first, a), point(&scan, &pose, last, b))
-                / f64::from(unit_mm);
+            let width =
+                distance(point(&scan, &pose, first, a), point(&scan, &pose, last, b)) / f64::from(unit_mm);
             for (reported, exact) in [
                 (f64::from(segment.width), width),
                 (f64::from(segment.x_mm), mean(|point| point.0)),
@@ -156,8 +156,7 @@ fn several_beams_or_the_scan_before_support_a_segment() {
             let points: Vec<_> = ranges.iter().map(|&(i, range)| point(&scan, &pose, i, range)).collect();
             for (i, segment) in out.segments().iter().enumerate() {
                 let beam = ranges.iter().position(|&(beam, _)| beam == usize::from(segment.first)).unwrap();
-                let nearest_mm =
-                    before.iter().map(|&other| distance(points[beam], other)).reduce(f64::min);
+                let nearest_mm = before.iter().map(|&other| distance(points[beam], other)).reduce(f64::min);
                 let is_near = nearest_mm.is_some_and(|nearest_mm| nearest_mm < 300.0);
                 // The two versions compute sine and cosine differently, so skip distances at the limit.
                 if nearest_mm.is_some_and(|nearest_mm| (nearest_mm - 300.0).abs() < 1e-6) {
