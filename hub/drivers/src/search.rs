@@ -842,8 +842,7 @@ const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
 const BOOT_MESSAGE_TIME: Nanos = 60 * MILLIS;
 /// Interval at which the search checks whether a transmission that has begun is complete.
 const EXTENSION_INTERVAL: Nanos = 20 * MILLIS;
-/// Maximum time before its earliest sending time at which the search passes a byte to the driver. The driver waits for
-/// the remaining time.
+/// Maximum time by which the search passes a byte to the driver before the driver may send it.
 const TRANSMIT_AHEAD: Nanos = 5 * MILLIS;
 /// Number of times that the search sends a request again because its reply may have been damaged.
 const MAX_RETRIES: u8 = 2;

@@ -75,9 +75,9 @@ impl ReadLog {
         self.earliest_in_read(n, offset, timing)
     }
 
-    /// Returns the [`earliest`](Self::earliest) arrival time of the byte at `offset`. Bytes are missing before this byte,
-    /// and it does not belong to the end of a backlog. If a full tty had a backlog, and almost no bytes follow this
-    /// byte, its time is known: it arrived when the tty had space again, or shortly before.
+    /// Returns the [`earliest`](Self::earliest) arrival time of the byte at `offset`. Bytes are missing before this
+    /// byte, and it does not belong to the end of a backlog. If a full tty had a backlog, and almost no bytes follow
+    /// this byte, its time is known: it arrived when the tty had space again, or shortly before.
     pub fn earliest_after_gap(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         let n = self.read_containing(offset)?;
         self.earliest_in_read(n, offset, timing).or_else(|| {

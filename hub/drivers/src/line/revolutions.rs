@@ -125,7 +125,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         Some(self.close(open, open.first?, rate.revolution_ns()))
     }
 
-    /// Returns the points of `revolution`, which is the last complete one or the one that is being measured.
+    /// Returns the points of `revolution`, which is the last complete revolution or the first open one.
     pub fn points(&self, revolution: &ClosedRevolution) -> &[Point] {
         &self.points[revolution.points][..revolution.len]
     }
@@ -230,7 +230,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         None
     }
 
-    /// Returns the first open revolution as a complete one that began at `first` and takes `period` nanoseconds.
+    /// Converts the first open revolution to a complete revolution. It began at `first` and takes `period` nanoseconds.
     fn close(&self, open: &OpenRevolution, first: f64, period: f64) -> ClosedRevolution {
         ClosedRevolution {
             number: self.serial,

@@ -249,7 +249,7 @@ pub trait ScannerSession: Protocol {
         }
     }
 
-    /// Adds the counters of this session to `counters`, which contain those of earlier sessions.
+    /// Adds the counters of this session to `counters`, which contains the counters of earlier sessions.
     fn add_counters(&self, counters: &mut Counters) {
         self.stats().add_to(counters);
     }
@@ -440,7 +440,7 @@ pub struct SessionStats {
 }
 
 impl SessionStats {
-    /// Adds these counters to `counters`, which contain those of earlier sessions.
+    /// Adds these counters to `counters`, which contains the counters of earlier sessions.
     pub fn add_to(&self, counters: &mut Counters) {
         counters[Counter::BytesRead] += self.read;
         counters[Counter::BytesInTelegrams] += self.in_telegrams;

@@ -200,8 +200,8 @@ impl StreamCounters {
         self.await_revolution(tally);
     }
 
-    /// Handles packets of a stream that has already started. Counts the bytes that were discarded since the last call as
-    /// damaged.
+    /// Handles packets of a stream that has already started. Counts the bytes that were discarded since the last call
+    /// as damaged.
     pub fn continue_stream(&mut self, tally: &ByteCounters) {
         self.damaged += tally.discarded - self.discarded;
         self.discarded = tally.discarded;

@@ -135,37 +135,38 @@ pub struct Sensor {
     worse_since: u16,
     /// Number of reports of a fatal status.
     fatal_reports: u8,
-    /// Issues of the last status report. `is_confirmed`: the previous report had the same issues.
+    /// Issues of the last status report. `is_confirmed` is whether the previous report had the same issues.
     issues: Option<HealthIssues>,
     is_confirmed: bool,
 }
 
-/// The two issues in a status report: a defective scanner and a dirty window.
+/// Issues in a status report: whether the scanner is defective, and whether the window is dirty.
 type HealthIssues = (bool, bool);
 
 impl Sensor {
-    /// Returns model, number and firmware as ASCII, such as `LMS200;S18063;V02.19`. Empty if not reported yet.
+    /// Returns model, number and firmware as ASCII, such as `LMS200;S18063;V02.19`. Empty if the scanner has not
+    /// reported them yet.
     pub fn kind(&self) -> &[u8] {
         &self.kind[..self.kind_len]
     }
 
-    /// Returns whether the scans have angles other than those of a [`Variant`], although their number of values matches
-    /// one.
+    /// Returns whether the scans have angles that no [`Variant`] has, although a variant has their number of values.
     pub fn has_other_angles(&self) -> bool {
         self.family == Some(LmsModel::Fast)
     }
 
-    /// Returns the measuring mode if the values are ranges at known angles; `None` if no scans can be published.
+    /// Returns the measuring mode if the values are ranges at known angles. Returns `None` if the session cannot return
+    /// scans.
     pub(crate) fn mode_of_scans(&self) -> Option<Mode> {
         self.mode.filter(|mode| mode.has_ranges() && !self.has_other_angles())
     }
 
-    /// Returns the firmware as ASCII, such as `V02.19`. Empty if not reported yet.
+    /// Returns the firmware as ASCII, such as `V02.19`. Empty if the scanner has not reported it yet.
     pub fn software(&self) -> &[u8] {
         self.software.trim_ascii()
     }
 
-    /// Returns the notices for the user, the worst first. Faults come before all other notices.
+    /// Returns the notices for the user, the worst notice first. Faults come before all other notices.
     pub fn notices(&self) -> impl Iterator<Item = Notice> {
         let severity = self.status_byte.and_then(StatusByte::severity);
         let dirty = self.status_byte.is_some_and(StatusByte::is_polluted);
@@ -181,8 +182,8 @@ impl Sensor {
         .filter_map(|(is_so, notice)| is_so.then_some(notice))
     }
 
-    /// Discards the identity and the layout of values, because the next telegram may come from another scanner, or from
-    /// the same one with another configuration. State that every scan repeats is kept.
+    /// Discards the identity and the layout of values. The next telegram may come from another scanner, or from the
+    /// same scanner with another configuration. Keeps the state that every scan contains.
     pub(crate) fn reset_identity(&mut self) {
         self.mode = None;
         self.set_kind(&[]);
@@ -199,18 +200,18 @@ impl Sensor {
         }
     }
 
-    /// Returns whether the status must be requested again, because a single report of an issue may be damaged.
+    /// Returns whether the session must request the status again, because a single report of an issue may be damaged.
     pub(crate) fn needs_confirmation(&self) -> bool {
         self.issues.is_some() && !self.is_confirmed
     }
 
-    /// Accepts the last status report, because there will not be a second one.
+    /// Accepts the last status report without a second report, because the session will not request another one.
     pub(crate) fn accept_unconfirmed(&mut self) {
         self.is_confirmed = true;
     }
 
-    /// Returns the identity of the scanner, for a session that continues the stream whose scans begin with `header`.
-    /// Returns `None` if it is incomplete.
+    /// Returns the identity of the scanner, for a session that continues the same stream. `header` is the start of
+    /// every scan. Returns `None` if the identity is incomplete.
     pub(crate) fn identity(&self, header: StreamHeader) -> Option<Identity> {
         let mode = self.mode.filter(|_| self.kind_len > 0)?;
         Some(Identity { header, mode, kind: self.kind })
@@ -275,9 +276,9 @@ impl Sensor {
         self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_NAME_LEN]);
     }
 
-    /// Counts a report of a worse status on a line that damages telegrams. Returns whether there were enough reports. A
-    /// scanner may report a fatal status only from time to time, so two such reports are enough, however far apart they
-    /// are.
+    /// Counts a report of a worse status on a line that damages telegrams. Returns whether enough reports have arrived.
+    /// For a fatal status, two reports with any time between them are sufficient, because a scanner may report it only
+    /// from time to time.
     fn count_worse_report(&mut self, is_fatal: bool) -> bool {
         if is_fatal {
             self.fatal_reports += 1;
@@ -310,8 +311,8 @@ impl Sensor {
     }
 }
 
-/// Identity of a scanner that streams, which is not part of its scans. With it, a session that continues the same
-/// stream can decode values before it sends a request.
+/// Identity of a scanner that streams. Its scans do not contain it. With the identity, a session that continues the
+/// same stream can decode values before it sends a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Identity {
     /// First bytes of each scan.
@@ -356,7 +357,7 @@ pub enum Notice {
     Error,
     /// The window is dirty.
     Dirty,
-    /// After power-on, the scanner does not use 9,600 baud.
+    /// The scanner does not use 9,600 baud after power-on.
     PermanentBaud,
 }
 
@@ -382,22 +383,26 @@ impl Notice {
     }
 }
 
-/// Returns the rank of a status byte; a worse one has a higher rank. Only severity and a dirty window count.
+/// Returns the rank of a status byte. A worse status byte has a higher rank. The rank depends only on the severity and
+/// on whether the window is dirty.
 fn severity_rank(condition: Option<StatusByte>) -> u8 {
     let severity = condition.and_then(StatusByte::severity).unwrap_or(Severity::Ok);
     let polluted = condition.is_some_and(StatusByte::is_polluted);
     if severity >= Severity::Error { 2 * severity.code() + u8::from(polluted) } else { u8::from(polluted) }
 }
 
-/// Number of consecutive better telegrams after which a bad status byte is replaced: some seconds of scans.
+/// Number of consecutive telegrams with a better status byte after which it replaces the worse one. They take some
+/// seconds.
 const RECOVERY_TELEGRAMS: u16 = 200;
-/// Number of reports of a worse status, among [`RECOVERY_TELEGRAMS`] telegrams, that are needed on a damaging line.
+/// Number of reports of a worse status that prove it on a line that damages telegrams. They must be among
+/// [`RECOVERY_TELEGRAMS`] telegrams.
 const CONFIRMATIONS: u8 = 3;
-/// Number of reports of a fatal status, among any number of telegrams, that are needed on a damaging line.
+/// Number of reports of a fatal status that prove it on a line that damages telegrams. They may be among any number of
+/// telegrams.
 const FATAL_CONFIRMATIONS: u8 = 2;
 /// Length of the firmware version, in bytes.
 const SOFTWARE_NAME_LEN: usize = 7;
-/// Maximum length of a stored type reply. Real ones have 20 or 21 characters.
+/// Maximum length of a stored type reply, in bytes. Type replies of real scanners have 20 or 21 characters.
 const MAX_TYPE_LEN: usize = 24;
 /// Operating mode: values on request.
 const ON_REQUEST: u8 = 0x25;

@@ -57,7 +57,7 @@ pub struct LmsSession {
     /// Stamp of the last byte of the last telegram.
     last_stamp: Nanos,
     first_frame_truncated: bool,
-    /// Length of the buffer of the next read.
+    /// Length of the buffer of the next read, in bytes.
     buffer_len: usize,
     /// Whether the last read filled its buffer, so that the port may have more bytes.
     has_more: bool,

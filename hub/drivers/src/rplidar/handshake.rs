@@ -1,10 +1,10 @@
 //! Steps from an open port to a stream: the search for the baud rate of the line, and the handshake with the scanner.
 //!
-//! [`RateSearch`] tries one baud rate after the other. A scanner that has lost power soon restarts at the rate of its
-//! last stream and sends its boot message there, so the search stores that rate.
+//! [`RateSearch`] tries each baud rate. A scanner that has lost power soon restarts at the rate of its last stream and
+//! sends its boot message at this rate. The search therefore stores the rate of the last stream.
 //!
-//! [`Handshake`] has the queries in their order, the data that the scanner has reported, and the scan mode that results
-//! from it. It decides the next step. The session carries out the step, and waits for responses.
+//! [`Handshake`] contains the queries in their order, the data that the scanner has reported, and the scan mode that
+//! follows from these data. It decides the next step. The session carries out the step and waits for responses.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -28,8 +28,8 @@ pub(crate) enum Query {
     Name(u8),
     /// Request the times per point of a scanner that does not list its modes.
     SampleTimes,
-    /// Request the time per point of the chosen mode again. Responses have no checksum, and all stamps depend on this
-    /// time.
+    /// Request the time per point of the chosen mode again, because all stamps depend on this time and responses have
+    /// no checksum.
     Confirm(u8),
     /// Start the standard scan.
     StandardScan,
@@ -57,8 +57,8 @@ impl Query {
         }
     }
 
-    /// Returns the contents of a response with `data`, if the response belongs to this query. The response to a query
-    /// with a key begins with that key.
+    /// Returns the contents of a response with `data`, if the response belongs to this query. If the query has a key,
+    /// the response begins with the key.
     fn contents(self, response: ResponseType, data: &[u8]) -> Option<&[u8]> {
         let (expected, key) = match self {
             Query::Info => (ResponseType::Info, None),
@@ -85,9 +85,9 @@ impl Query {
 /// Step that follows a response or a missing response.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum NextStep {
-    /// Do nothing, for example because the response was not the expected one.
+    /// Do nothing, for example because the response was not the expected response.
     Nothing,
-    /// Send this query. The scanner has responded to the first one.
+    /// Send this query. The scanner has responded to the first query.
     ScannerFound(Query),
     /// Send this query.
     Query(Query),
@@ -105,7 +105,7 @@ pub(crate) enum NextStep {
     Refused,
 }
 
-/// State of the handshake: the data that the scanner has reported, and the scan mode that results from it.
+/// State of the handshake: the data that the scanner has reported, and the scan mode that follows from these data.
 #[derive(Clone, Debug)]
 pub(crate) struct Handshake {
     settings: Settings,
@@ -120,7 +120,7 @@ pub(crate) struct Handshake {
     pub(crate) mode: Option<Mode>,
     /// Configured scan mode, if the scanner cannot use it.
     pub(crate) unavailable_mode: Option<Mode>,
-    /// For a recording: index of the mode in the last response about a mode, and the key of that response.
+    /// For a recording: index of the mode and key in the last response about a mode.
     last_recorded: (u8, u8),
 }
 
@@ -144,16 +144,16 @@ impl Handshake {
         self.info.and_then(|info| info.model()).or(Model::of(&self.settings))
     }
 
-    /// Handles the descriptor of a stream with packets of format `kind`. In a recording without a configured mode, the
-    /// mode is the only reported one with this format.
+    /// Handles the descriptor of a stream with packets of format `kind`. If a recording has no configured mode, and
+    /// only one reported mode has this format, this mode is the mode of the stream.
     pub(crate) fn stream_begins(&mut self, kind: PacketFormat) {
         if self.settings.listen_only && self.settings.mode.is_none() {
             self.mode = self.modes.single_mode(kind);
         }
     }
 
-    /// Returns the format of packets that may be express or dense ones and whose descriptor is missing. It follows from
-    /// the configured mode, or it is the format of the model's fastest mode.
+    /// Returns the format of packets that may be express or dense packets and whose descriptor is missing. The
+    /// configured mode determines the format. If no mode is configured, it is the format of the model's fastest mode.
     pub(crate) fn ambiguous_format(&self) -> Option<PacketFormat> {
         match (Mode::of(&self.settings), self.model()) {
             (Some(Mode::DenseBoost), _) => Some(PacketFormat::Dense),
@@ -317,8 +317,8 @@ impl Handshake {
         usable.or_else(fastest).unwrap_or_default()
     }
 
-    /// Infers the query that a response in a recording belongs to. A program requests the modes in the order of the
-    /// list, and the keys of each mode in ascending order.
+    /// Infers to which query a response in a recording belongs. A program requests the modes in the order of the list,
+    /// and the keys of each mode in ascending order.
     fn infer_query(&mut self, response: ResponseType, data: &[u8]) -> Query {
         let key = match response {
             ResponseType::Info => return Query::Info,
@@ -398,7 +398,7 @@ impl ScanModes {
     }
 
     /// Returns the two modes that every scanner has, for a scanner that does not list its modes. The times per point
-    /// are in microseconds; 0 if they are unknown.
+    /// are in microseconds. A time of 0 means that it is unknown.
     fn without_list(standard_us: u16, express_us: u16) -> ScanModes {
         let mode_of = |us: u16, kind, mode| ScanMode {
             id: 0,
@@ -413,8 +413,8 @@ impl ScanModes {
         modes
     }
 
-    /// Returns the offered mode for `mode`, if a line of `baud` bits per second can carry it. `baud` is `None` for a
-    /// port without a baud rate, which can carry every mode.
+    /// Returns the scanner's mode that corresponds to `mode`, if a line of `baud` bits per second can carry it. `baud`
+    /// is `None` for a port without a baud rate, which can carry every mode.
     fn find_mode(&self, mode: Mode, baud: Option<u32>) -> Option<ScanMode> {
         let kind = match mode {
             Mode::Standard => Some(PacketFormat::Standard),
@@ -428,8 +428,8 @@ impl ScanModes {
             .or_else(|| self.possible_modes(baud).find(|offered| kind.is_some() && offered.kind == kind))
     }
 
-    /// Returns the fastest mode that the line can carry. Among equally fast modes, it prefers one with a checksum, and
-    /// then the recommended one.
+    /// Returns the fastest mode that the line can carry. Among equally fast modes, prefers a mode with a checksum, and
+    /// then the recommended mode.
     fn fastest(&self, baud: Option<u32>) -> Option<ScanMode> {
         self.possible_modes(baud).min_by(|a, b| {
             let of = |mode: &ScanMode| mode.sample_us.unwrap_or(f32::MAX);
@@ -442,7 +442,7 @@ impl ScanModes {
     }
 
     /// Returns the time per point for packets of format `kind`, in microseconds. It is the time of `mode` if this mode
-    /// has such packets, and otherwise the time of the fastest mode that has.
+    /// has packets of this format. Otherwise, it is the time of the fastest mode with packets of this format.
     pub(crate) fn sample_us(&self, kind: PacketFormat, mode: Option<Mode>) -> Option<f32> {
         let of_kind = || self.of_kind(kind);
         let in_mode = of_kind().filter(|(named, _)| mode.is_some() && *named == mode).map(|(_, us)| us);
@@ -465,7 +465,7 @@ impl ScanModes {
     }
 
     /// Returns whether all reported modes with packets of format `kind` have the same time per point, so that the
-    /// format determines it.
+    /// format determines the time.
     pub(crate) fn is_unambiguous(&self, kind: PacketFormat) -> bool {
         let mut times = self.of_kind(kind).map(|(_, us)| us);
         let first = times.next();
@@ -504,20 +504,20 @@ fn sample_us(data: &[u8]) -> f32 {
     number(data) as f32 / 256.0
 }
 
-/// Motor speed to request, in revolutions per minute. It is the manufacturer's default for an S1.
+/// Speed of the motor that the session requests, in revolutions per minute. It is the manufacturer's default for an S1.
 const MOTOR_SPEED_RPM: u16 = 600;
-/// Duty cycle of the motor to request, out of 1,023. It is the manufacturer's default for an A2.
+/// Duty cycle of the motor that the session requests, out of 1,023. It is the manufacturer's default for an A2.
 const MOTOR_PWM: u16 = 660;
 
 /// Baud rate of the line, and the state of the search for it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RateSearch {
     pub(crate) baud: u32,
-    /// Whether the search cannot change the baud rate, because the port has a fixed rate or nothing can be sent.
+    /// Whether the search cannot change the baud rate, because the port has a fixed rate or the session cannot send.
     is_fixed: bool,
     /// Whether the port must still be set to the baud rate.
     pub(crate) needs_change: bool,
-    /// Time from which no response has arrived, and the number of bytes read until then.
+    /// Time since which no response has arrived, and the number of bytes read until this time.
     no_response_since: Option<(Nanos, u64)>,
     /// Baud rate of the last stream. `None` after a boot message, or after the session has restarted the scanner.
     stream_rate: Option<u32>,
@@ -535,12 +535,12 @@ impl RateSearch {
         }
     }
 
-    /// Starts at `baud`, at which the port is open.
+    /// Starts at `baud`. The port is open at this rate.
     pub(crate) fn begin_at(&mut self, baud: u32) {
         self.baud = baud;
     }
 
-    /// Returns the baud rate if the port must be set to it.
+    /// Returns the baud rate if the session must still set the port to it.
     pub(crate) fn take_change(&mut self) -> Option<u32> {
         core::mem::take(&mut self.needs_change).then_some(self.baud)
     }
@@ -551,10 +551,10 @@ impl RateSearch {
     }
 
     /// Changes to the next baud rate, because no response has arrived. `read` is the number of bytes read so far.
-    /// Returns the time from which no response has arrived.
+    /// Returns the time since which no response has arrived.
     pub(crate) fn advance(&mut self, now: Nanos, read: u64) -> Nanos {
         let (since, read_before) = *self.no_response_since.get_or_insert((now, read));
-        // Stay at the rate of the last stream for a while, in order to receive the boot message.
+        // Stay at the rate of the last stream for some time, in order to receive the boot message.
         let may_boot =
             self.stream_rate == Some(self.baud) && read == read_before && now < since + BOOT_TIMEOUT;
         if let Some(baud) = self.next_rate().filter(|_| !may_boot) {
@@ -564,9 +564,9 @@ impl RateSearch {
         since
     }
 
-    /// Returns whether the search has just started. A scanner that still streams after the stop request then uses
-    /// another baud rate, because it would have stopped at this one, so the session does not send a query. Later, the
-    /// session sends queries anyway, because the line may never be quiet.
+    /// Returns whether the search has just started. If bytes still arrive after the stop request, the scanner uses
+    /// another baud rate, because it would have stopped at this one. The session then does not send a query. Later, it
+    /// sends queries even if bytes arrive, because the line may never be quiet.
     pub(crate) fn is_quick(&self, now: Nanos) -> bool {
         self.no_response_since.is_none_or(|(since, _)| now < since + QUICK_SEARCH_TIME)
             && self.next_rate().is_some()
@@ -579,12 +579,13 @@ impl RateSearch {
         (seconds > 0).then(|| Problem::NoResponse { baud, seconds: 1 << seconds.ilog2() })
     }
 
-    /// Stores the current baud rate as that of the last stream.
+    /// Stores the current baud rate as the rate of the last stream.
     pub(crate) fn note_stream(&mut self) {
         self.stream_rate = Some(self.baud);
     }
 
-    /// Deletes the stored rate of the last stream if it is the current baud rate. Returns whether it was.
+    /// Deletes the stored rate of the last stream if it is the current baud rate. Returns whether it was the current
+    /// baud rate.
     pub(crate) fn take_stream(&mut self) -> bool {
         self.stream_rate.take_if(|baud| *baud == self.baud).is_some()
     }
@@ -594,7 +595,7 @@ impl RateSearch {
         self.stream_rate = None;
     }
 
-    /// Returns the baud rate to try next. Returns `None` if the rate is fixed.
+    /// Returns the baud rate that the search tries next. Returns `None` if the rate is fixed.
     fn next_rate(&self) -> Option<u32> {
         const RATES: [u32; 4] = [115_200, 256_000, 460_800, 1_000_000];
         let at = RATES.iter().position(|rate| *rate == self.baud)?;
@@ -604,8 +605,8 @@ impl RateSearch {
 
 /// Maximum time from power-on to the boot message.
 const BOOT_TIMEOUT: Nanos = 3_000 * MILLIS;
-/// Time in which all baud rates are tried twice if bytes arrive at each of them. A stop request can be lost, so one try
-/// is not enough.
+/// Time in which the search tries all baud rates twice if bytes arrive at each rate. One try is not sufficient, because
+/// a stop request can be lost.
 const QUICK_SEARCH_TIME: Nanos = 8 * MAX_DRAIN_TIME;
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
-//! Formats of the packets that contain points, and their decoders. Sources: the manufacturer's protocol description and
-//! its own decoder. A packet of several points contains only the angle of its first point. The angles of the others
-//! follow from the next packet.
+//! Formats of the packets that contain points, and the decoders of these formats. Sources: the manufacturer's protocol
+//! description and the manufacturer's decoder. A packet of several points contains only the angle of its first point.
+//! The angles of the other points follow from the next packet.
 
 /// Format of the packets of a stream. HQ packets (83h) are not supported.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -9,7 +9,7 @@ pub enum PacketFormat {
     Standard,
     /// 32 points, each with a compensation of its angle.
     Express,
-    /// 96 points. Two of three are stored as differences.
+    /// 96 points. Two of three points are stored as differences.
     Ultra,
     /// 40 points.
     Dense,
@@ -20,7 +20,8 @@ pub enum PacketFormat {
 /// Point of a packet.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PacketPoint {
-    /// Angle in degrees by which the point lies before its evenly spaced angle. Negative if it lies after it.
+    /// Angle in degrees by which the point lies before its evenly spaced angle. Negative if the point lies after this
+    /// angle.
     pub before: f32,
     /// Range in millimeters; 0 means no return.
     pub range: u16,
@@ -101,8 +102,8 @@ impl PacketFormat {
     pub(crate) fn begins(self, bytes: &[u8]) -> bool {
         let fits = |at: usize, is_match: fn(u8) -> bool| bytes.get(at).is_none_or(|byte| is_match(*byte));
         match self {
-            // The bit for the start of a revolution differs from the bit after it, which is its inverse. The lowest bit
-            // of the angle is 1.
+            // The second bit is the inverse of the first bit, which marks the start of a revolution. The lowest bit of
+            // the angle is 1.
             PacketFormat::Standard => {
                 fits(0, |byte| (byte ^ byte >> 1) & 1 == 1) && fits(1, |byte| byte & 1 == 1)
             }
@@ -110,7 +111,8 @@ impl PacketFormat {
         }
     }
 
-    /// Returns whether `packet` is valid. Checks its first bytes, its angle, and its checksum if it has one.
+    /// Returns whether `packet` is valid. Checks its first bytes and its angle. Also checks its checksum if the format
+    /// has one.
     pub(crate) fn is_valid(self, packet: &[u8]) -> bool {
         let is_sum_valid = || {
             let sum = packet[2..].iter().fold(0, |sum, byte| sum ^ byte);
@@ -153,9 +155,10 @@ fn word(bytes: &[u8], at: usize) -> u16 {
     u16::from_le_bytes([bytes[at], bytes[at + 1]])
 }
 
-/// Decodes point `i` of an ultra packet. The first of three points has an absolute range. The second is a difference
-/// from the first point, and the third one from the first of the next three. If the first has no return, the second is
-/// a difference from the next three, too.
+/// Decodes point `i` of an ultra packet. Points form groups of three. The first point of a group has an absolute range.
+/// The second point is a difference from the first point. The third point is a difference from the first point of the
+/// next group. If the first point has no return, the second point is also a difference from the first point of the next
+/// group.
 fn ultra(packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
     let triple = |packet: &[u8], n: usize| {
         u32::from(word(packet, 4 + 4 * n)) | u32::from(word(packet, 6 + 4 * n)) << 16
@@ -180,7 +183,7 @@ fn ultra(packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
 }
 
 /// Decodes an absolute range, whose resolution is coarser for longer ranges. Returns the range in millimeters, and the
-/// number of bits by which differences from it are shifted.
+/// number of bits by which a difference from this range is shifted.
 fn major(three: u32) -> (i32, u32) {
     let stored = (three & 0xFFF) as i32;
     const SCALES: [(i32, i32, u32); 4] =

@@ -51,13 +51,13 @@ impl Request {
         Request::with_payload(0x82, &[mode, 0, 0, 0, 0])
     }
 
-    /// Returns the request for the value of `key`, for one mode if `mode` is given.
+    /// Returns the request for the value of `key`. If `mode` is given, requests the value for this mode.
     pub(crate) fn configuration(key: u8, mode: Option<u8>) -> Request {
         let payload = [key, 0, 0, 0, mode.unwrap_or_default(), 0];
         Request::with_payload(0x84, &payload[..if mode.is_some() { 6 } else { 4 }])
     }
 
-    /// Returns the request for whether an accessory board controls the motor.
+    /// Returns the request that asks whether an accessory board controls the motor.
     pub(crate) fn accessory_board() -> Request {
         Request::with_payload(0xFF, &[0; 4])
     }
@@ -85,7 +85,7 @@ pub(crate) struct RequestQueue {
 }
 
 impl RequestQueue {
-    /// Adds `request` after the queued ones. Bytes for which there is no room are dropped.
+    /// Adds `request` after the queued requests. Drops bytes for which no room is left.
     pub(crate) fn push(&mut self, request: &Request) {
         for byte in request.bytes() {
             if let Some(slot) = self.bytes.get_mut(self.len) {
@@ -118,7 +118,7 @@ pub(crate) mod key {
 /// Descriptor at the start of a response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ResponseDescriptor {
-    /// A single response of this type follows, with this number of bytes.
+    /// A single response of this type follows. It has this number of bytes.
     Reply(ResponseType, usize),
     /// A stream of packets of this format follows, until the stop request.
     Stream(PacketFormat),
@@ -197,7 +197,7 @@ impl ResponseDescriptor {
 }
 
 const START_BYTE: u8 = 0xA5;
-/// Maximum length of a response, in bytes. It is enough for the longest name of a mode.
+/// Maximum length of a response, in bytes. The longest name of a mode fits into it.
 const MAX_RESPONSE_LEN: usize = 64;
 
 /// Identity of a scanner, from its reply to `A5 50`.
@@ -224,8 +224,8 @@ impl Info {
     }
 
     /// Returns the identity of a scanner from a status whose type is `text`, such as `S2 denseboost 1.02`. A status
-    /// does not contain the hardware revision and the serial number, so they are 0. Returns `None` if the number of the
-    /// model is neither in `model` nor in the text.
+    /// contains neither the hardware revision nor the serial number, so they are 0. Returns `None` if neither `model`
+    /// nor `text` gives the number of the model.
     pub(crate) fn of_status(model: Option<Model>, text: &str) -> Option<Info> {
         let words: Vec<&str> = text.split_whitespace().collect();
         let number = |word: &&str| u8::from_str_radix(word.strip_prefix("0x")?, 16).ok();
@@ -301,7 +301,7 @@ impl fmt::Display for Health {
     }
 }
 
-/// Contents of the responses before a stream, for a stream file that lacks them.
+/// Contents of the responses at the start of a stream, for a stream file that lacks these responses.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StreamHead {
     /// Identity of the scanner, if it is known.
@@ -315,7 +315,7 @@ pub(crate) struct StreamHead {
 }
 
 impl StreamHead {
-    /// Encodes the responses. They are the identity, a list of modes that contains only the mode of the stream, and the
+    /// Encodes the responses: the identity, a list of modes that contains only the mode of the stream, and the
     /// descriptor of the stream.
     pub(crate) fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::new();

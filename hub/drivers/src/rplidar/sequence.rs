@@ -164,7 +164,7 @@ impl PacketSequencer {
         self.locate_next(last, packet, angle, packets, Step::Gap { from: last.angle, ns })
     }
 
-    /// Returns the position of a packet of one point. Its angle may be smaller than that of an earlier packet.
+    /// Returns the position of a packet of one point. Its angle may be smaller than the angle of an earlier packet.
     pub(crate) fn locate_point(
         &mut self,
         packet: ReceivedPacket,

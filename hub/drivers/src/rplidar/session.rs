@@ -1,5 +1,5 @@
-//! Session with an RPLIDAR. It requests the identity of the scanner, starts a scan mode, and returns packets as they
-//! arrive, and revolutions.
+//! Session with an RPLIDAR. It requests the identity of the scanner and starts a scan mode. It returns packets as they
+//! arrive, and complete revolutions.
 //!
 //! The session stops a stream that another program has left running, and never continues it. Express and dense packets
 //! look alike, and a scanner does not respond to requests while it streams.
@@ -28,30 +28,30 @@ pub struct RplidarSession {
     settings: Settings,
     now: Nanos,
     phase: Phase,
-    /// State to report until measured data arrives.
+    /// State that the session reports until measured data arrives.
     shown: State,
     problem: Option<Problem>,
     framer: Framer,
     reads: ReadScheduler,
     rate: RateSearch,
     requests: RequestQueue,
-    /// Level that the line DTR must be set to.
+    /// Level to which the driver must set the line DTR.
     change_dtr: Option<bool>,
     handshake: Handshake,
     stream: Stream,
     /// Packet format of the stream and arrival time of its descriptor. `None` until the descriptor has arrived.
     announced: Option<(PacketFormat, Nanos)>,
     counters: StreamCounters,
-    /// Time from which the sensor has had no subscribers.
+    /// Time since which the sensor has had no subscribers.
     idle_since: Option<Nanos>,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// The session reads a recording, and no packet has been read.
+    /// The session reads a recording and has not read a packet yet.
     Listening { since: Nanos },
-    /// The stop request was sent. The session sends the first query when the line is quiet at `until`, or at `at_most`
-    /// even if bytes still arrive.
+    /// The session has sent the stop request. It sends the first query at `until` if the line is quiet, and at
+    /// `at_most` even if bytes still arrive.
     Draining { attempts: u8, until: Nanos, at_most: Nanos },
     /// The session waits for the response to `query` until `until`.
     Querying { query: Query, attempts: u8, until: Nanos },
@@ -61,7 +61,7 @@ enum Phase {
     Unhealthy { until: Nanos },
     /// Packets are arriving.
     Streaming(Watchdog),
-    /// A user has paused the session, or, if `is_idle`, the sensor has no subscribers.
+    /// A user has paused the session. If `is_idle`, the session has paused because the sensor has no subscribers.
     Paused { is_idle: bool },
 }
 
@@ -89,7 +89,7 @@ impl RplidarSession {
         session
     }
 
-    /// Returns the model that the scanner has reported, or the configured one.
+    /// Returns the model that the scanner has reported. Before its report, returns the configured model.
     pub fn model(&self) -> Option<Model> {
         self.handshake.model()
     }
@@ -119,7 +119,7 @@ impl RplidarSession {
         self.stream.revolution_counts()
     }
 
-    /// Starts again at the current baud rate. `shown` is the state of the session until measured data arrives.
+    /// Starts again at the current baud rate. `shown` is the session's state until measured data arrives.
     fn begin(&mut self, shown: State) {
         self.end_stream();
         self.announced = None;
@@ -133,7 +133,8 @@ impl RplidarSession {
         self.stop(0);
     }
 
-    /// Sends the stop request, and then the first query. `attempts` is the number of earlier attempts with that query.
+    /// Sends the stop request, and then the first query. `attempts` is the number of earlier attempts with the first
+    /// query.
     fn stop(&mut self, attempts: u8) {
         self.framer.expect(ExpectedBytes::Responses);
         self.requests = RequestQueue::default();
@@ -142,7 +143,7 @@ impl RplidarSession {
         self.phase = Phase::Draining { attempts, until, at_most };
     }
 
-    /// Stops the stream and the motor. The session then expects nothing.
+    /// Stops the stream and the motor. After the call, the session expects no bytes.
     fn stop_scanner(&mut self, is_idle: bool) {
         self.end_stream();
         self.framer.expect(ExpectedBytes::Nothing);
@@ -165,13 +166,13 @@ impl RplidarSession {
         }
     }
 
-    /// Sends `query`, after `attempts` earlier attempts. Does nothing for a recording, in which the recorded program
-    /// has sent the queries.
+    /// Sends `query`. `attempts` is the number of earlier attempts. Does nothing for a recording, because the recorded
+    /// program has sent the queries.
     fn query(&mut self, query: Query, attempts: u8) {
         if self.settings.listen_only {
             return;
         }
-        // A leftover fragment would swallow the start of the next response.
+        // The framer would take the start of the next response for the rest of an incomplete response.
         self.framer.clear();
         self.requests.push(&query.request());
         self.phase = Phase::Querying { query, attempts, until: self.now + self.response_timeout() };
@@ -203,8 +204,8 @@ impl RplidarSession {
 
     /// Handles a missing response to `query`.
     fn on_no_response(&mut self, query: Query, attempts: u8) {
-        // Bytes arrived, but no valid response. The response may have been damaged, so do not conclude that the request
-        // is unsupported.
+        // Bytes arrived, but no valid response. The response may have been damaged, so this does not mean that the
+        // scanner does not support the request.
         let is_damaged =
             self.reads.last_byte() + self.response_timeout() > self.now && attempts < MAX_ATTEMPTS;
         match query {
@@ -274,21 +275,23 @@ impl RplidarSession {
     fn on_boot_message(&mut self, is_named: bool) {
         match self.phase {
             Phase::Paused { .. } | Phase::Listening { .. } => {}
-            // The first query follows anyway. A stream at another baud rate may look like text repeatedly.
+            // The session sends the first query in any case. A stream at another baud rate may look like text
+            // repeatedly.
             Phase::Draining { .. } | Phase::Querying { query: Query::Info, .. } => {
                 if is_named && self.rate.take_stream() {
                     self.counters.note_restart();
                 }
             }
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE_TIME },
-            // The rest of a packet may look like text too, but a scanner pauses before its boot message. The name
-            // proves the message even after other bytes, which a scanner sends while its supply voltage drops.
+            // The rest of a packet may also look like text, but a scanner pauses before its boot message. The name
+            // proves the message even if other bytes precede it. A scanner sends these bytes while its supply voltage
+            // drops.
             Phase::Streaming(watchdog)
                 if !is_named
                     && (watchdog.silent_at().abs_diff(self.now + Watchdog::SILENCE_TIMEOUT)
                         < BOOT_SILENCE
                         || self.framer.skipped() > PacketFormat::MAX_LEN as u32 + BOOT_MESSAGE_LEN) => {}
-            // A stream whose first bytes were damaged may look like text in some places.
+            // A stream whose first bytes were damaged may look like text in some parts.
             Phase::Querying { .. } if !is_named => {}
             phase => {
                 if matches!(phase, Phase::Streaming(_)) {
@@ -306,7 +309,8 @@ impl RplidarSession {
     /// Handles the descriptor of a stream.
     fn on_stream_begin(&mut self) {
         match self.phase {
-            // The descriptor announces another stream in an unknown mode, from another program or another scanner.
+            // The descriptor announces another stream, whose mode is unknown. It comes from another program or another
+            // scanner.
             Phase::Streaming(_) if !self.settings.listen_only && !self.is_repeated_announcement() => {
                 self.counters.note_resync();
                 self.begin(State::Starting);
@@ -328,9 +332,9 @@ impl RplidarSession {
         }
     }
 
-    /// Returns whether the descriptor that has just arrived announces the session's own stream again. A scanner
-    /// responds to a request and to its repetition. Another scanner or program can also start a stream in the second
-    /// that a head may need to spin up, so only a descriptor shortly after the first one counts.
+    /// Returns whether the descriptor that has just arrived announces the session's own stream again, because a scanner
+    /// responds to a request and to its repetition. A head may need a second to spin up, and another scanner or program
+    /// can start a stream in this second. Only a descriptor shortly after the first descriptor therefore counts.
     fn is_repeated_announcement(&self) -> bool {
         let is_repeated = |(kind, at): (PacketFormat, Nanos)| {
             self.framer.kind() == Some(kind) && self.now < at + 2 * self.response_timeout()
@@ -338,7 +342,8 @@ impl RplidarSession {
         !self.stream.has_begun() && self.announced.is_some_and(is_repeated)
     }
 
-    /// Starts the stream after its first packets, or extends it after later ones. Returns its deadlines.
+    /// Starts the stream after its first packets, or continues it after later packets. Returns the deadlines of the
+    /// stream.
     fn continue_stream(&mut self) -> Watchdog {
         let mut watchdog = Watchdog::new(self.now);
         if let Phase::Streaming(known) = self.phase {
@@ -354,13 +359,13 @@ impl RplidarSession {
         watchdog
     }
 
-    /// Ends the stream. The next packet belongs to a new one.
+    /// Ends the stream. The next packet belongs to a new stream.
     fn end_stream(&mut self) {
         self.stream.end();
         self.reads.cancel_wait();
     }
 
-    /// Returns the packets of `span` with their stamps, and keeps them for revolutions.
+    /// Returns the packets of `span` with their stamps, and keeps them for the assembly of revolutions.
     fn receive(&mut self, kind: PacketFormat, mut span: Span) -> ReceivedTelegram<'_> {
         self.continue_stream();
         span.reasons |= self.reads.take_suspect(span.offset + span.len as u64);
@@ -453,7 +458,7 @@ impl RplidarSession {
                 self.problem = match self.counters.damaged_percent(self.framer.buffer.byte_counters()) {
                     0 | 1 => Some(Problem::HeadBlocked),
                     2..=50 => Some(Problem::DamagedRevolutions),
-                    // The hub reports such a line itself.
+                    // The hub itself reports a line that damages more bytes.
                     _ => None,
                 };
             }
@@ -465,7 +470,7 @@ impl RplidarSession {
     fn deadline(&self) -> Nanos {
         match self.phase {
             Phase::Listening { since } => {
-                // The next full second, at which the duration in the problem changes.
+                // The duration in the problem changes at the next full second.
                 let seconds = self.now.saturating_sub(since) / SECOND;
                 since + (seconds + 1) * SECOND
             }
@@ -678,7 +683,7 @@ impl line::ScannerSession for RplidarSession {
     }
 
     fn device_info(&self) -> Option<DeviceInfo> {
-        // The health is known, unless the scanner does not respond to this request.
+        // The session knows the health, unless the scanner does not respond to this request.
         let is_unconfirmed = matches!(
             self.phase,
             Phase::Draining { .. } | Phase::Querying { query: Query::Info | Query::Health, .. }
@@ -710,24 +715,24 @@ impl line::ScannerSession for RplidarSession {
 pub enum Problem {
     /// No response arrives. In a recording, no packet arrives.
     NoResponse {
-        /// The only baud rate that the session tried. `None` if it tried all of them.
+        /// Only baud rate that the session tried. `None` if it tried all rates.
         baud: Option<u32>,
-        /// Duration in seconds, rounded down to 1, 2, 4, ..
+        /// Time without a response in seconds, rounded down to 1, 2, 4, ..
         seconds: u32,
     },
     /// No measured data arrived for one second.
     Silence,
     /// Packets arrive, but the head does not rotate.
     HeadBlocked,
-    /// No revolution is complete, because bytes are damaged on the line.
+    /// No revolution is complete, because the line damages bytes.
     DamagedRevolutions,
     /// The scanner reports a warning or an error.
     Unhealthy(Health),
     /// The scanner responds, but does not start to measure.
     Refused,
-    /// A recording contains packets that may have one of two formats, and nothing in it shows which one.
+    /// A recording contains packets that may have one of two formats, and does not show which format they have.
     AmbiguousPackets,
-    /// The scanner does not have this mode, or the line is too slow for it, so the scanner uses another mode.
+    /// The scanner uses another mode, because it does not have this mode or because the line is too slow for it.
     ModeUnavailable(Mode),
 }
 

@@ -1,5 +1,5 @@
-//! Stamps and revolutions of the packets of a stream. The points of a packet with several points are known once the
-//! next packet has arrived, and only if no packet is missing between the two.
+//! Stamps and revolutions of the packets of a stream. The points of a packet with several points are known only after
+//! the next packet has arrived, and only if no packet is missing between the two packets.
 
 use crate::line::{
     self, ClosedRevolution, RawScan, ReadLog, ReadScheduler, RevolutionAssembler, RevolutionCounts,
@@ -51,7 +51,7 @@ impl Stream {
         }
     }
 
-    /// Ends the stream. The next packet belongs to a new one.
+    /// Ends the stream. The next packet belongs to a new stream.
     pub(crate) fn end(&mut self) {
         self.sequencer.end();
         self.revolutions.end();
@@ -77,7 +77,7 @@ impl Stream {
         self.point_time.ns.map(|ns| (1e9 / ns) as f32)
     }
 
-    /// Returns the number of received and of lost packets.
+    /// Returns the number of received packets and the number of lost packets.
     pub(crate) fn received_and_lost(&self) -> (u64, u64) {
         self.sequencer.received_and_lost()
     }
@@ -87,7 +87,7 @@ impl Stream {
         self.revolutions.assembler.counts()
     }
 
-    /// Returns the maximum number of packets in a sample: those that arrive in 10 ms, limited by the space of a sample.
+    /// Returns the maximum number of packets in a sample. These packets arrive within 10 ms and fit into a sample.
     pub(crate) fn max_packets_per_sample(&self, kind: PacketFormat) -> usize {
         let packet_ns = self.point_time.ns.unwrap_or(1e6) * kind.points() as f64;
         ((1e7 / packet_ns) as usize).clamp(1, (MAX_SAMPLE_LEN / kind.byte_len()).min(MAX_PACKETS))
@@ -110,7 +110,7 @@ impl Stream {
                 self.sequencer.end();
             }
             if change > 0.001 {
-                // The times of this clock were computed with the previous value.
+                // The times of this clock were computed with the previous time per point.
                 self.clock = SensorClock::new();
             }
         }
@@ -118,8 +118,9 @@ impl Stream {
     }
 
     /// Locates the packets of `span` in the sequence, and keeps them for [`advance`](Self::advance). If there is a gap
-    /// within the span, returns the packets after the gap to the framer and shortens `span`, so that they form the next
-    /// span. Returns the stamps of the first and the last packet: of the last point in each, if they are known.
+    /// within the span, returns the packets after the gap to the framer and shortens `span`, so that these packets form
+    /// the next span. Returns the stamps of the first and the last packet. A packet's stamp is the stamp of its last
+    /// point, if this is known.
     pub(crate) fn locate(
         &mut self,
         kind: PacketFormat,
@@ -155,7 +156,7 @@ impl Stream {
                 } else {
                     arrivals.earliest(end, timing)
                 };
-                // A packet from a backlog is late because it was buffered.
+                // The delay of a packet from a backlog counts as 0, because only the buffer delayed the packet.
                 earliest.unwrap_or(0).saturating_sub(packet_time + due) as f64
             };
             let before = self.sequencer;
@@ -216,10 +217,10 @@ impl Stream {
         self.revolutions.begin(beams);
     }
 
-    /// Returns the number of beams of a `model` that takes `point_ns` nanoseconds per point. It is the number for a
-    /// configured mode. For a recording, and for a scanner that a search has found without a configured model, it is
-    /// the number for the mode that the scanner reports. Otherwise it is the number for the model's fastest mode. An A1
-    /// with old firmware measures half as many points as others.
+    /// Returns the number of beams of a `model` that takes `point_ns` nanoseconds per point. It is the number for the
+    /// configured mode. If none is configured, it normally is the number for the model's fastest mode. For a recording,
+    /// and for a scanner that a search has found without a configured model, it is the number for the mode that the
+    /// scanner reports. An A1 with old firmware measures half as many points as other scanners of this model.
     fn beams_of(&self, model: Model, kind: PacketFormat, point_ns: f64, handshake: &Handshake) -> usize {
         let Settings { model: configured, mode, is_found, listen_only, .. } = self.settings;
         let point_us = (point_ns / 1e3) as f32;
@@ -251,7 +252,7 @@ impl Stream {
         Some(RotationRate { step: advance / kind.points() as f64, point_ns })
     }
 
-    /// Adds the points of the located packets to revolutions, until one is complete. Returns that revolution.
+    /// Adds the points of the located packets to revolutions until a revolution is complete. Returns that revolution.
     pub(crate) fn advance(&mut self, framer: &Framer) -> Option<ClosedRevolution> {
         let rate = self.revolutions.current.and_then(|current| self.rotation_rate(current.kind));
         self.revolutions.advance(framer, rate)
@@ -262,7 +263,7 @@ impl Stream {
         self.revolutions.assembler.partial_revolution(self.rotation_rate(kind)?)
     }
 
-    /// Converts a revolution, complete or partial, to a scan with stamps of the hub's clock.
+    /// Converts a complete or partial revolution to a scan whose stamps are in the hub's clock.
     pub(crate) fn to_scan(
         &self,
         revolution: ClosedRevolution,
@@ -289,10 +290,10 @@ struct PointTime {
 struct Measurement {
     /// Arrival time of the last packet.
     last: Nanos,
-    /// Whether packets are missing before it, or it was late.
+    /// Whether packets are missing before the last packet, or the last packet was late.
     is_incomplete: bool,
-    /// Time in nanoseconds by which the last packet was later than in a steady stream. It decreases while packets catch
-    /// up.
+    /// Time in nanoseconds by which the last packet was later than in a steady stream. It decreases while packets
+    /// arrive faster than in a steady stream.
     lateness: f64,
     elapsed: Nanos,
     points: u64,
@@ -331,11 +332,11 @@ impl PointTime {
         let is_late = steady.is_some_and(|steady| interval as f64 > 1.5 * steady + LATE_TOLERANCE_NS);
         measurement.lateness = match steady {
             Some(_) if is_late => -ahead,
-            // Packets that were buffered behind the late one arrive fast until they have caught up.
+            // Packets that were buffered behind the late packet arrive faster until the delay is 0.
             Some(steady) if ahead > steady / 2.0 => (measurement.lateness - ahead).max(0.0),
             _ => 0.0,
         };
-        // Packets that arrive at the same time as an incomplete span were in the same read.
+        // Packets that arrive at the same time as an incomplete span were in the same read as this span.
         measurement.is_incomplete = span.reasons != 0
             || is_late
             || measurement.lateness > 0.0
@@ -374,7 +375,7 @@ struct Revolutions {
 struct CurrentSpan {
     kind: PacketFormat,
     span: Span,
-    /// Index of the first packet that is not finished.
+    /// Index of the first packet whose points are not completely processed.
     next_packet: usize,
     /// Whether the points of this packet were added.
     is_added: bool,
@@ -412,8 +413,8 @@ impl Revolutions {
         (self.current, self.pending) = (None, None);
     }
 
-    /// Adds the points of the current packets to revolutions, until one is complete. Returns that revolution. `rate` is
-    /// the speed of the head.
+    /// Adds the points of the current packets to revolutions until a revolution is complete. Returns that revolution.
+    /// `rate` is the speed of the head.
     fn advance(&mut self, framer: &Framer, rate: Option<RotationRate>) -> Option<ClosedRevolution> {
         while let Some(CurrentSpan { kind, span, next_packet: packet, is_added: is_put }) = self.current {
             let position = self.positions.get(packet).copied().filter(|_| packet < span.packets);
@@ -437,7 +438,8 @@ impl Revolutions {
         None
     }
 
-    /// Adds the points that are known with the packet `bytes`: its own point, or the points of the previous packet.
+    /// Adds the points that are known once the packet `bytes` has arrived: the point of this packet, or the points of
+    /// the previous packet.
     fn add_packet(
         &mut self,
         kind: PacketFormat,
@@ -502,15 +504,15 @@ impl Revolutions {
     }
 }
 
-/// Duration of the first measurement of the time per point. Revolutions are assembled after it.
+/// Duration of the first measurement of the time per point. The assembly of revolutions starts after it.
 const FIRST_MEASUREMENT_TIME: Nanos = 250 * MILLIS;
 /// Maximum change of the head's speed during a gap, as a ratio.
 const SPEED_VARIATION: f64 = 0.005;
 /// Maximum delay in nanoseconds of packets that arrive together.
 const LATE_TOLERANCE_NS: f64 = 15e6;
-/// Maximum deviation of the time per point from the reported one, as a ratio.
+/// Maximum deviation of the time per point from the reported time, as a ratio.
 const MAX_POINT_TIME_DEVIATION: f64 = 0.02;
-/// Maximum number of points in a revolution. It is enough for an S2 at four revolutions per second.
+/// Maximum number of points in a revolution. An S2 measures fewer points, even at four revolutions per second.
 const MAX_POINTS: usize = 8_192;
 /// Maximum number of packets in a sample.
 const MAX_PACKETS: usize = 128;
