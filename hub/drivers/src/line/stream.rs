@@ -152,8 +152,7 @@ impl Watchdog {
         self.revolution_at = now;
     }
 
-    /// Extends both deadlines, because the head may not reach its speed before `until`, and measures nothing until
-    /// then.
+    /// Extends both deadlines. Before `until`, the head may still be spinning up, and may not measure.
     pub fn await_spin_up(&mut self, until: Nanos) {
         (self.revolution_at, self.silent_at) = (until, until);
     }

@@ -183,9 +183,9 @@ pub(crate) fn is_data(command: u8) -> bool {
     STREAM_COMMANDS.contains(&command)
 }
 
-/// Command bytes of telegrams that a scanner sends continuously: all values, means, a sub-range, a sub-range with field
-/// values, means of a sub-range, ranges with the reflectivity of a sub-range, ranges and reflectivities, Cartesian
-/// coordinates (Telegram listing, 20h).
+/// Command bytes of telegrams that a scanner sends continuously (Telegram listing, 20h). In this order, they contain
+/// all values, means, a sub-range, a sub-range with field values, means of a sub-range, ranges with the reflectivity of
+/// a sub-range, ranges and reflectivities, and Cartesian coordinates.
 const STREAM_COMMANDS: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
 /// Replies to a session's requests, the refusal, and the boot message, each with its possible values of LENGTH. Types
 /// have 20 or 21 characters, and configurations have 32 or 34 bytes. Without this restriction, the bytes of scans would

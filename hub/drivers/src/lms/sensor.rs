@@ -140,7 +140,8 @@ pub struct Sensor {
     is_confirmed: bool,
 }
 
-/// Issues in a status report: whether the scanner is defective, and whether the window is dirty.
+/// Issues in a status report. The first value is whether the scanner is defective, and the second is whether the window
+/// is dirty.
 type HealthIssues = (bool, bool);
 
 impl Sensor {

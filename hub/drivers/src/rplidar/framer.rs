@@ -337,8 +337,8 @@ const CAPACITY: usize = 4_096 + 2 * PacketFormat::MAX_LEN;
 /// Time without a byte after which no byte of a packet can still arrive. In the slowest stream, an adapter forwards a
 /// packet every 6 ms.
 const HOLD_TIME: Nanos = 10 * MILLIS;
-/// Minimum number of consecutive packets of one point. At a wrong position, so many packets occur once in millions of
-/// positions.
+/// Minimum number of consecutive packets of one point. A wrong position looks like this number of packets only once in
+/// millions.
 const MIN_RUN: usize = 6;
 /// Maximum angle between consecutive points in degrees, even if some points are missing between them.
 const MAX_STEP_DEG: f32 = 30.0;

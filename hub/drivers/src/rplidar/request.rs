@@ -57,7 +57,7 @@ impl Request {
         Request::with_payload(0x84, &payload[..if mode.is_some() { 6 } else { 4 }])
     }
 
-    /// Returns the request that asks whether an accessory board controls the motor.
+    /// Returns the request for the information whether an accessory board controls the motor.
     pub(crate) fn accessory_board() -> Request {
         Request::with_payload(0xFF, &[0; 4])
     }
