@@ -1,5 +1,5 @@
-//! `bridge --check`: a test connection that finds what keeps a bridge from working, such as an unreachable router, a
-//! wrong clock or another version. `scanhub doctor` shows the same findings. Nothing is sent or published.
+//! `bridge --check`: connects for a test, and finds reasons why a bridge does not work, for example an unreachable
+//! router, a wrong clock or another version. `scanhub doctor` shows the same findings. Nothing is sent or published.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -30,17 +30,18 @@ struct Finding {
     remedy: String,
 }
 
-/// Time limits: for the first connection, for another router after one has refused, and for the announcements of the
-/// hubs.
+/// Three time limits: for the first connection, for a connection to another router after one router has refused, and
+/// for the announcements of the hubs.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 const ANNOUNCEMENT_TIMEOUT: Duration = Duration::from_secs(2);
 /// Interval between checks for a connection and for new sensors.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
-/// Maximum difference between the clocks of two machines. The stamp of an announcement is set when it is created, at
-/// most this long ago, so a larger difference is an error of a clock. A listener with a key has the same limit.
+/// Maximum difference between the clocks of two machines. An announcement gets its stamp when it is created, and it
+/// arrives within this time. A larger difference therefore means that a clock is wrong. A listener with a key has the
+/// same limit.
 const MAX_CLOCK_DIFFERENCE_NS: u64 = 5_000_000_000;
-/// Maximum number of sensors that are queried. It is bounded because any connected program can announce sensors.
+/// Maximum number of sensors that are queried. It is limited because any connected program can announce sensors.
 const MAX_SENSORS: usize = 256;
 
 /// Connects with `options`, and writes one line for each finding to `out`, as JSON if `options.json` is set.
@@ -98,7 +99,7 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
             Ok::<_, Infallible>(())
         };
         let Ok(()) = connection.events(event);
-        // Another router may still accept a client that one router has refused, but it answers soon.
+        // A router has refused the client. Another router may still accept it, but would reply soon.
         if Diagnosis::of(&reasons.join("; ")).is_some_and(|known| known != UNREACHED) {
             end_at = end_at.min(Instant::now() + REFUSAL_TIMEOUT);
         }
@@ -125,8 +126,8 @@ fn unreachable(reasons: &[String]) -> Finding {
     Finding::failed(message, remedy)
 }
 
-/// Replies of the hubs by ID. A reply is the lead of our clock over the hub's in nanoseconds, or the error in its
-/// datagram.
+/// Replies of the hubs by ID. A reply is the time by which this machine's clock is ahead of the hub's clock, in ns, or
+/// the error in the hub's datagram.
 type HubReplies = BTreeMap<u64, Result<i64, DatagramError>>;
 
 /// Queries all sensors for their announcements, and returns the findings about their hubs.

@@ -1,5 +1,5 @@
-//! Causes and remedies for Zenoh's messages about failed connections. The texts match Zenoh 1.10, whose version is
-//! pinned.
+//! Causes and remedies for Zenoh's messages about failed connections. The texts are those of Zenoh 1.10. The version of
+//! Zenoh is pinned.
 
 /// A cause and its remedy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,14 +22,14 @@ impl Diagnosis {
     }
 }
 
-/// Default cause if the connecting side reports no other: no program answers there, or it does not use Zenoh's
-/// protocol.
+/// Default cause if the connecting side reports no other cause: no program replies at the address, or the program does
+/// not use Zenoh's protocol.
 pub(crate) const UNREACHED: Diagnosis = Diagnosis {
     finding: "no router is reached",
     remedy: "start a router there (`scanhub bridge --listen ..` or zenohd), and check the firewall",
 };
 
-/// Parts of Zenoh's messages in lower case, and their cause. The first entry that matches is used.
+/// Parts of Zenoh's messages in lower case, and the cause of these messages. The first entry that matches is used.
 type KnownCause = (&'static [&'static str], Diagnosis);
 
 const KNOWN_CAUSES: &[KnownCause] = &[

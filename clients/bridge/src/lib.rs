@@ -1,6 +1,6 @@
 //! A bridge that sends the topics of a hub to other machines over Zenoh, and publishes the topics of other machines
 //! here. In a LAN, `gateway` and `listen` do the same over UDP. `scanhub_network` decides which samples are sent and
-//! accepted, and counts the lost ones. Only module `session` uses Zenoh.
+//! accepted, and counts lost samples. Only module `session` uses Zenoh.
 #![forbid(unsafe_code)]
 
 mod check;
@@ -54,8 +54,8 @@ pub struct BridgeOptions {
 /// Topics that a bridge sends.
 #[derive(Clone, Debug)]
 pub struct SendOptions {
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`. A suffix `:every=N` sends only the samples of every Nth telegram. If
-    /// empty, the default topics of all sensors, as `scanhub gateway` sends them.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`. With the suffix `:every=N`, only the samples of every Nth telegram are
+    /// sent. If the list is empty, the bridge sends the default topics of all sensors, as `scanhub gateway` does.
     pub topics: Vec<String>,
     /// Possible locations of the hub's domain.
     pub locations: Vec<Domain>,
@@ -68,9 +68,9 @@ pub struct PublishOptions {
     pub domain: Domain,
     /// Topics to receive, of all sensors.
     pub topics: Vec<Topic>,
-    /// `NAME=HUB`: name of a hub, used instead of its 16 hex digits.
+    /// `NAME=HUB`: name of a hub. The name replaces the 16 hex digits of the hub.
     pub names: Vec<String>,
-    /// Hubs to receive from, by 16 hex digits or by a name in `names`. If empty, all hubs.
+    /// Hubs from which topics are received, by 16 hex digits or by a name in `names`. If the list is empty, all hubs.
     pub hubs: Vec<String>,
     /// Limits of the published topics, such as the number of subscribers.
     pub limits: TopicLimits,
@@ -106,7 +106,7 @@ pub fn bridge(
 
 /// Interval between announcements, and between reports of the statistics.
 const TICK_INTERVAL: Duration = ANNOUNCEMENT_INTERVAL;
-/// Time without a router after which the bridge reports that it waits.
+/// Time without a router after which the bridge reports that it waits for one.
 const REPORT_WAITING_AFTER: Duration = Duration::from_secs(1);
 /// Maximum wait for samples of the hub.
 const MAX_WAIT: Duration = Duration::from_millis(50);

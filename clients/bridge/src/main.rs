@@ -164,8 +164,8 @@ impl Cli {
 /// Highest domain ID of ROS 2 on Linux.
 const MAX_DOMAIN_ID: u32 = 232;
 
-/// Returns the domain ID from `ROS_DOMAIN_ID`, or 0 if it is not set. Called only for a ROS 2 node, so an invalid value
-/// does not affect other uses.
+/// Returns the domain ID from `ROS_DOMAIN_ID`, or 0 if it is not set. Called only for a ROS 2 node, so that an invalid
+/// value does not affect other bridges.
 fn domain_id() -> Result<u32, Failure> {
     let value = std::env::var("ROS_DOMAIN_ID").unwrap_or_default();
     match value.as_str() {
@@ -197,7 +197,7 @@ fn main() -> ExitCode {
     match run(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            // An error means that the reader closed the stream, so there is no one left to inform.
+            // Ignore an error, because the reader has closed the stream and would not see a message about it.
             let _ = match json {
                 true => writeln!(io::stdout(), "{}", Printable(&scanhub_verbs::error_line(&failure))),
                 false => writeln!(io::stderr(), "scanhub-bridge: {}", Printable(&failure.to_string())),

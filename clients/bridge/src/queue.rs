@@ -1,5 +1,6 @@
-//! Queue between the thread that receives from the hub and the thread that sends over Zenoh, so that a slow network
-//! delays only the second. There are two kinds: one of datagrams (`sending.rs`) and one of ROS 2 messages (`ros2.rs`).
+//! Queue between the thread that receives from the hub and the thread that sends over Zenoh. A slow network therefore
+//! delays only the sending thread. There is a queue of datagrams (`sending.rs`), and a queue of ROS 2 messages
+//! (`ros2.rs`).
 
 use std::num::NonZeroU64;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,24 +23,24 @@ pub(crate) trait Queue: SampleSink {
     /// Returns whether a message waits.
     fn is_waiting(&self) -> bool;
 
-    /// Updates the parts that depend on whether the hub is available. [`QueueFiller::forward`] calls it after each poll
-    /// of the hub.
+    /// Tells the queue whether the hub is available. [`QueueFiller::forward`] calls this function after each poll of
+    /// the hub.
     fn set_hub_available(&mut self, hub_is_available: bool, now: WallTimestamp);
 
-    /// Settles the message that was taken last. If `is_sent` is false, it counts as not sent.
+    /// Settles the message that was taken last. If `is_sent` is false, the message counts as not sent.
     fn settle(&mut self, is_sent: bool);
 }
 
 /// Queue that two threads share.
 pub(crate) struct SharedQueue<Q>(Arc<(Mutex<Q>, Condvar)>);
 
-/// Receiver of a hub's samples, which fills a queue.
+/// Receives the samples of a hub, and adds them to a queue.
 pub(crate) struct QueueFiller<Q> {
     forwarder: Forwarder,
     queue: SharedQueue<Q>,
 }
 
-/// Sender of a queue's messages through a session. Each message belongs to a topic, which is given by its index.
+/// Sends the messages of a queue through a session. Each message belongs to a topic. Topics are identified by an index.
 pub(crate) trait Sender {
     /// Queue that holds the messages.
     type Queue: Queue;
@@ -47,8 +48,8 @@ pub(crate) trait Sender {
     /// Declares tokens, and publishers of new topics.
     fn declare(&mut self, queue: &SharedQueue<Self::Queue>) -> Result<(), Failure>;
 
-    /// Writes the message that has waited longest to `message`, counts it as sent until it is
-    /// [settled](Queue::settle), and returns its topic.
+    /// Writes the message that has waited longest to `message`, and returns the index of its topic. The message counts
+    /// as sent until it is [settled](Queue::settle).
     fn take(&mut self, queue: &mut Self::Queue, now: WallTimestamp, message: &mut Vec<u8>) -> Option<usize>;
 
     /// Sends `message`. Returns whether the links had room for it.
@@ -62,7 +63,7 @@ pub(crate) trait Sender {
 const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 /// Interval between checks of the links while there is no connection.
 const LINK_INTERVAL: Duration = Duration::from_millis(5);
-/// Time limit at the end of a run for messages that still wait.
+/// Maximum time at the end of a run for sending messages that still wait.
 const FLUSH_TIME: Duration = Duration::from_secs(1);
 
 impl<Q: Queue> QueueFiller<Q> {
@@ -73,7 +74,7 @@ impl<Q: Queue> QueueFiller<Q> {
         QueueFiller { forwarder, queue }
     }
 
-    /// Makes it an error if the hub does not have `sensor`, even if no topic of it is selected.
+    /// Requires that the hub has `sensor`, even if no topic of this sensor is selected.
     pub(crate) fn require(&mut self, sensor: &str) {
         self.forwarder.require(sensor);
     }
@@ -112,7 +113,7 @@ impl<Q: Queue> QueueFiller<Q> {
 impl<Q> SharedQueue<Q> {
     /// Locks the queue.
     pub(crate) fn lock(&self) -> MutexGuard<'_, Q> {
-        // No code panics while it holds the lock. Even if it did, the messages would be valid.
+        // No code panics while it holds the lock. Even after a panic, the messages would be valid.
         self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -143,7 +144,7 @@ impl<Q: Queue> SampleSink for SharedQueue<Q> {
 }
 
 /// Waits for the end of a thread that [sends](send) the messages of `queue`. If the thread still waits for room on a
-/// link after [`FLUSH_TIME`], it is abandoned until the process exits, and its message counts as not sent.
+/// link after [`FLUSH_TIME`], it is left running until the process exits, and its message counts as not sent.
 ///
 /// # Errors
 ///
@@ -164,7 +165,7 @@ pub(crate) fn join<Q: Queue>(
 }
 
 /// Sends the messages of `queue` until `is_over` is set, and then the messages that still wait, for at most
-/// [`FLUSH_TIME`]. Calls `open` to create the sender when the session is open.
+/// [`FLUSH_TIME`]. When the session is open, calls `open` to create the sender.
 pub(crate) fn send<'a, S: Sender>(
     queue: &SharedQueue<S::Queue>,
     connection: &'a Connection,
@@ -183,7 +184,7 @@ pub(crate) fn send<'a, S: Sender>(
             }
         }
         sender.declare(queue)?;
-        // Without a link, keep the newest messages for the next link.
+        // Without a link, keep the newest messages in the queue until there is a link.
         if !session.is_linked() {
             thread::sleep(LINK_INTERVAL);
             continue;

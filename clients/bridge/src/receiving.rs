@@ -1,4 +1,4 @@
-//! Receiver of samples from other machines over Zenoh. It checks each sample against the key that it arrived under,
+//! Receives samples from other machines over Zenoh. Checks that each sample matches the key under which it arrived,
 //! counts it, and publishes it as a topic of this machine. All queues are limited, and rejected input is counted.
 
 use std::collections::VecDeque;
@@ -19,7 +19,7 @@ use crate::session::{Connection, Subscriber, ZenohSession};
 
 /// Input from Zenoh.
 enum InboundEvent {
-    /// A payload with its key.
+    /// A key, and the payload that arrived under it.
     Sample(Box<str>, Vec<u8>),
     /// Key of a sensor that has appeared.
     Live(Box<str>),
@@ -41,13 +41,14 @@ struct Counts {
     overrun: AtomicU64,
 }
 
-/// Maximum number of inputs in the queue: 32 MB of the longest samples, or one second of many sensors.
+/// Maximum number of inputs in the queue. This is 32 MB if all samples have the maximum length, or the samples of many
+/// sensors in one second.
 const QUEUE_CAPACITY: usize = 512;
-/// Maximum length of a sample in one piece, in bytes.
+/// Maximum length of a sample that is not divided into parts, in bytes.
 const MAX_SAMPLE_LEN: usize = HEADER_LEN + u16::MAX as usize + MAC_LEN;
-/// Maximum length of a key, in bytes. Keys of scanhub have at most 56.
+/// Maximum length of a key, in bytes. The keys of scanhub have at most 56 bytes.
 const MAX_KEY_LEN: usize = 128;
-/// Maximum number of inputs that are handled before other work.
+/// Maximum number of inputs that are handled before the receiver does other work.
 const BATCH_SIZE: usize = 64;
 /// Maximum wait for input.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
@@ -110,7 +111,7 @@ pub(crate) fn run(
 impl InboxSender {
     /// Subscribes to announcements, samples of `topics`, and the tokens of sensors.
     fn listen(&self, session: &ZenohSession, topics: &[Topic]) -> Result<Vec<Subscriber>, Failure> {
-        // Use one key expression for all topics, so that a user with rights to all topics needs no others.
+        // Use one key expression for all topics. A user whose rights cover this expression then needs no other rights.
         let patterns = match topics.len() == Topic::ALL.len() {
             true => vec!["*"],
             false => std::iter::once(ANNOUNCE).chain(topics.iter().map(|topic| topic.name())).collect(),
@@ -141,7 +142,7 @@ impl InboxSender {
         }
     }
 
-    /// Adds an event without waiting, so that a sender that is too fast does not delay others.
+    /// Adds an event without waiting, so that a sender that is too fast does not delay other senders.
     fn put(&self, event: InboundEvent) {
         if self.to.try_send(event).is_err() {
             self.counts.overrun.fetch_add(1, Ordering::Relaxed);
@@ -153,7 +154,7 @@ type QueryFn<'a> = dyn Fn(&Address<'_>) -> Result<(), Failure> + 'a;
 
 struct ZenohReceiver<'a> {
     remote_receiver: RemoteReceiver<'a>,
-    /// Topics for which a new sensor is queried; `None` stands for its announcement.
+    /// Topics for which a new sensor is queried; `None` stands for the sensor's announcement.
     queried_topics: Vec<Option<Topic>>,
     query_queue: QueryQueue,
     counts: Arc<Counts>,
@@ -166,8 +167,8 @@ struct ZenohReceiver<'a> {
 }
 
 impl ZenohReceiver<'_> {
-    /// Handles the input in `inbox` until `is_over` is set. Then calls `close` to end the subscriptions, and handles
-    /// the rest of the queue.
+    /// Handles the input in `inbox` until `is_over` is set. Then calls `close`, which ends the subscriptions, and
+    /// handles the input that is left in `inbox`.
     fn run(
         &mut self,
         inbox: &Receiver<InboundEvent>,
@@ -192,7 +193,7 @@ impl ZenohReceiver<'_> {
         self.report_counters()
     }
 
-    /// Handles at most [`BATCH_SIZE`] inputs. Returns whether there may be more.
+    /// Handles at most [`BATCH_SIZE`] inputs. Returns whether there may be more inputs.
     fn take_batch(&mut self, inbox: &Receiver<InboundEvent>) -> Result<bool, ExitReason> {
         let mut next = inbox.recv_timeout(POLL_INTERVAL).ok();
         for _ in 0..BATCH_SIZE {
@@ -225,7 +226,7 @@ impl ZenohReceiver<'_> {
         self.remote_receiver.handle_datagram(payload, origin)
     }
 
-    /// Queries new sensors for their last samples, because the next ones may not arrive for a long time.
+    /// Queries new sensors for their last samples, because the next samples may not arrive for a long time.
     fn query_next(&mut self) -> Result<(), ExitReason> {
         while let Some((hub, sensor)) = self.query_queue.next(Instant::now()) {
             let queried = self
@@ -254,8 +255,8 @@ impl ZenohReceiver<'_> {
     }
 }
 
-/// Returns the topics for which a new sensor is queried if `topics` are received. The first is the announcement
-/// (`None`), because no sample is published without it.
+/// Returns the topics for which a new sensor is queried if the bridge receives `topics`. The first is the announcement
+/// (`None`), because no sample is published before the announcement has arrived.
 fn topics_to_query(topics: &[Topic]) -> Vec<Option<Topic>> {
     let stored = [Topic::Status, Topic::Background].into_iter().filter(|topic| topics.contains(topic));
     std::iter::once(None).chain(stored.map(Some)).collect()
@@ -276,7 +277,8 @@ struct QueryQueue {
 
 /// Maximum number of sensors that are queried in a second.
 const MAX_QUERIES_PER_SECOND: usize = 64;
-/// Maximum number of sensors that wait. This is enough for 16 s of queries, with at most 96 kB of names.
+/// Maximum number of sensors that wait for a query. The bridge queries this number in 16 s. The names need at most 96
+/// kB.
 const MAX_WAITING_SENSORS: usize = 1024;
 const SECOND: Duration = Duration::from_secs(1);
 
@@ -328,8 +330,8 @@ mod tests {
 
     const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 
-    /// Runs a receiver on `events`, with `is_over` set from the start or by the first query. Returns its output and the
-    /// number of queries.
+    /// Runs a receiver on `events`. `is_over` is set from the start, or by the first query. Returns the output of the
+    /// receiver and the number of queries.
     fn run(
         events: Vec<InboundEvent>,
         has_ended: bool,

@@ -16,7 +16,7 @@ use crate::session::LinkEvent;
 /// Writer of a bridge's reports.
 pub(crate) struct Report<'a> {
     json: bool,
-    /// Causes reported since the last connection, so that each remedy is printed once.
+    /// Causes reported since the last connection. The remedy of each is printed only once.
     reported: Vec<Diagnosis>,
     out: Output<'a>,
     notes: Output<'a>,
@@ -81,7 +81,7 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{message}"))
     }
 
-    /// Reports an event of a link. The first time that a cause occurs, its remedy is printed too.
+    /// Reports an event of a link. When a cause occurs for the first time, also prints the remedy.
     pub(crate) fn link(&mut self, event: &LinkEvent) -> Result<(), ExitReason> {
         let LinkEvent::Failing(words) = event else {
             let is_up = *event == LinkEvent::Up;
@@ -143,7 +143,7 @@ struct ReadyJson<'a> {
     pid: u32,
 }
 
-/// JSON line of class `bridge_refused` of a bridge that receives nothing.
+/// JSON line of class `bridge_refused`, for a bridge that receives nothing.
 #[derive(Serialize)]
 struct RefusedJson {
     class: &'static str,

@@ -27,8 +27,8 @@ use graph::{Graph, PublishedTopic};
 /// Options of the ROS 2 node.
 #[derive(Clone, Debug)]
 pub struct Ros2Options {
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`. A suffix `:every=N` sends only the samples of every Nth telegram. If
-    /// empty, all topics for which ROS has messages.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`. With the suffix `:every=N`, only the samples of every Nth telegram are
+    /// sent. If the list is empty, the node publishes all topics for which ROS has messages.
     pub topics: Vec<String>,
     /// Possible locations of the hub's domain.
     pub locations: Vec<Domain>,
@@ -38,7 +38,7 @@ pub struct Ros2Options {
     pub distro: Distro,
     /// Names of topics and frames.
     pub names: RosNames,
-    /// Whether the ROS 2 node reports events of the hub. Otherwise, the sender of datagrams reports them.
+    /// Whether the ROS 2 node reports events of the hub. If false, the sender of datagrams reports them.
     pub reports_hub: bool,
 }
 
@@ -70,7 +70,7 @@ pub(crate) fn run(
     let mut filler = QueueFiller::new(selection, &options.locations, graph);
     options.names.sensors_with_frame().for_each(|sensor| filler.require(sensor));
     let queue = filler.queue().clone();
-    // Set however this function ends, so that the sending thread stops waiting for a router.
+    // Set at the end of this function, even after an error, so that the sending thread stops waiting for a router.
     let is_done = Arc::new(AtomicBool::new(false));
     let work = {
         let (queue, connection, is_done) = (queue.clone(), connection.clone(), is_done.clone());
@@ -142,7 +142,7 @@ struct RosSender<'a> {
 /// Payload and attachment of the last message of a latched topic, kept for late joiners.
 type LastMessage = Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>>;
 
-/// A publisher of the node. Its tokens, and the queryable of a latched topic, are withdrawn when it is dropped.
+/// A publisher of the node. When it is dropped, its tokens and the queryable of a latched topic are withdrawn.
 struct RosPublisher {
     publisher: Publisher,
     gid: [u8; 16],

@@ -1,5 +1,5 @@
-//! Sender of a hub's topics under scanhub's own Zenoh keys: `scanhub/HUB/SENSOR/TOPIC`, with the datagrams of a gateway
-//! as payload. The newest sample of each topic waits until the links have room for it.
+//! Sends the topics of a hub under scanhub's own Zenoh keys: `scanhub/HUB/SENSOR/TOPIC`. The payloads are the datagrams
+//! of a gateway. The newest sample of each topic waits until the links have room for it.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -32,11 +32,12 @@ pub(crate) struct Datagrams {
     hub_is_available: bool,
     /// Number of the hub's runs so far.
     hub_runs: u64,
-    /// Message that was taken last and is not settled: sensor number, topic and length in bytes.
+    /// Message that was taken last, until it is settled: sensor number, topic and length in bytes.
     in_flight: Option<(u8, Option<Topic>, usize)>,
 }
 
-/// Takes the place of the interface in the name of the file that stores the bridge's identity.
+/// Word in the name of the file that stores the bridge's identity. A gateway has the name of its network interface
+/// there.
 const INTERFACE: &str = "bridge";
 
 impl BridgeSender {
@@ -110,7 +111,7 @@ impl Queue for Datagrams {
     fn set_hub_available(&mut self, hub_is_available: bool, _: WallTimestamp) {
         if hub_is_available && !self.hub_is_available {
             self.hub_runs += 1;
-            // Sensors of the previous run may not exist any more.
+            // Sensors of the previous run of the hub may no longer exist.
             self.outgoing.drop_kept();
         }
         self.hub_is_available = hub_is_available;
@@ -146,7 +147,7 @@ impl Transmit for NullTransmit {
     }
 }
 
-/// Sender of datagrams under their keys, which also replies to queries with the last ones.
+/// Sends datagrams under their keys, and replies to queries with the last datagrams.
 pub(crate) struct DatagramSender<'a> {
     session: &'a ZenohSession,
     hub: u64,
@@ -159,7 +160,7 @@ pub(crate) struct DatagramSender<'a> {
     _queryable: Queryable,
 }
 
-/// A topic of a sensor. After a restart of the hub with other links, a sensor number may belong to another sensor.
+/// A topic of a sensor. If the hub restarts with other links, a sensor number may belong to another sensor.
 struct SentTopic {
     number: u8,
     sensor: String,
@@ -243,7 +244,7 @@ impl Sender for DatagramSender<'_> {
         Ok(publisher.is_some_and(|publisher| self.session.put(publisher, message, None)))
     }
 
-    /// Queues the last announcement, whose counters include everything that was sent.
+    /// Queues the last announcement. Its counters include everything that was sent.
     fn finish(&mut self, queue: &mut Datagrams) -> bool {
         if self.is_finished {
             return false;

@@ -1,5 +1,5 @@
-//! A Zenoh session, independent of scanhub's topics. A background thread opens it. It creates publishers, tokens,
-//! subscribers and queryables, and reports the events of its links. Payloads are bytes.
+//! A Zenoh session, independent of scanhub's topics. A background thread opens the session. The session creates
+//! publishers, tokens, subscribers and queryables, and reports the events of its links. Payloads are bytes.
 
 mod config;
 mod log;
@@ -25,7 +25,7 @@ use log::{Log, without_locations};
 pub(crate) struct Connection {
     state: Arc<State>,
     log: Log,
-    /// Whether the session listens. Such a session opens at once or fails.
+    /// Whether the session listens. A session that listens opens at once or fails.
     listens: bool,
     /// Set once the bridge has reported that it is ready. No sample is received or sent earlier.
     has_begun: AtomicBool,
@@ -41,7 +41,7 @@ struct State {
 /// An event of the links.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum LinkEvent {
-    /// A link is connected, and before there was none.
+    /// The session has a link, after it had none.
     Up,
     /// The session has no more links.
     Down,
@@ -62,7 +62,7 @@ impl Connection {
         let log = Log::install();
         let (state, listens) = (Arc::new(State::default()), config.listens());
         let shared = state.clone();
-        // No call can end an attempt, so the thread runs until the process exits.
+        // No call can end an attempt to open a session, so the thread runs until the process exits.
         let opening = thread::Builder::new().name("opening".into()).spawn(move || {
             loop {
                 match zenoh::open(config.zenoh()).wait() {
@@ -120,7 +120,7 @@ impl Connection {
         self.state.session.get().is_some()
     }
 
-    /// Returns whether the session listens. It then needs no router.
+    /// Returns whether the session listens. A session that listens needs no router.
     pub(crate) fn listens(&self) -> bool {
         self.listens
     }
@@ -130,8 +130,8 @@ impl Connection {
         self.state.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Passes the link events since the last call to `report`. They do not include a final failure;
-    /// [`failure`](Connection::failure) returns that.
+    /// Passes each link event since the last call to `report`. A final failure is not among them;
+    /// [`failure`](Connection::failure) returns it.
     pub(crate) fn events<E>(&self, mut report: impl FnMut(LinkEvent) -> Result<(), E>) -> Result<(), E> {
         if self.listens && !self.is_open() {
             return Ok(());
@@ -152,8 +152,8 @@ impl Connection {
         self.log.count()
     }
 
-    /// Closes the session. A stalled link may delay this for ten seconds, so after [`CLOSE_TIMEOUT`] the session is
-    /// left to the end of the process. The peers notice that too.
+    /// Closes the session. A stalled link may delay this for ten seconds. Therefore, after [`CLOSE_TIMEOUT`], the
+    /// session stays open until the process exits. The peers detect that too.
     pub(crate) fn close(&self) {
         let Some(session) = self.state.session.get().map(|opened| opened.session.clone()) else { return };
         let closing = thread::Builder::new().name("closing".into()).spawn(move || {
@@ -177,15 +177,15 @@ pub(crate) struct ZenohSession {
 struct Links {
     checked: Option<Instant>,
     is_linked: bool,
-    /// Whether exactly one program is connected, and it is a client, which forwards nothing.
+    /// Whether exactly one program is connected, and this program is a client. A client forwards nothing.
     is_lone_client: bool,
 }
 
 /// Time for which a check is valid while there is a connection.
 const LINK_CHECK_LIFETIME: Duration = Duration::from_millis(10);
 
-/// A key to send under. A publisher of Zenoh is not used, because it loses its first sample while it finds the
-/// subscribers.
+/// A key under which samples are sent. Zenoh's own publisher is not used, because it loses the first sample while it
+/// searches for subscribers.
 pub(crate) struct Publisher {
     key_expr: KeyExpr<'static>,
 }
@@ -251,7 +251,7 @@ impl ZenohSession {
     /// The wait ends when the link breaks, or after 5 s (one client), 10 s (a router, from a client) or 1 s (several
     /// links), unless Zenoh's configuration file has other values. The payload is then lost on that link.
     pub(crate) fn put(&self, to: &Publisher, payload: &[u8], attachment: Option<&[u8]>) -> bool {
-        // A router would forward `Block`, and then one slow subscriber of the router would delay all others.
+        // A router would forward `Block`. Then one slow subscriber of the router would delay all other subscribers.
         let congestion_control = match self.links().is_lone_client {
             true => CongestionControl::Block,
             false => CongestionControl::Drop,
@@ -296,8 +296,8 @@ impl ZenohSession {
         subscriber.map(|_subscriber| Subscriber { _subscriber }).map_err(|error| failed(keys, &error))
     }
 
-    /// Replies to queries that intersect `keys`. `answer` returns the replies. Its argument is a function that checks
-    /// whether a key matches the query, which may have wildcards.
+    /// Replies to queries that intersect `keys`. `answer` returns the replies. The argument of `answer` is a function
+    /// that checks whether a key matches the query. A query may have wildcards.
     pub(crate) fn answer(
         &self,
         keys: &str,
@@ -307,7 +307,7 @@ impl ZenohSession {
             let is_queried =
                 |key: &str| KeyExpr::try_from(key).is_ok_and(|key| query.key_expr().intersects(&key));
             for Reply { key, payload, attachment } in answer(&is_queried) {
-                // The client may have exited, or it accepts only replies under the key of its query.
+                // Ignore an error: the client may have exited, or may accept only replies under the key of its query.
                 let _ = query.reply(key, payload).attachment(attachment).wait();
             }
         });

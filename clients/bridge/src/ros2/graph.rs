@@ -1,5 +1,5 @@
-//! ROS 2 topics that a bridge publishes for one hub. Each sample becomes a message. Messages of a topic wait in a
-//! queue, whose length is the depth in the topic's quality of service. Time is an argument.
+//! ROS 2 topics that a bridge publishes for one hub. Each sample becomes a message. The messages of a topic wait in a
+//! queue. The length of the queue is the depth in the topic's quality of service. Time is an argument.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU64;
@@ -19,7 +19,7 @@ pub(super) struct Graph {
     sensors: Vec<Sensor>,
     topics: Vec<PublishedTopic>,
     slots: Vec<Slot>,
-    /// Slot of each queued message, the longest waiting one first.
+    /// Slot of each queued message. The message that has waited longest is first.
     waiting: VecDeque<usize>,
     /// Message that [`take_next`](Graph::take_next) returned last. Its memory is reused.
     current: Vec<u8>,
@@ -37,7 +37,7 @@ pub(super) struct PublishedTopic {
     pub(super) name: String,
     pub(super) of: Type,
     pub(super) qos: Qos,
-    /// Messages that were sent, that newer messages replaced, and that could not be sent.
+    /// Number of messages that were sent, number that newer messages replaced, and number that could not be sent.
     pub(super) sent: u64,
     pub(super) replaced: u64,
     pub(super) failed: u64,
@@ -64,7 +64,7 @@ pub(super) struct QueuedMessage<'a> {
 struct Hub {
     /// Slot of the reports; `None` if the topic `status` is not selected.
     slot: Option<usize>,
-    /// Wall clock time since when the hub is unavailable, and of the last report.
+    /// Wall clock time at which the hub became unavailable, and wall clock time of the last report.
     missed_ns: Option<u64>,
     reported_ns: u64,
 }
@@ -74,13 +74,13 @@ struct Sensor {
     name: String,
     every: [Option<NonZeroU64>; TOPIC_COUNT],
     slots: TopicSlots,
-    /// Last scans by `seq`. The points of a foreground are computed from its scan.
+    /// Last scans by `seq`. The points of a foreground are computed from the scan with the same `seq`.
     scans: VecDeque<(u64, Box<Scan>)>,
     /// Foreground that arrived before its scan.
     pending_foreground: Option<(Header, Box<Foreground>)>,
     /// Points of the current sweep, if the sensor has clouds.
     sweep: SweepPoints,
-    /// Wall clock times of the last scan, of the last status, and of the last report about a missing status.
+    /// Wall clock time of the last scan, of the last status, and of the last report about a missing status.
     last_scan_ns: Option<u64>,
     last_status_ns: Option<u64>,
     reported_ns: u64,
@@ -100,11 +100,11 @@ struct TopicSlots {
     poses: Option<usize>,
 }
 
-/// Time after which a waiting message is dropped if its topic has a newer one. On a good network, a subscriber with a
-/// depth of five misses no message. On a slow network, old messages do not delay newer ones.
+/// Time after which a waiting message is dropped if its topic has a newer message. On a good network, a subscriber with
+/// a depth of five misses no message. On a slow network, old messages do not delay newer ones.
 const MAX_QUEUED_NS: u64 = 100_000_000;
 const TOPIC_COUNT: usize = Topic::ALL.len();
-/// Number of scans kept for their foregrounds.
+/// Number of scans of a sensor that are kept until their foregrounds arrive.
 const MAX_SCANS: usize = 4;
 /// Time without a status after which the state of a sensor is unknown. A hub sends a status once a second.
 const SILENT_AFTER_NS: u64 = 3_000_000_000;
@@ -133,8 +133,8 @@ impl Graph {
         graph
     }
 
-    /// Adds the sensor `name`, and returns its index. `every` returns N if the samples of every Nth telegram of a topic
-    /// are sent, or `None` if the topic is not sent.
+    /// Adds the sensor `name`, and returns its index. For each topic, `every` returns N if the samples of every Nth
+    /// telegram are sent, and `None` if no samples are sent.
     pub(super) fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
         let every = Topic::ALL.map(every);
         let mut slot = |topic: Topic, word: &str, of: Type| {
@@ -168,7 +168,7 @@ impl Graph {
         self.sensors.len() - 1
     }
 
-    /// Returns whether the graph uses samples of this topic. It needs scans also for their foregrounds, and the status
+    /// Returns whether the graph uses samples of this topic. The graph needs scans for foregrounds too, and the status
     /// for the pose.
     pub(super) fn needs(&self, sensor: usize, topic: Topic) -> bool {
         let is_sent = |topic: Topic| self.sensors[sensor].every[topic as usize].is_some();
@@ -232,8 +232,8 @@ impl Graph {
         }
     }
 
-    /// Queues the reports that are due, once a second: one on whether the hub runs, and one for each sensor without a
-    /// recent status, whose state is unknown.
+    /// Queues the reports that are due, once a second. One report states whether the hub runs. For each sensor without
+    /// a recent status, another report states that the state of the sensor is unknown.
     pub(super) fn report_silence(&mut self, is_hub_there: bool, now: WallTimestamp) {
         let now_ns = now.wall_ns;
         let missed_ns = *self.hub.missed_ns.get_or_insert(now_ns);
@@ -378,7 +378,8 @@ impl Graph {
         self.slots.len() - 1
     }
 
-    /// Queues a message in `slot`, which `write` fills. If the slot is full, the message replaces the oldest one.
+    /// Queues a message in `slot`. `write` fills the message. If the slot is full, the message replaces the oldest
+    /// message.
     fn write(&mut self, slot: Option<usize>, now: WallTimestamp, write: impl FnOnce(&mut Vec<u8>)) {
         let Some(index) = slot else { return };
         let slot = &mut self.slots[index];

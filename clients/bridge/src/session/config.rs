@@ -1,5 +1,5 @@
-//! Zenoh's configuration: the user's configuration file, the given addresses, and limits for settings that the file
-//! does not contain. A session listens or scouts only if the user or the file enables that.
+//! Zenoh's configuration. It consists of the user's configuration file, the given addresses, and limits for settings
+//! that the file does not contain. A session listens or scouts only if the options or the file enable that.
 
 use std::path::Path;
 
@@ -22,8 +22,8 @@ pub(crate) struct CheckedConfig {
 /// Keys of Zenoh's configuration, and the JSON values that they get if the file does not set them.
 ///
 /// Zenoh's defaults are chosen for throughput, and on a slow link samples in its long queues become old. With these
-/// limits, a message without room waits in this session, where newer samples replace older ones. A router on the path
-/// has its own settings.
+/// limits, a message for which a link has no room waits in this process, where newer samples replace older ones. A
+/// router on the path has its own settings.
 const LIMITS: &[(&str, &str)] = &[
     ("scouting/multicast/enabled", "false"),
     ("scouting/gossip/enabled", "false"),
@@ -35,20 +35,20 @@ const LIMITS: &[(&str, &str)] = &[
     ("transport/link/tx/batch_size", "8192"),
     ("transport/link/tx/queue/size/data", "1"),
     // Without batching, a sample is sent at once, as with Zenoh's `express`. But `express` would also apply to routers
-    // on the path, which have room for two batches, and drop the third.
+    // on the path. They have room for two batches, and drop the third.
     ("transport/link/tx/queue/batching/enabled", "false"),
     ("transport/link/rx/max_message_size", "1048576"),
     ("transport/link/tcp/so_sndbuf", "8192"),
     ("transport/link/tls/so_sndbuf", "8192"),
 ];
 
-/// Time in microseconds for which a message waits for room before Zenoh drops it: for a client, and for a router or
-/// peer. Zenoh then drops later messages too, until there is room. The second key is the additional wait of a message
-/// in fragments.
+/// Maximum time for which a message waits for room before Zenoh drops it, in microseconds. The first value is for a
+/// client, and the second for a router or peer. After a drop, Zenoh drops later messages too, until there is room. The
+/// second key is the additional wait of a message in fragments.
 ///
 /// A client has one link. It waits as long as a link without data stays open (10 s), so messages are dropped only if
 /// the link breaks. A longer wait would delay the detection of a dead link, because the waiting thread holds a lock of
-/// Zenoh. A router may have many links, and one that stalls must not delay the others.
+/// Zenoh. A router may have many links, and a stalled link must not delay the others.
 const WAIT_SETTINGS: [(&str, [&str; 2]); 2] = [
     ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["10000000", "1000000"]),
     ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", ["0", "2000000"]),
@@ -158,7 +158,7 @@ fn read(path: &Path) -> Result<Config, Failure> {
     })
 }
 
-/// Sets a key that this module chooses. Key and value are valid in Zenoh, which a test checks.
+/// Sets a key that this module chooses. A test checks that key and value are valid in Zenoh.
 fn set(config: &mut Config, key: &str, value: &str) {
     let set = config.insert_json5(key, value);
     debug_assert!(set.is_ok(), "{key} = {value}: {set:?}");
@@ -208,19 +208,20 @@ fn check_file(config: &Config, key: &str, content: Content, now_s: i64) -> Resul
 }
 
 /// Reason why a certificate or key file cannot be used. This module checks the files, because Zenoh opens them only
-/// when it connects, and reports an expired certificate with the message of the peer.
+/// when it connects. For an expired certificate, Zenoh then reports only the message of the peer.
 struct UnusableFile {
     reason: String,
     remedy: &'static str,
 }
 
-/// Checks that the first certificate in `text`, which this machine presents, is valid `now_s` seconds after 1970.
+/// Checks that the first certificate in `text` is valid at the time `now_s`, in seconds since 1970. This machine
+/// presents this certificate to others.
 fn check_own(text: &[u8], now_s: i64) -> Result<(), UnusableFile> {
     check_validity(&certificates(text)?[0], now_s)
 }
 
-/// Checks that at least one certificate in `text`, which this machine trusts, is valid `now_s` seconds after 1970.
-/// Others in the list may have expired.
+/// Checks that at least one certificate in `text` is valid at the time `now_s`, in seconds since 1970. This machine
+/// trusts these certificates. Others in the list may have expired.
 fn check_trusted(text: &[u8], now_s: i64) -> Result<(), UnusableFile> {
     let certificates = certificates(text)?;
     let is_good = certificates[1..].iter().any(|block| check_validity(block, now_s).is_ok());

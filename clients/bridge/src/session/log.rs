@@ -1,5 +1,5 @@
-//! Zenoh's log lines about failed connections, which are the only source of the reason. The newest lines wait here
-//! until they are reported, each once. All other log lines are ignored.
+//! Collects Zenoh's log lines about failed connections. Only these lines contain the reason of a failure. The newest
+//! lines wait until they are reported, each once. All other log lines are ignored.
 
 use std::collections::VecDeque;
 use std::fmt::{Debug, Write};
@@ -16,31 +16,32 @@ pub(super) struct Log(Arc<Mutex<Lines>>);
 #[derive(Default)]
 struct Lines {
     waiting: VecDeque<String>,
-    /// Lines that were reported or wait, so that each is reported once.
+    /// Lines that were reported or still wait. A line that is in this list is not reported again.
     recent: VecDeque<String>,
     count: u64,
 }
 
-/// Maximum number of waiting lines, and of recent lines. Bounded because any program that can connect can cause lines.
+/// Maximum number of waiting lines, and maximum number of recent lines. Any program that can connect can cause lines,
+/// so both lists are limited.
 const MAX_LINES: usize = 16;
 /// Maximum length of a line in bytes.
 const MAX_LINE_LEN: usize = 500;
 
-/// Texts after which a line is cut, and the number of bytes of the text that are kept. The rest differs in each attempt
-/// (time until the next attempt, local port), or is advice for another system.
+/// Texts at which a line is cut, and the number of bytes of the text that are kept. The rest of the line differs in
+/// each attempt (time until the next attempt, local port), or is advice for another system.
 const CUT_MARKERS: [(&str, usize); 3] =
     [(" Retry in ", 0), ("Syn on: ", 3), (" Hint: increase the system", 0)];
 /// Suffix that Zenoh adds to addresses because of the settings in `config.rs`.
 const OUR_LIMIT: &str = "#so_sndbuf=8192";
 
-/// Messages that Zenoh logs only at debug level: source and start of the text. They have the reasons why a lost
-/// connection does not return, and why an incoming connection was refused.
+/// Messages that Zenoh logs only at debug level: source, and start of the text. They have the reason why a lost
+/// connection cannot be restored, or why an incoming connection was refused.
 const QUIET_MESSAGES: [(&str, &str); 3] = [
     ("zenoh::net::runtime::orchestrator", "Unable to connect"),
     ("zenoh_link_tls::unicast", "Can not accept"),
     ("zenoh_transport::unicast::establishment::accept", ""),
 ];
-/// Start of Zenoh's line about a link that it closes because it has no room. Such a connection was not refused.
+/// Start of Zenoh's line about a link that Zenoh closes because the link has no room. This connection was not refused.
 const CLOSED_MESSAGE: &str = "Unable to push";
 /// Start of a message about a connection that was accepted.
 const ACCEPTED_MESSAGE: &str = "New transport";
