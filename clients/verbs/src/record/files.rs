@@ -1,4 +1,4 @@
-//! Files of a run: their names, the limits at which the next one starts, and the removal of old ones.
+//! Files of a run: their names, the limits at which the next file starts, and the removal of old files.
 //!
 //! With `--force`, files of earlier runs count as kept files too. Each file is checked again just before it is removed.
 //! A file that another recorder writes, or that is not a recording, is therefore never removed.

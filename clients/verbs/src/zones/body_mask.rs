@@ -18,7 +18,7 @@ const MAX_RANGE_MM: u32 = 65_000;
 const MARGIN_MM: u32 = 50;
 /// Margin in mm for a beam that meets only the body. It can be large, because the beam sees nothing else that the mask
 /// could hide. One reading in a hundred is off by 60 mm. With a smaller margin, these readings would cause a stop every
-/// few seconds. The margin is four times these 60 mm, as a standard deviation.
+/// few seconds. The margin is four standard deviations of 60 mm.
 const HIDDEN_MARGIN_MM: u32 = 250;
 /// Minimum share of body readings in the scans of a beam for which the beam counts as meeting only the body.
 const FULL_SHARE: f64 = 0.9;
