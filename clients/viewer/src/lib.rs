@@ -1,7 +1,7 @@
 //! Live pictures of a hub's sensors: `watch` in a terminal, and `web` for browsers and Foxglove.
 //!
-//! Both verbs update a [`scene`] from the topics of a hub, so their pictures cannot disagree. Only the [`server`] of
-//! `web` handles untrusted input. It only has channels of bytes, and a test checks that it uses neither a hub nor a
+//! Both verbs update a [`scene`] from the topics of a hub, so their pictures always agree. Only the [`server`] of `web`
+//! handles untrusted input. The server only has channels of bytes, and a test checks that it uses neither a hub nor a
 //! file.
 #![forbid(unsafe_code)]
 

@@ -1,5 +1,5 @@
-//! Scene of a running hub, for `watch` and `web`: the topics to subscribe to, the effect of samples and notices, the
-//! join of each scan with its foreground, and the CPU time of the hub.
+//! Scene of a running hub, for `watch` and `web`. Selects the topics to subscribe to, updates the scene with samples
+//! and notices, joins each scan with its foreground, and measures the CPU time of the hub.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
@@ -14,8 +14,8 @@ use scanhub_verbs::names::TopicName;
 
 use crate::scene::Scene;
 
-/// Topics of every picture. The status is first, because it has the pose of its sensor. [`Topic::Lines`] costs the hub
-/// CPU time while it has a subscriber, so a picture subscribes to it only while it shows lines.
+/// Topics that every picture needs. The status is first, because it has the pose of the sensor. [`Topic::Lines`] costs
+/// the hub CPU time while it has a subscriber, so a picture subscribes to it only while it shows lines.
 pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Status,
     Topic::Scan,
@@ -27,9 +27,9 @@ pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Tracks,
 ];
 
-/// Returns the topics to follow for the named `sensors`, and those to follow for every sensor. Without names, these are
-/// the topics of all sensors of a hub and of all programs that publish. If a name belongs to a program in the first
-/// live domain of `locations`, all sensors are followed too.
+/// Returns the topics to subscribe to for the named `sensors`, and the topics to subscribe to for every sensor. Without
+/// names, returns the topics of all sensors of a hub and of all programs that publish. If a name belongs to a program
+/// in the first live domain of `locations`, the picture also has all sensors.
 pub(crate) fn topics_to_follow(
     sensors: &[String],
     requested: &[Topic],
@@ -64,19 +64,19 @@ pub(crate) struct LiveScene {
 
 type StampedScan = (Header, Box<Scan>);
 
-/// A scan with its header, and the foreground that the hub computed from the same telegram. The scene shows a scan at once,
-/// without its foreground. A trail needs both.
+/// A scan with its header, and the foreground that the hub computed from the same telegram. The scene shows a scan at
+/// once, without its foreground. A trail needs the scan and the foreground.
 pub(crate) type Pair = (StampedScan, Box<Foreground>);
 
 impl LiveScene {
-    /// Adds the sensor of a topic that will be followed, if the topic belongs to a link.
+    /// Adds the sensor of a topic that will be subscribed to, if the topic belongs to a link.
     pub(crate) fn begin(&mut self, name: &TopicName) {
         if name.topic.publisher_kind() == PublisherKind::Link {
             self.scene.sensor(&name.sensor);
         }
     }
 
-    /// Updates the scene with a `sample` of `name`. Returns a scan and its foreground if the sample has completed the
+    /// Updates the scene with a `sample` of `name`. If `sample` completes a pair of scan and foreground, returns the
     /// pair.
     pub(crate) fn take(&mut self, name: &TopicName, sample: &Sample) -> Option<Pair> {
         let now_ns = clock::now_ns();
@@ -144,12 +144,12 @@ impl LiveScene {
         }
     }
 
-    /// Deletes data that is too old. Returns whether there was any.
+    /// Deletes data that is too old. Returns whether any was deleted.
     pub(crate) fn expire(&mut self) -> bool {
         self.scene.expire(clock::now_ns())
     }
 
-    /// Drops samples whose partners do not arrive. Call it after all waiting samples were taken.
+    /// Drops samples whose partners do not arrive. Call this function after all waiting samples were taken.
     pub(crate) fn expire_joins(&mut self) {
         let now_ns = clock::now_ns();
         self.joins.values_mut().for_each(|join| join.expire(now_ns));
@@ -169,13 +169,13 @@ impl LiveScene {
 #[derive(Debug, Default)]
 struct CpuUsage {
     pid: u32,
-    /// Time of each measurement, and the total CPU time at that time in ns.
+    /// Time of each measurement, and the total CPU time of the process at that time, in ns.
     samples: VecDeque<(Instant, u64)>,
 }
 
 impl CpuUsage {
-    /// Measures process `pid`, at most once a second. Returns percent of one processor over the last five seconds, if
-    /// known.
+    /// Measures process `pid`, at most once a second. Returns the CPU time over the last five seconds in percent of one
+    /// processor, if it is known.
     fn measure(&mut self, pid: u32, now: Instant) -> Option<f64> {
         if self.pid != pid {
             *self = CpuUsage { pid, samples: VecDeque::new() };
@@ -192,8 +192,8 @@ impl CpuUsage {
     }
 }
 
-/// Returns the CPU time of `pid` in ns, user and system, including threads that have ended. `None` if it is not
-/// accessible.
+/// Returns the CPU time of process `pid` in ns: user and system time, including threads that have ended. Returns `None`
+/// if it is not accessible.
 ///
 /// The sum over the running threads would have a finer resolution than a tick, but it decreases when a thread ends.
 fn used_ns(pid: u32) -> Option<u64> {
@@ -249,7 +249,7 @@ mod tests {
         assert_eq!(cpu.measure(me, begin), None, "one measurement has no span");
         let before = used_ns(me).unwrap();
         let mut sum = 0_u64;
-        // The kernel counts in ticks, so use CPU time until it has counted one.
+        // The kernel counts in ticks, so use CPU time until the kernel has counted a tick.
         while used_ns(me).unwrap() == before && begin.elapsed() < Duration::from_secs(20) {
             sum = std::hint::black_box(sum + 1);
         }

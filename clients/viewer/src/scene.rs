@@ -1,6 +1,6 @@
-//! Contents of every picture of the robot: points in its frame, circles with their verdict, people, and the state of
-//! each sensor with rate, age and losses. The terminal and the browser draw the same scene, so they cannot disagree.
-//! Callers pass the time.
+//! Contents of every picture of the robot: points in the robot's frame, circles with their verdict, people, and the
+//! state of each sensor with rate, age and losses. The terminal and the browser draw the same scene, so they always
+//! agree. Callers pass the time.
 
 mod people;
 mod pointer;
@@ -21,7 +21,7 @@ pub struct Point {
     pub y_m: f64,
     /// Index of the beam in its scan.
     pub beam: usize,
-    /// Intensity of the echo in the sensor's own units, if it measures that.
+    /// Intensity of the echo in the sensor's own units, if the sensor measures intensities.
     pub intensity: Option<u16>,
     /// Whether the point is part of the foreground.
     pub is_foreground: bool,
@@ -64,8 +64,8 @@ impl Scene {
         &mut self.sensors[at]
     }
 
-    /// Returns the sensor from which a sample with this `header` arrived. A header proves that a hub runs, and names
-    /// its process unless the sensor is remote.
+    /// Returns the sensor `name`, from which a sample with this `header` arrived. A sample with a header shows that a
+    /// hub runs. Unless the sensor is remote, the header has the hub's process ID.
     pub fn sensor_of_sample(&mut self, name: &str, header: Option<&Header>) -> &mut Sensor {
         if let Some(header) = header {
             self.hub_is_running = true;
@@ -76,8 +76,8 @@ impl Scene {
         self.sensor(name)
     }
 
-    /// Stores people of the tracker `name` that arrived at `now_ns`, and the poses of the tracker's sensors. From then
-    /// on, these sensors are shown in its map, unless another tracker sends other poses.
+    /// Stores the people of the tracker `name`, which arrived at `now_ns`, and the poses of the tracker's sensors. From
+    /// then on, these sensors are shown in the tracker's map, unless another tracker sends other poses.
     pub fn take_tracks(&mut self, name: &str, tracks: &Tracks, now_ns: u64) {
         let at = self.trackers.iter().position(|(known, _)| known == name).unwrap_or_else(|| {
             self.trackers.push((name.to_owned(), People::default()));
@@ -96,19 +96,19 @@ impl Scene {
         self.trackers.iter().flat_map(|(_, people)| people.known())
     }
 
-    /// Returns whether the picture is the map of a site, because a tracker sent poses of its sensors there.
+    /// Returns whether the picture is the map of a site. It is if a tracker has sent poses of sensors in its map.
     pub fn is_in_map(&self) -> bool {
         self.sensors.iter().any(|sensor| sensor.placement.is_in_map())
     }
 
-    /// Returns the sensors of the robot with their indices, or all sensors if the robot has none. Sensors of other
-    /// machines are on other robots.
+    /// Returns the sensors of the robot with their indices, or all sensors if the robot has none. Remote sensors belong
+    /// to other robots.
     pub fn robot(&self) -> impl Iterator<Item = (usize, &Sensor)> {
         let has_own = self.sensors.iter().any(|sensor| !is_remote(&sensor.name));
         self.sensors.iter().enumerate().filter(move |(_, sensor)| !has_own || !is_remote(&sensor.name))
     }
 
-    /// Deletes scans, trails and people that are too old at `now_ns`. Returns whether there were any.
+    /// Deletes scans, trails and people that are too old at `now_ns`. Returns whether any were deleted.
     pub fn expire(&mut self, now_ns: u64) -> bool {
         let mut any = false;
         for sensor in &mut self.sensors {
@@ -125,7 +125,7 @@ impl Scene {
         self.sensors.iter_mut().for_each(|sensor| sensor.lines = None);
     }
 
-    /// Deletes all data of a hub that has exited, except for the background, which is only drawn.
+    /// Deletes all data of a hub that has exited. The background stays, because it is only drawn.
     pub fn on_hub_exit(&mut self) {
         (self.hub_is_running, self.hub_pid, self.hub_percent) = (false, 0, None);
         self.trackers.clear();
@@ -133,8 +133,8 @@ impl Scene {
     }
 }
 
-/// Returns the worst verdict of `sensors`, the first sensor that has it, and the smallest distance of a point from the
-/// robot's center in mm. Without sensors, the verdict is unknown.
+/// Returns the worst verdict of `sensors`, the first sensor with this verdict, and the smallest distance between a
+/// point and the robot's center in mm. Without sensors, the verdict is unknown.
 pub fn verdict<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> (Verdict, Option<&'a str>, Option<u32>) {
     let (mut worst, mut nearest): (Option<(Verdict, &str)>, Option<u32>) = (None, None);
     for sensor in sensors {
@@ -153,17 +153,18 @@ pub fn verdict<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> (Verdict, Optio
 pub struct Circle {
     /// Radius in meters.
     pub radius_m: f64,
-    /// Worst verdict of all sensors: clear while the circle is not violated, and stop if it is the innermost one.
+    /// Worst verdict of all sensors for this circle: clear while the circle is not violated, and stop if the innermost
+    /// circle is violated.
     pub verdict: Verdict,
 }
 
 impl Circle {
-    /// Returns whether enough beams of enough scans are inside.
+    /// Returns whether enough beams of enough scans end inside the circle.
     pub fn is_violated(&self) -> bool {
         self.verdict != Verdict::Clear
     }
 
-    /// Returns the points of `sensor` that are inside, if the circle is violated in its view.
+    /// Returns the points of `sensor` inside the circle, if this sensor reports a violation of the circle.
     pub fn inside<'a>(&self, sensor: &'a Sensor) -> impl Iterator<Item = Point> + use<'a> {
         let radius_m = self.radius_m;
         let own = |zone: &&Zone| f64::from(zone.radius_mm) / 1000.0 == radius_m;

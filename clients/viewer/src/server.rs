@@ -1,5 +1,6 @@
-//! Web server with one page and one WebSocket of the protocol `foxglove.sdk.v1`, which the page and other viewers use
-//! alike. One thread serves all clients. A slow client gets only the newest messages, and does not delay the others.
+//! Web server with one page and one WebSocket. The page and other viewers use the WebSocket with the protocol
+//! `foxglove.sdk.v1`. One thread serves all clients. A slow client gets only the newest messages, and does not delay
+//! the others.
 
 mod channels;
 mod connection;
@@ -32,12 +33,13 @@ pub use http::AccessPolicy;
 
 /// Maximum number of connections, including those that only fetch the page.
 const MAX_CONNECTIONS: usize = 64;
-/// Number of ports after the configured one that are tried if it is in use.
+/// Number of further ports that are tried if the configured port is in use.
 const PORT_ATTEMPTS: u16 = 20;
-/// Size of the kernel's send buffer in bytes. It is small, because data in it grows old if the client is slow.
+/// Size of the kernel's send buffer in bytes. The buffer is small, because data in it becomes old if the client is
+/// slow.
 const SEND_BUFFER_LEN: usize = 64 << 10;
-/// Time without accepting connections after descriptors ran out. Otherwise, the waiting connection would keep the
-/// thread busy.
+/// Time for which no connections are accepted after descriptors ran out. Without this pause, the waiting connection
+/// would keep the thread busy.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 /// Minimum interval between two reports that no connection can be accepted.
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
@@ -202,8 +204,7 @@ impl Server {
             if stream.set_nonblocking(true).is_err() {
                 continue;
             }
-            // At the limit, a client that has sent no request is disconnected, so that idle clients cannot block
-            // others.
+            // At the limit, disconnect a client that has sent no request, so that idle clients cannot block others.
             if connections.len() >= MAX_CONNECTIONS {
                 let Some(silent) = connections.iter().position(Connection::is_silent) else { continue };
                 connections.remove(silent);
@@ -220,7 +221,8 @@ fn cannot_listen(address: SocketAddr, error: &io::Error) -> Failure {
     Failure::new(Kind::Failed, format!("cannot listen on {address}: {error}"), hint)
 }
 
-/// Returns a random ID for this run of the server. Time and process ID repeat, above all in containers.
+/// Returns a random ID for this run of the server. Time and process ID are not used, because they can repeat, above all
+/// in containers.
 fn session() -> Result<String, Failure> {
     let no_random =
         |why: &str| Failure::new(Kind::Failed, format!("no random numbers: {why}"), "start it again");

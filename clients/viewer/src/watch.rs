@@ -47,9 +47,9 @@ Keys: q quits, ? lists the other keys. NO_COLOR=1 shows signs instead of colours
 
 /// Minimum interval between frames, so that a scan is on the screen within 50 ms.
 const FRAME_INTERVAL: Duration = Duration::from_millis(45);
-/// Bytes per second that frames may need. On a slow line there are fewer frames.
+/// Maximum number of bytes of frames per second. Large frames are drawn less often.
 const BYTES_PER_SECOND: f64 = 80_000.0;
-/// Time for which a message takes the place of the keys.
+/// Time for which a message is shown instead of the keys.
 const MESSAGE_TIME: Duration = Duration::from_secs(4);
 
 impl WatchArgs {
@@ -118,7 +118,7 @@ pub fn can_show_pictures() -> bool {
 struct Watcher<'a> {
     /// Locations where the domain may be.
     locations: &'a [Domain],
-    /// Whether the run ends by itself, so that Ctrl-C is a failure.
+    /// Whether the run ends by itself. Ctrl-C is then a failure.
     is_bounded: bool,
     live: LiveScene,
     /// Scene of the frozen picture. Its verdict and the lines of sensors are still live.
@@ -134,7 +134,7 @@ struct Watcher<'a> {
 }
 
 impl Watcher<'_> {
-    /// Shows a message in place of the keys.
+    /// Shows a message instead of the keys.
     fn show_message(&mut self, message: String, now: Instant) {
         self.view.message = message;
         self.message_until = Some(now + MESSAGE_TIME);
@@ -219,7 +219,7 @@ impl Watcher<'_> {
                         self.show_message(format!("{message}: {hint}"), Instant::now());
                     }
                 }
-                // Keep the topics that are already followed.
+                // Keep the topics that the run has already subscribed to.
                 Event::ResourceExhausted(name, Failure { message, hint, .. }) => {
                     self.show_message(format!("{name} is not shown: {message}; {hint}"), Instant::now());
                 }
@@ -282,7 +282,7 @@ impl BackgroundRequest {
         true
     }
 
-    /// Returns the outcome once, after the request has ended.
+    /// Returns the outcome after the request has ended. Returns it to only one call.
     fn outcome(&mut self) -> Option<RequestOutcome> {
         self.running.take_if(|running| running.is_finished())?.join().ok()
     }

@@ -230,8 +230,8 @@ fn urls(address: SocketAddr, reachable: &[IpAddr], host: &str, token: Option<&st
     if urls.is_empty() { vec![of(&address)] } else { urls }
 }
 
-/// Returns the addresses by which other machines can reach this one. Empty if the system does not report them. Omits
-/// link-local IPv6 addresses, because a browser needs the interface too.
+/// Returns the addresses by which other machines can reach this machine. The list is empty if the system does not
+/// report them. Omits link-local IPv6 addresses, because a browser needs the interface too.
 fn reachable_addresses() -> Vec<IpAddr> {
     let up = getifaddrs().into_iter().flatten().filter(|entry| entry.flags.contains(InterfaceFlags::IFF_UP));
     let addresses = up.filter_map(|entry| {
@@ -361,7 +361,8 @@ impl Reporter<'_> {
         }
     }
 
-    /// Prints that a topic is not served, because the system lacks a resource, unless that was just printed.
+    /// Prints that a topic is not served because the system lacks a resource, unless a line about this was just
+    /// printed.
     fn not_served(&mut self, name: &TopicName, failure: &Failure) -> Result<(), ExitReason> {
         let now = Instant::now();
         if self.next_shortage_report.is_some_and(|at| now < at) {

@@ -1,4 +1,5 @@
-//! People of a tracker: position and its uncertainty, room, and positions of the last seconds. Callers pass the time.
+//! People of a tracker: each has a position with its uncertainty, a room, and the positions of the last seconds.
+//! Callers pass the time.
 
 use std::collections::VecDeque;
 
@@ -25,7 +26,7 @@ pub struct Person {
     pub ellipse: Ellipse,
     /// Name of the room, if the person is in one.
     pub room: Option<String>,
-    /// Times in ns of CLOCK_MONOTONIC and positions of the last seconds, the oldest first.
+    /// Positions of the last seconds, the oldest first, each with its time in ns of CLOCK_MONOTONIC.
     tail: VecDeque<(u64, (f64, f64))>,
 }
 
@@ -102,7 +103,7 @@ impl People {
         self.expire(now_ns);
     }
 
-    /// Deletes positions and people that are too old at `now_ns`. Returns whether there were any.
+    /// Deletes positions and people that are too old at `now_ns`. Returns whether any were deleted.
     pub(crate) fn expire(&mut self, now_ns: u64) -> bool {
         let steps = |people: &People| people.people.iter().map(|person| person.tail.len() + 1).sum::<usize>();
         let before = steps(self);
@@ -126,8 +127,8 @@ impl People {
     }
 }
 
-/// Returns the number of people in each room as text, sorted by name, with those outside all rooms at the end. `None`
-/// if there are no people.
+/// Returns the number of people in each room as text, sorted by the room's name. People outside all rooms are at the
+/// end. Returns `None` if there are no people.
 pub fn rooms<'a>(people: impl Iterator<Item = &'a Person>) -> Option<String> {
     let mut rooms: Vec<_> = people.map(|person| person.room.as_deref()).collect();
     rooms.sort_by_key(|room| (room.is_none(), *room));
@@ -186,7 +187,7 @@ mod tests {
         assert!(near(along.yaw_rad, 0.0));
         let across = Ellipse::of([0.01, 0.0, 0.25]);
         assert!(near(across.long_m, along.long_m) && near(across.yaw_rad.abs(), 90_f64.to_radians()));
-        // Turned by 30 degrees.
+        // Rotated by 30 degrees.
         let (sin, cos) = 30_f64.to_radians().sin_cos();
         let turned =
             [0.25 * cos * cos + 0.01 * sin * sin, 0.24 * sin * cos, 0.25 * sin * sin + 0.01 * cos * cos];

@@ -6,11 +6,11 @@ use super::{Point, Sensor};
 /// Position under the pointer.
 #[derive(Clone, Copy, Debug)]
 pub struct PointerPosition<'a> {
-    /// Meters ahead of the robot's center; the coordinate of the point if there is a reading.
+    /// Meters ahead of the robot's center. If there is a reading, this is the coordinate of its point.
     pub x_m: f64,
     /// Meters to the left of the robot's center.
     pub y_m: f64,
-    /// Reading of the nearest point, if one is near enough.
+    /// Reading of the nearest point, if a point is near enough.
     pub reading: Option<Reading<'a>>,
 }
 
@@ -28,8 +28,8 @@ pub struct Reading<'a> {
 }
 
 impl<'a> PointerPosition<'a> {
-    /// Returns the position `at_m`, in meters ahead and to the left, or the nearest point of `sensors` if one is within
-    /// `within_m`.
+    /// Returns the nearest point of `sensors`, if it is within `within_m` of `at_m`, and otherwise the position `at_m`.
+    /// `at_m` is in meters ahead and to the left.
     pub fn of(
         sensors: impl Iterator<Item = &'a Sensor>,
         at_m: (f64, f64),
@@ -45,8 +45,8 @@ impl<'a> PointerPosition<'a> {
         self.x_m.hypot(self.y_m)
     }
 
-    /// Returns the lines of text about the position, the most important first: distance, coordinates, and for a point
-    /// the sensor with angle and range, and the intensity.
+    /// Returns lines of text about the position, the most important first: distance and coordinates. For a point, also
+    /// sensor, angle, range and intensity.
     pub fn text_lines(&self) -> Vec<String> {
         let mut words = vec![
             format!("{} m from the robot", fixed(self.distance_m(), 2)),

@@ -1,5 +1,5 @@
-//! One sensor of a scene: its last samples, its placement, the trail of its foreground, the rate and age of its scans,
-//! and the reason for a silence. Callers pass the time.
+//! One sensor of a scene: last samples, placement, trail of the foreground, rate and age of the scans, and the reason
+//! for a silence. Callers pass the time.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use super::{Point, point_m};
 /// The last samples of one sensor.
 #[derive(Clone, Debug, Default)]
 pub struct Sensor {
-    /// Name of the sensor; that of a remote sensor begins with the name of its machine.
+    /// Name of the sensor. The name of a remote sensor begins with the name of its machine.
     pub name: String,
     /// Last status of the sensor's link.
     pub status: Option<Status>,
@@ -71,7 +71,7 @@ impl Sensor {
         self.flags = header.flags;
     }
 
-    /// Stores a foreground. It is drawn on the last scan, even if that scan comes from another telegram.
+    /// Stores a foreground. It is drawn on the last scan, even if the scan comes from another telegram.
     pub fn take_foreground(&mut self, foreground: &Foreground) {
         self.foreground = Some(foreground.boxed());
     }
@@ -93,7 +93,7 @@ impl Sensor {
         }
     }
 
-    /// Deletes a scan and steps of the trail that are too old at `now_ns`. Returns whether there were any.
+    /// Deletes the scan and steps of the trail if they are too old at `now_ns`. Returns whether any were deleted.
     pub(super) fn expire(&mut self, now_ns: u64) -> bool {
         let is_old = self.scan.is_some() && now_ns >= self.old_at_ns;
         if is_old {
@@ -104,15 +104,15 @@ impl Sensor {
         self.trail.expire(now_ns) | is_old
     }
 
-    /// Deletes all data of a hub that has exited, except for the background, which is only drawn.
+    /// Deletes all data of a hub that has exited. The background stays, because it is only drawn.
     pub(super) fn on_hub_exit(&mut self) {
         let background = self.background.take();
         let Sensor { placement, missed, .. } = *self;
         *self = Sensor { placement, background, missed, ..Sensor::new(&self.name) };
     }
 
-    /// Returns the brightness of a point with this `intensity`, from 0 to 1. It is the square root of the intensity's
-    /// share of the highest one, because most points are dark.
+    /// Returns the brightness of a point with this `intensity`, from 0 to 1. It is the square root of `intensity`
+    /// divided by the highest intensity, because most points are dark.
     pub fn shade(&self, intensity: u16) -> f64 {
         (f64::from(intensity) / self.brightest).min(1.0).sqrt()
     }
@@ -125,7 +125,7 @@ impl Sensor {
         }
     }
 
-    /// Returns why the sensor sends no scans, and the remedy; `None` while its scans arrive.
+    /// Returns the reason why the sensor sends no scans, and the remedy. Returns `None` while scans arrive.
     pub fn problem(&self) -> Option<Problem> {
         self.scan.is_none().then(|| Problem::of_silent(&self.name, self.status.as_ref()))
     }
@@ -208,15 +208,15 @@ impl SensorPlacement {
     }
 }
 
-/// Positions of a sensor's foreground over the last moments, in steps that are few enough to be drawn.
+/// Positions of a sensor's foreground over the last moments. The number of steps is small enough to draw all of them.
 #[derive(Clone, Debug, Default)]
 pub struct Trail {
-    /// Time of each step in ns of CLOCK_MONOTONIC, and its points in meters in the robot's frame; the oldest first.
+    /// Steps, the oldest first: the time in ns of CLOCK_MONOTONIC, and the points in meters in the robot's frame.
     steps: VecDeque<(u64, Vec<(f64, f64)>)>,
 }
 
 impl Trail {
-    /// Adds the foreground of `now_ns`, unless the last step was just before.
+    /// Adds the foreground that arrived at `now_ns`, unless the last step is newer than [`STEP_INTERVAL_NS`].
     fn take(&mut self, now_ns: u64, points: impl FnOnce() -> Vec<(f64, f64)>) {
         if self.steps.back().is_none_or(|(at_ns, _)| now_ns >= at_ns + STEP_INTERVAL_NS) {
             self.steps.push_back((now_ns, points()));
@@ -224,7 +224,7 @@ impl Trail {
         self.expire(now_ns);
     }
 
-    /// Deletes steps that are too old at `now_ns`. Returns whether there were any.
+    /// Deletes steps that are too old at `now_ns`. Returns whether any were deleted.
     fn expire(&mut self, now_ns: u64) -> bool {
         let before = self.steps.len();
         self.steps.retain(|(at_ns, _)| now_ns < at_ns + TRAIL_NS);
@@ -265,7 +265,7 @@ impl RateMeter {
         scanhub_schema::rate_hz(self.scans.len() as u64 - 1, Duration::from_nanos(last - first))
     }
 
-    /// Returns mean and maximum age on arrival, from the telegram's last byte, in ms.
+    /// Returns mean and maximum age on arrival in ms. The age counts from the telegram's last byte.
     pub fn age_ms(&self) -> Option<(f64, f64)> {
         let ages = || self.scans.iter().filter_map(|(_, age)| *age);
         let maximum = ages().max()?;
@@ -296,7 +296,8 @@ pub struct Problem {
 }
 
 impl Problem {
-    /// Returns why `sensor`, whose link has this status, sends no scans. The link's own error takes precedence.
+    /// Returns the reason why `sensor` sends no scans. `status` is the status of its link. An error in the status takes
+    /// precedence.
     fn of_silent(sensor: &str, status: Option<&Status>) -> Problem {
         let Some(status) = status else {
             return Problem { description: "no data from it yet".into(), remedy: String::new() };

@@ -1,8 +1,8 @@
 //! Channels that viewers can subscribe to, each with a short queue of its last messages. All viewers share the queues,
 //! so memory does not depend on their number.
 //!
-//! A queue covers 250 ms. A server that was delayed by less still sends every message. A viewer that falls further
-//! behind skips to the newest message, so that it never shows old data.
+//! A queue covers 250 ms, so a server that was delayed by less still sends every message. A viewer with a longer delay
+//! gets the newest message next, so that it never shows old data.
 
 use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -25,8 +25,8 @@ pub struct Channel {
     pub schema_encoding: &'static str,
     /// Definition of the type.
     pub schema: &'static str,
-    /// Whether a message is the state until the next one: a later subscriber gets the last message, and older ones
-    /// are never sent.
+    /// Whether a message is a state that is valid until the next message. A later subscriber then gets the last
+    /// message, and older messages are never sent.
     pub is_kept: bool,
 }
 
@@ -46,7 +46,7 @@ pub(crate) struct QueuedMessage {
 #[derive(Debug)]
 pub struct ChannelStore {
     channels: Mutex<Vec<ChannelQueue>>,
-    /// Whether there are messages for which the server was not woken yet.
+    /// Whether messages were queued since the server was last woken.
     is_new: AtomicBool,
     /// Wakes the server.
     wake: OwnedFd,
@@ -102,7 +102,7 @@ impl ChannelStore {
 
     /// Wakes the server.
     pub fn wake(&self) {
-        // The write fails if the counter is full, and then the descriptor is readable anyway.
+        // The write fails only if the counter is full. The descriptor is readable in this case too.
         let _ = rustix::io::write(&self.wake, &1_u64.to_ne_bytes());
     }
 
@@ -121,8 +121,8 @@ impl ChannelStore {
         self.channels().iter().enumerate().skip(from).map(|(at, one)| (at, one.channel.clone())).collect()
     }
 
-    /// Adds a subscriber. Returns the number of the last message that it does not get, or `None` if there is no such
-    /// channel.
+    /// Adds a subscriber to channel `id`. Returns the number of the last message that the subscriber does not get, or
+    /// `None` if the channel does not exist.
     pub(crate) fn subscribe(&self, id: usize) -> Option<u64> {
         let mut channels = self.channels();
         let one = channels.get_mut(id)?;
@@ -137,8 +137,8 @@ impl ChannelStore {
         }
     }
 
-    /// Returns the message after message `number`, or the newest one if that message is no longer queued. `None` if
-    /// there is no newer message.
+    /// Returns the message after message `number`, or the newest message if the message after `number` is no longer
+    /// queued. Returns `None` if there is no newer message.
     pub(crate) fn next(&self, id: usize, number: u64) -> Option<QueuedMessage> {
         let channels = self.channels();
         let queue = &channels.get(id)?.queue;
@@ -160,7 +160,7 @@ pub struct ChannelPublisher<'a> {
 }
 
 impl ChannelPublisher<'_> {
-    /// Returns whether a current or a later subscriber would get a message.
+    /// Returns whether a message would be sent to any current or later subscriber.
     pub fn is_needed(&self) -> bool {
         let one = &self.store.channels()[self.id];
         one.channel.is_kept || one.subscribers > 0
@@ -198,7 +198,7 @@ impl ChannelPublisher<'_> {
 const MIN_LEN: usize = 2;
 /// Maximum number of messages in a queue.
 const MAX_LEN: usize = 16;
-/// Time that a queue covers between these lengths.
+/// Time that a queue covers, if its length is between [`MIN_LEN`] and [`MAX_LEN`].
 const QUEUE_SPAN_NS: u64 = 250_000_000;
 
 #[cfg(test)]

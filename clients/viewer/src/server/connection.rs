@@ -64,7 +64,7 @@ impl Connection {
         Connection { address, state, is_closed: false }
     }
 
-    /// Returns the socket and the events on it that the connection waits for.
+    /// Returns the socket, and the events on it for which the connection waits.
     pub(crate) fn waits_for(&self) -> Option<(&TcpStream, PollFlags)> {
         match &self.state {
             ConnectionState::Request { stream, .. } => Some((stream, PollFlags::IN)),
@@ -77,7 +77,7 @@ impl Connection {
         }
     }
 
-    /// Returns when the connection next needs service even without input, such as for a timeout.
+    /// Returns the time at which the connection must be served even if no input arrives, for example for a timeout.
     pub(crate) fn wake_at(&self) -> Option<Instant> {
         match &self.state {
             ConnectionState::Request { until, .. } | ConnectionState::Response { until, .. } => Some(*until),
@@ -141,8 +141,8 @@ impl Connection {
         }
     }
 
-    /// Continues after a request whose head has `length` bytes. A WebSocket keeps the connection, so it needs no
-    /// further descriptor.
+    /// Replies to a request whose head has `length` bytes. A WebSocket uses the same socket, so it needs no further
+    /// descriptor.
     fn reply(
         &mut self,
         context: &ServerContext<'_>,
@@ -169,7 +169,7 @@ impl Connection {
     }
 }
 
-/// Reads the next bytes of a head. Returns the request and the length of its head once it is complete.
+/// Reads the next bytes of a head. Returns the request and the length of its head once the head is complete.
 fn receive(stream: &mut TcpStream, head: &mut Vec<u8>) -> Result<Option<(Request, usize)>, Disconnected> {
     let mut buffer = [0; MAX_HEAD_LEN];
     loop {
@@ -194,7 +194,7 @@ enum Reply<'a> {
 }
 
 impl ServerContext<'_> {
-    /// Returns the result of a request while `viewers` are connected.
+    /// Returns the result of a request. `viewers` is the number of connected viewers.
     fn reply<'a>(&self, request: &'a Request, viewers: usize) -> Reply<'a> {
         let text = |status, text| Reply::Response(text_response(status, text));
         if let Err(refusal) = self.policy.check(request) {

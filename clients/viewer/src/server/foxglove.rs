@@ -6,7 +6,7 @@ use super::channels::Channel;
 use super::player::PlayerCommand;
 
 /// Subprotocols of the WebSocket, the preferred one first. The second is the former name of the same protocol. Some
-/// clients only know that name (npm's `@foxglove/ws-protocol`, older versions of Lichtblick).
+/// clients only support the former name (npm's `@foxglove/ws-protocol`, older versions of Lichtblick).
 pub(crate) const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 
 /// Returns the first message of the server.
@@ -80,8 +80,8 @@ pub(crate) enum ClientMessage {
     Player(PlayerCommand),
 }
 
-/// Parses a message from a viewer. Returns `None` if it is invalid, or requires a capability that this server does not
-/// have.
+/// Parses a message from a viewer. Returns `None` if the message is invalid, or requires a capability that this server
+/// does not have.
 pub(crate) fn parse(text: &str) -> Option<ClientMessage> {
     #[derive(Deserialize)]
     #[serde(tag = "op", rename_all = "camelCase")]

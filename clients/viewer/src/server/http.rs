@@ -27,7 +27,8 @@ pub(crate) struct Request {
 pub(crate) struct MalformedRequest;
 
 impl Request {
-    /// Parses the head at the start of `bytes`. Returns it with its length, or `None` while it is incomplete.
+    /// Parses the head at the start of `bytes`. Returns the request and the length of the head, or `None` while the
+    /// head is incomplete.
     pub(crate) fn parse(bytes: &[u8]) -> Result<Option<(Request, usize)>, MalformedRequest> {
         let mut headers = [httparse::EMPTY_HEADER; 64];
         let mut head = httparse::Request::new(&mut headers);
@@ -42,7 +43,7 @@ impl Request {
             let named = head.headers.iter().filter(|header| header.name.eq_ignore_ascii_case(name));
             named.map(|header| std::str::from_utf8(header.value).unwrap_or("?").trim().to_owned()).collect()
         };
-        // If a header is repeated, a proxy may have checked the other value.
+        // Reject a repeated header, because a proxy may have checked the other value.
         let one = |name: &str| -> Result<Option<String>, MalformedRequest> {
             let mut values: Vec<String> = all(name);
             if values.len() > 1 { Err(MalformedRequest) } else { Ok(values.pop()) }
@@ -117,8 +118,8 @@ impl AccessPolicy {
         if is_known { Ok(()) } else { Err(Refusal::Token) }
     }
 
-    /// Returns whether `host` is this machine. An address cannot be made to point elsewhere, but a name can, so only
-    /// names of this machine are accepted.
+    /// Returns whether `host` is this machine. DNS can make a name point to another machine, but not an address.
+    /// Therefore every address is accepted, but only names of this machine.
     fn is_this_machine(&self, host: &str) -> bool {
         let name = match host.strip_prefix('[') {
             Some(rest) => rest.split(']').next().unwrap_or_default(),
@@ -135,14 +136,14 @@ impl AccessPolicy {
     }
 }
 
-/// Compares a candidate with the token, in a time that depends only on their lengths.
+/// Compares a candidate with the token. The time for this depends only on the lengths of the two.
 fn is_equal(candidate: &str, token: &str) -> bool {
     let differing = candidate.bytes().zip(token.bytes()).fold(0, |all, (a, b)| all | (a ^ b));
     candidate.len() == token.len() && differing == 0
 }
 
 impl Refusal {
-    /// Returns the response, with the remedy.
+    /// Returns the response for this refusal, with a remedy.
     pub(crate) fn response(self) -> Vec<u8> {
         let (status, message) = match self {
             Refusal::Host => ("403 Forbidden", "not a name of this machine: use its address"),
@@ -156,8 +157,8 @@ impl Refusal {
     }
 }
 
-/// Returns a response that ends the connection. Other pages cannot show it, and browsers neither keep it nor guess its
-/// type.
+/// Returns a response that ends the connection. Other pages cannot embed the response. Browsers neither store it nor
+/// guess its type.
 pub(crate) fn response(status: &str, kind: &str, policy: &str, body: &[u8]) -> Vec<u8> {
     let head = format!(
         "HTTP/1.1 {status}\r\nContent-Type: {kind}; charset=utf-8\r\nContent-Length: {}\r\nCache-Control: no-store\r\n\

@@ -1,5 +1,5 @@
-//! Channels for viewers, and encoders of their messages from a scene and from samples. Scans and poses have the types
-//! of ROS, which every viewer draws; circles and marks those of Foxglove; states and the verdict are JSON objects.
+//! Channels for viewers, and encoders of their messages from a scene and from samples. Scans and poses have types of
+//! ROS, which every viewer draws. Circles and marks have types of Foxglove. States and the verdict are JSON objects.
 
 mod scene_update;
 
@@ -57,8 +57,8 @@ pub(crate) fn cloud_channel(name: &str) -> Channel {
     ros_channel(sibling_topic(name, "cloud"), POINT_CLOUD, false)
 }
 
-/// Returns the channel of the last sweep's obstacles, as `foxglove.SceneUpdate`. They are not kept for later
-/// subscribers, because a message is valid for a limited time after its arrival.
+/// Returns the channel of the last sweep's obstacles, as `foxglove.SceneUpdate`. A message is not kept for later
+/// subscribers, because it is valid only for a limited time after its arrival.
 pub(crate) fn obstacles_channel(name: &str) -> Channel {
     Channel { is_kept: false, ..scene_update::channel(&sibling_topic(name, "obstacles")) }
 }
@@ -73,8 +73,8 @@ pub(crate) fn status_channel(sensor: &str) -> Channel {
     json_channel(sibling_topic(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
 }
 
-/// Encodes the verdict of the robot's sensors, whether they are shown in a map, the state of the hub, and the number of
-/// people in each room as text. `problem` is why there is no hub.
+/// Encodes the verdict of the robot's sensors, whether the sensors are shown in a map, the state of the hub, and a text
+/// with the number of people in each room. `problem` is the reason why the scene is empty.
 pub(crate) fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> Vec<u8> {
     #[derive(Serialize)]
     struct Robot<'a> {
@@ -116,7 +116,7 @@ fn hub_text(scene: &Scene, domain: &str) -> String {
     format!("domain {domain}{pid}{load}")
 }
 
-/// Encodes state, rate, ages and losses of `sensor`, its pose if that is known, and whether its scans come from a
+/// Encodes state, rate, ages and losses of `sensor`, the pose if it is known, and whether the scans come from a
 /// simulator or a recording.
 pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
     #[derive(Serialize)]

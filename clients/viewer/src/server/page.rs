@@ -34,8 +34,8 @@ impl Page {
         Page { body, hashes: [hash(&script), hash(&style)] }
     }
 
-    /// Returns the content security policy of the page for `host`. It names the WebSocket's address, because 'self'
-    /// does not include it in every browser.
+    /// Returns the content security policy of the page for `host`. The policy contains the WebSocket's address, because
+    /// in some browsers 'self' does not include it.
     pub(crate) fn policy(&self, host: &str) -> String {
         let [script, style] = &self.hashes;
         format!(

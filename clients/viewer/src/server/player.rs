@@ -26,7 +26,7 @@ pub struct Progress {
     pub position_s: f64,
     /// Position of the end in seconds, if it is known.
     pub length_s: Option<f64>,
-    /// Multiple of the recorded rate; `None` for as fast as possible.
+    /// Rate as a multiple of the recorded rate; `None` means as fast as possible.
     pub rate: Option<f64>,
     /// Whether the player is paused.
     pub paused: bool,
@@ -34,7 +34,7 @@ pub struct Progress {
     pub over: bool,
     /// Number of restarts.
     pub lap: u32,
-    /// Number of telegrams that were played, of all sensors and laps.
+    /// Number of telegrams of all sensors that were played, in all laps.
     pub telegrams: u64,
 }
 

@@ -1,5 +1,5 @@
-//! One viewer: its WebSocket, its subscriptions, and the choice of its next message. Few bytes are in flight, so memory
-//! is bounded, and a viewer that was slow continues with the newest messages.
+//! One viewer: the WebSocket, the subscriptions, and the choice of the next message. Few bytes are in flight, so memory
+//! is limited. A viewer that was slow continues with the newest messages.
 
 use std::io;
 use std::net::TcpStream;
@@ -34,23 +34,24 @@ pub(crate) struct Viewer {
     advertised: usize,
     /// Subscription that is served next.
     next: usize,
-    /// Time from which on the socket has not accepted all bytes; `None` if it has.
+    /// Time since which the socket has been full; `None` if it has accepted all bytes.
     pending: Option<Instant>,
-    /// Whether the socket was full at any time since this viewer last had all messages.
+    /// Whether the socket was full at any time since this viewer last had received all messages.
     was_full: bool,
     replaced: ReplacedMessages,
     reported: ReplacedMessages,
     report_at: Instant,
-    /// The last subscription to an unknown channel, which was not refused yet.
+    /// Last subscription to an unknown channel that was not refused yet.
     unknown_channel: Option<usize>,
-    /// Whether unread messages may be left, even if the socket receives nothing new.
+    /// Whether received messages may still be unread, even if the socket receives nothing new.
     has_unread: bool,
 }
 
 struct Subscription {
     id: u32,
     channel: usize,
-    /// Number of the last message that was sent, or of the last one before the subscription.
+    /// Number of the last message that was sent. Before the first message, number of the last message before the
+    /// subscription.
     number: u64,
 }
 
@@ -59,7 +60,7 @@ struct Subscription {
 struct ReplacedMessages {
     /// Number of messages that were replaced because the viewer or its network was too slow.
     by_viewer: u64,
-    /// Number of messages that were replaced because this process was too late.
+    /// Number of messages that were replaced because this process was delayed.
     by_server: u64,
 }
 
@@ -102,7 +103,7 @@ impl Viewer {
         self.socket.get_ref()
     }
 
-    /// Returns whether the socket does not accept all bytes.
+    /// Returns whether bytes wait because the socket is full.
     pub(crate) fn is_pending(&self) -> bool {
         self.pending.is_some()
     }
@@ -118,7 +119,7 @@ impl Viewer {
         self.has_unread
     }
 
-    /// Returns when the viewer next needs service even without input, such as for a timeout.
+    /// Returns the time at which the viewer must be served even if no input arrives, for example for a timeout.
     pub(crate) fn wake_at(&self) -> Option<Instant> {
         let times_out = self.pending.map(|since| since + SEND_TIMEOUT);
         let reports = (self.replaced != self.reported).then_some(self.report_at);

@@ -13,8 +13,8 @@ use super::map::{DOTS_PER_CELL, color, map};
 use super::view::View;
 use crate::scene::{PointerPosition, Scene, Sensor, rooms, verdict};
 
-/// Draws `scene` as in `view`. If the picture is frozen, it shows `held`, but verdict and sensors are always those of
-/// `scene`.
+/// Draws `scene` as in `view`. If the picture is frozen, it shows `held`. The verdict and the lines of sensors always
+/// come from `scene`.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
     let areas = ScreenAreas::of(frame.area(), scene);
     let heading = heading(scene, view, areas.heading.width);
@@ -82,8 +82,8 @@ impl ScreenAreas {
     }
 }
 
-/// Returns the verdict and the smallest distance as text, because not everyone can tell colors apart. A part that does
-/// not fit is omitted completely, because a truncated number is another number.
+/// Returns the verdict and the smallest distance as text, because not everyone can distinguish colors. A part that does
+/// not fit is omitted completely, because a truncated number looks like another number.
 fn heading(scene: &Scene, view: &View, columns: u16) -> Line<'static> {
     let shown = view.shown(scene);
     let (verdict, sensor, nearest) = verdict(shown.iter().map(|(_, sensor)| *sensor));
@@ -125,7 +125,7 @@ fn hub_states(scene: &Scene) -> Vec<Line<'static>> {
     words.into_iter().map(Line::raw).collect()
 }
 
-/// Returns the sensors that have a line in `rows`: all, or those from the selected one on.
+/// Returns the sensors whose lines fit in `rows`. If not all fit, starts at the selected sensor.
 fn listed<'a>(scene: &'a Scene, view: &View, rows: u16) -> impl Iterator<Item = (usize, &'a Sensor)> {
     let hidden = scene.sensors.len().saturating_sub(usize::from(rows));
     let first = view.only_sensor.unwrap_or(0).min(hidden);
@@ -288,7 +288,7 @@ o ,   foreground, its trail (coloured: without the signs)
 const NAME_WIDTH: usize = 32;
 /// Width of the column of a sensor.
 const COLUMN_WIDTH: usize = 14;
-/// Maximum distance of a point from the pointer that is read, in dots.
+/// Maximum distance between the pointer and a point whose reading is shown, in dots.
 const MAX_POINTER_DISTANCE_DOTS: f64 = 6.0;
 /// Minimum number of columns for the line of a sensor with all fields.
 const MIN_WIDE_COLUMNS: u16 = 100;

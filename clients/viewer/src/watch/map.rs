@@ -1,5 +1,5 @@
-//! Map of the robot from above: points and figures of its sensors as Braille dots, with ahead up. Without colors, each
-//! color is replaced by another sign.
+//! Map of the robot from above: points and figures of the sensors as Braille dots. Ahead is up. Without colors, a sign
+//! replaces each color.
 
 use ratatui::style::Color;
 use ratatui::symbols::Marker;
@@ -14,7 +14,7 @@ use crate::scene::{Scene, circles};
 /// Dots across and down in a cell of the terminal.
 pub(super) const DOTS_PER_CELL: (f64, f64) = (2.0, 4.0);
 
-/// Returns the picture of `scene` for `cells`, columns and rows.
+/// Returns the picture of `scene`. `cells` is the number of columns and rows.
 pub(super) fn map(scene: &Scene, view: &View, cells: (u16, u16)) -> Canvas<'static, impl Fn(&mut Context)> {
     // The ends of the axes are the centers of dots, not their edges.
     let half = |cells: u16, dots: f64| view.dot_m * (f64::from(cells) * dots - 1.0).max(1.0) / 2.0;
@@ -166,7 +166,7 @@ impl Layers {
         self.axes.extend(ticks(y, dots).map(|up| (0.0, up)));
     }
 
-    /// Moves signs to the cells of `grid`.
+    /// Moves each sign to the center of its cell in `grid`.
     fn snap(&mut self, grid: &Grid) {
         let snap = |dots: &mut Dots| {
             dots.retain(|dot| grid.has(*dot));
@@ -281,7 +281,7 @@ fn grid_step_m(dot_m: f64) -> f64 {
     STEPS_M.into_iter().find(|step| *step >= GRID_DOTS * dot_m).unwrap_or(50.0)
 }
 
-/// Colors of points without an intensity, and from the darkest to the brightest.
+/// Colors of points. The first is for points without an intensity; the others are from the darkest to the brightest.
 const SHADES: [Color; 5] = [Color::Reset, Color::Blue, Color::Cyan, Color::Green, Color::Yellow];
 const STEPS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
 /// Minimum distance between two crossings of the grid, in dots.

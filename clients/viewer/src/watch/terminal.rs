@@ -124,7 +124,8 @@ fn size() -> Option<(u16, u16)> {
     tcgetwinsize(io::stdout()).ok().map(|size| (size.ws_col, size.ws_row))
 }
 
-/// Returns whether the terminal was closed. A program may get no signal then, and without a frame no write fails.
+/// Returns whether the terminal was closed. The program may then get no signal, and no write fails while no frame is
+/// drawn.
 fn hung_up() -> bool {
     let stdout = io::stdout();
     let mut ends = [PollFd::new(&stdout, PollFlags::empty())];
@@ -179,9 +180,9 @@ pub(super) enum Key {
     Interrupt,
     /// Left mouse button at this column and row, counted from 0.
     Point(u16, u16),
-    /// Mouse wheel away from the user, at this column and row.
+    /// Mouse wheel moved away from the user, at this column and row.
     WheelUp(u16, u16),
-    /// Mouse wheel toward the user.
+    /// Mouse wheel moved toward the user.
     WheelDown(u16, u16),
 }
 
@@ -252,7 +253,7 @@ fn next(typed: &mut VecDeque<u8>) -> Option<Key> {
                     let sequence: Vec<u8> = typed.drain(..length.min(typed.len())).collect();
                     typed.front().and_then(|last| parse_sequence(&sequence[2..], *last))
                 }
-                // The character after it was typed with Alt, so skip only the escape.
+                // The character after the escape was typed with Alt, so skip only the escape.
                 Some(_) => None,
             },
             b' '..=b'~' => Some(Key::Sign(byte.into())),

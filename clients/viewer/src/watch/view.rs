@@ -1,4 +1,4 @@
-//! View of a scene: the visible part, its scale and its layers, and their change by keys and the mouse.
+//! View of a scene: the visible part, the scale and the layers. Keys and the mouse change them.
 
 use ratatui::layout::{Position, Rect};
 
@@ -40,7 +40,7 @@ pub(crate) struct View {
     pub(crate) colors: bool,
     /// Text next to the keys.
     pub(crate) note: String,
-    /// Message in place of the keys; empty if there is none.
+    /// Message that is shown instead of the keys; empty if there is none.
     pub(crate) message: String,
 }
 
@@ -92,7 +92,7 @@ impl View {
         }
     }
 
-    /// Handles a key while `scene` is on the screen. Returns the command that is left to the caller.
+    /// Handles a key while `scene` is on the screen. Returns a command that the caller must execute.
     pub(crate) fn key(&mut self, key: Key, scene: &Scene) -> Option<ViewCommand> {
         match key {
             Key::Interrupt => return Some(ViewCommand::Interrupt),
@@ -138,8 +138,8 @@ impl View {
         None
     }
 
-    /// Fits the points into the picture, unless the user has moved it. If they fit already and the scale is about
-    /// right, nothing changes, because a picture that changes its scale often cannot be read.
+    /// Fits the points into the picture, unless the user has moved the picture. If the points fit already and the scale
+    /// is about right, nothing changes, because a picture whose scale changes often is hard to read.
     pub(crate) fn fit(&mut self, scene: &Scene) {
         let dots = (
             f64::from(self.map.width.max(1)) * DOTS_PER_CELL.0,
@@ -217,7 +217,7 @@ impl View {
         self.center_m = (moved(self.center_m.0, ahead), moved(self.center_m.1, left));
     }
 
-    /// Shows only the sensor with index `n`, or all if it does not exist.
+    /// Shows only the sensor with index `n`, or all sensors if there is no sensor with this index.
     fn select_sensor(&mut self, n: usize, scene: &Scene) {
         self.only_sensor = (n < scene.sensors.len()).then_some(n);
     }
@@ -230,9 +230,9 @@ fn span(mut values: Vec<f64>, reach: f64) -> (f64, f64) {
     (values[out].min(-reach), values[values.len() - 1 - out].max(reach))
 }
 
-/// Factor of a step of zoom.
+/// Factor by which one zoom step changes the scale.
 const ZOOM_FACTOR: f64 = 1.25;
-/// Distance of a step of pan.
+/// Distance by which one pan step moves the picture, in dots.
 const STEP_DOTS: f64 = 8.0;
 /// Scale before the first scan: eight meters in a picture of 80 columns.
 const INITIAL_DOT_M: f64 = 0.05;
@@ -245,7 +245,7 @@ const MAX_CENTER_M: f64 = 200.0;
 const MIN_REACH_M: f64 = 0.5;
 /// Size of the picture relative to the points.
 const MARGIN_FACTOR: f64 = 1.1;
-/// Minimum share of the picture that the points must fill. With less, the scale changes.
+/// Minimum share of the picture that the points must fill. If they fill less, the scale changes.
 const MIN_FILL_SHARE: f64 = 0.6;
 /// Divisor of the number of points that gives the number of outliers at either end.
 const OUTLIER_DIVISOR: usize = 50;

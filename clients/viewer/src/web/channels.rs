@@ -1,5 +1,5 @@
-//! Channels of sensors, mounts, and programs such as `tilt`. Each is opened when its topics are followed, and publishes
-//! samples as messages.
+//! Channels of sensors, mounts, and programs such as `tilt`. A channel is opened when `web` subscribes to its topics.
+//! It publishes samples as messages.
 
 use std::collections::BTreeMap;
 
@@ -43,7 +43,7 @@ impl<'a> SensorChannels<'a> {
         }
     }
 
-    /// Publishes a foreground. Its scan has the angles of the beams.
+    /// Publishes a foreground. The angles of the beams are taken from its scan.
     pub(super) fn publish_foreground(&mut self, ((header, scan), foreground): &Pair) {
         if self.foreground.is_needed() {
             let (message, frame) = (&mut self.message, scanhub_ros::frame(&self.sensor));
@@ -95,7 +95,7 @@ impl<'a> TiltChannels<'a> {
         TiltChannels { channels, mounts: BTreeMap::new(), sweeps: BTreeMap::new() }
     }
 
-    /// Opens the channels of a topic that will be followed.
+    /// Opens the channels of a topic that `web` will subscribe to.
     pub(super) fn begin(&mut self, name: &TopicName) {
         match name.topic.publisher_kind() {
             PublisherKind::Mount => drop(self.mount(&name.sensor)),

@@ -19,12 +19,13 @@ use crate::scene::{Circle, Problem, Scene, Sensor, SensorPlacement, circles, ver
 use crate::server::player::{self, Playback, Progress};
 use crate::server::{ChannelPublisher, ChannelStore, messages};
 
-/// Interval at which the verdict and the distance are repeated. The page takes the verdict as unknown after half a
-/// second, and users cannot read a distance that changes with every scan. A changed verdict is published at once.
+/// Interval at which the verdict and the distance are repeated. If no message arrives for half a second, the page shows
+/// the verdict as unknown. Users cannot read a distance that changes with every scan. A changed verdict is published at
+/// once.
 const ROBOT_INTERVAL: Duration = Duration::from_millis(90);
 /// Minimum interval between messages of the player if only its position has changed.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(50);
-/// Minimum interval between messages of circles, marks or line features. A message has those of all sensors.
+/// Minimum interval between messages of circles, marks or line features. A message has the figures of all sensors.
 const OVERLAY_INTERVAL: Duration = Duration::from_millis(50);
 /// Interval at which unchanged circles are repeated, because viewers delete them after a second.
 const CIRCLES_INTERVAL: Duration = Duration::from_millis(300);
@@ -130,7 +131,7 @@ impl Feed<'_> {
                 Event::Added(name) => self.begin(&name),
                 Event::Sample(name, sample, _) => self.sample(&name, &sample),
                 Event::Notice(names, notice) => self.notice(&names, &notice)?,
-                // The topics that are followed already stay.
+                // Keep the topics that are already subscribed to.
                 Event::ResourceExhausted(name, failure) => self.reporter.not_served(&name, &failure)?,
                 Event::Tick(now) => {
                     if following.is_caught_up() {
@@ -208,7 +209,7 @@ fn placements(scene: &Scene) -> Vec<SensorPlacement> {
     scene.sensors.iter().map(|sensor| sensor.placement).collect()
 }
 
-/// Returns why the scene is empty: no hub runs, or it has no sensors.
+/// Returns the reason why the scene is empty: no hub runs, or the hub has no sensors.
 fn problem(scene: &Scene, locations: &[Domain]) -> Option<Problem> {
     if scene.hub_is_running {
         let what = || "the hub has no sensors".to_owned();
@@ -234,7 +235,7 @@ struct SensorFeed<'a> {
     channels: &'a ChannelStore,
     sensors: BTreeMap<String, SensorChannels<'a>>,
     poses: ChannelPublisher<'a>,
-    /// Whether poses have changed since they were published.
+    /// Whether poses have changed since they were last published.
     are_poses_new: bool,
     /// Time of the next message with the state of each sensor.
     publish_at: Instant,
@@ -252,7 +253,7 @@ impl<'a> SensorFeed<'a> {
         self.sensors.entry(sensor.to_owned()).or_insert_with(open)
     }
 
-    /// Returns whether states must be published. New poses count, because a state has a pose too.
+    /// Returns whether states must be published. New poses are a reason too, because a state contains a pose.
     fn is_due(&self, now: Instant) -> bool {
         self.are_poses_new || now >= self.publish_at
     }
@@ -303,7 +304,7 @@ struct Overlays<'a> {
     lines: Overlay<'a>,
     /// Circles of the last message.
     circles: Vec<Circle>,
-    /// Time at which they are repeated.
+    /// Time at which the circles are repeated.
     repeat_at: Instant,
 }
 
@@ -377,7 +378,7 @@ struct PlayerFeed<'a> {
     channel: ChannelPublisher<'a>,
     /// Progress of the last message.
     published: Option<Progress>,
-    /// Earliest time of a message if only the position has changed.
+    /// Earliest time of the next message if only the position has changed.
     publish_at: Instant,
 }
 

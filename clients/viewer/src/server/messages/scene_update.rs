@@ -49,8 +49,8 @@ pub(crate) fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 }
 
 /// Encodes the people of one tracker with their IDs and tails. The ellipse around a person contains the true position
-/// in 95 of 100 cases. The frame is the robot's; with a tracker, that is the map of the site. People who are not seen
-/// are pale.
+/// in 95 of 100 cases. The frame has the name of the robot's frame. With a tracker, this frame is the map of the site.
+/// People who are not seen are pale.
 pub(crate) fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
     let entities = people.known().map(|person| {
         let (x, y) = person.position;
@@ -97,9 +97,9 @@ pub(crate) fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 }
 
 /// Encodes the obstacles of a sweep as boxes with the metadata `distance_m`, `points`, `foreground` and `near`. The
-/// first entity has no shape, and the metadata of the sweep: `sweep`, `generation`, `complete`, `unreliable`, `dropped`,
-/// and `words`, a summary as text. Sweeps end when the mount reverses, so each message deletes all earlier entities,
-/// and has its own lifetime.
+/// first entity has no shape. It has the metadata of the sweep: `sweep`, `generation`, `complete`, `unreliable`,
+/// `dropped`, and `words`, a summary as text. A sweep ends when the mount reverses. Therefore each message deletes all
+/// earlier entities, and has its own lifetime.
 pub(crate) fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
     let lifetime = || Time::of(lifetime_ns(header));
     let mut sweep = Entity { lifetime: lifetime(), ..Entity::new("sweep".to_owned(), header.wall_ns) };
@@ -148,7 +148,7 @@ fn sweep_text(found: &Obstacles) -> String {
     let count = u64::from(found.dropped) + found.obstacles().len() as u64;
     let plural = if count == 1 { "" } else { "s" };
     let obstacles = found.obstacles().first().map_or("no obstacle".to_owned(), |nearest| {
-        // One decimal, because screen readers read the text whenever it changes.
+        // Use one decimal, because screen readers read the text whenever it changes.
         format!("{count} obstacle{plural}, nearest {:.1} m", nearest.distance_m)
     });
     let incomplete = if found.has(Obstacles::COMPLETE) { "" } else { ", sweep incomplete" };
@@ -337,7 +337,7 @@ fn oval((x, y): (f64, f64), of: &Ellipse, color: Color) -> Cylinder {
     Cylinder { pose, size, bottom_scale: 1.0, top_scale: 1.0, color }
 }
 
-/// Returns green, amber or red as on the page.
+/// Returns the color of a verdict: green, amber or red, as on the page.
 fn color(verdict: Verdict, a: f64) -> Color {
     let (r, g, b) = match verdict {
         Verdict::Clear => (0.18, 0.62, 0.36),

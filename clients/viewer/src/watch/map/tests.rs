@@ -92,7 +92,8 @@ fn primitives<'a>(entities: &'a [Json], kind: &str) -> Vec<&'a Json> {
     entities.iter().flat_map(|entity| entity[kind].as_array().unwrap()).collect()
 }
 
-/// Asserts that the points `sent`, in the robot's frame, are those `drawn`, to the right and up.
+/// Asserts that the points in `sent` and in `drawn` are the same. `sent` is in the robot's frame, and `drawn` has the
+/// coordinates to the right and up.
 fn assert_same_points(kind: &str, sent: Vec<(f64, f64)>, drawn: &Dots) {
     assert!(
         !sent.is_empty() && sent.len() == drawn.len(),
@@ -130,7 +131,7 @@ fn browser_and_terminal_draw_the_same_scene() {
             models.extend(points(&message, &placed));
         }
     }
-    // The terminal draws the foreground in place of points of the scan, and the browser draws it on top.
+    // The terminal draws the foreground instead of points of the scan. The browser draws it on top of them.
     let drawn: Dots = layers.walls.iter().flatten().chain(&layers.foreground).copied().collect();
     assert_same_points("scans", scans, &drawn);
     assert_same_points("foreground", found, &layers.foreground);
@@ -168,7 +169,7 @@ fn browser_and_terminal_draw_the_same_scene() {
         let is_seen = at["color"]["a"] == 1.0;
         let text = word["text"].as_str().unwrap();
         assert_eq!(*number, if is_seen { text.to_owned() } else { format!("({text})") });
-        // The last position of a tail is that of the person.
+        // The last position of a tail is the position of the person.
         let line = positions(entity["lines"][0]["points"].as_array().unwrap().iter());
         assert_eq!(line.last(), Some(&position));
         tails.extend(line.into_iter().rev().skip(1));
