@@ -19,11 +19,11 @@ pub(crate) struct CheckedConfig {
     listens: bool,
 }
 
-/// Keys of Zenoh's configuration, and the JSON values that they get if the file does not set them.
+/// Keys of Zenoh's configuration, and the JSON values that the keys get if the file does not set them.
 ///
-/// Zenoh's defaults are chosen for throughput, and on a slow link samples in its long queues become old. With these
-/// limits, a message for which a link has no room waits in this process, where newer samples replace older ones. A
-/// router on the path has its own settings.
+/// Zenoh's defaults are chosen for throughput. On a slow link, samples become old in the long queues of Zenoh. With
+/// these limits, a message for which a link has no room waits in this process, where newer samples replace older ones.
+/// A router on the path has its own settings.
 const LIMITS: &[(&str, &str)] = &[
     ("scouting/multicast/enabled", "false"),
     ("scouting/gossip/enabled", "false"),
@@ -44,11 +44,11 @@ const LIMITS: &[(&str, &str)] = &[
 
 /// Maximum time for which a message waits for room before Zenoh drops it, in microseconds. The first value is for a
 /// client, and the second for a router or peer. After a drop, Zenoh drops later messages too, until there is room. The
-/// second key is the additional wait of a message in fragments.
+/// second key is the additional time for a message in fragments.
 ///
-/// A client has one link. It waits as long as a link without data stays open (10 s), so messages are dropped only if
-/// the link breaks. A longer wait would delay the detection of a dead link, because the waiting thread holds a lock of
-/// Zenoh. A router may have many links, and a stalled link must not delay the others.
+/// A client has one link. It waits for 10 s, because a link without data stays open for 10 s. Messages of a client are
+/// therefore dropped only if the link breaks. A longer wait would delay the detection of a dead link, because the
+/// waiting thread holds a lock of Zenoh. A router may have many links, and a stalled link must not delay the others.
 const WAIT_SETTINGS: [(&str, [&str; 2]); 2] = [
     ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["10000000", "1000000"]),
     ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", ["0", "2000000"]),

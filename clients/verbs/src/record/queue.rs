@@ -1,7 +1,8 @@
-//! Exchange between the receiving thread and the disk thread: samples in one direction, progress in the other.
+//! Passes samples from the receiving thread to the disk thread, and progress from the disk thread to the receiving
+//! thread.
 //!
 //! The queue is bounded, so a stalled disk costs samples, but no additional memory. The disk thread takes the whole
-//! queue at once, so the receiving thread never waits.
+//! queue at once, so the receiving thread never waits for the disk.
 
 use std::path::PathBuf;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
