@@ -93,13 +93,13 @@ function axes() {
 const gridStep = () => STEPS.find((length) => length * view.scale >= 64) ?? 100;
 const gridReach = () => hypot(size.width, size.height) / view.scale / 2 + gridStep();
 
-/** Returns whether a text of this width at a position of the screen is not covered. */
+/** Returns whether nothing covers a text of this width at a position on the screen. */
 const isFree = ([x, y], width) => x > width / 2 + 8 && x < middle.width - width / 2 - 8 && abs(y - middle.y) < middle.height / 2 - 8;
 
 function drawGrid() {
   const [step, reach] = [gridStep(), gridReach()];
   const digits = step < 0.1 ? 2 : step < 1 ? 1 : 0;
-  // Omit a number where a zone has its label.
+  // Omit the number of a grid line where a zone has its label.
   const hasNumber = (n) => n !== 0 && !(layers.zones && !isSideView() && circles.some(({ radius }) => abs(abs(n * step) - radius) * view.scale < 26));
   const forEachGridLine = (paint) => {
     for (const axis of axes()) for (let n = ceil((axis.center - reach) / step); n * step <= axis.center + reach; n++) paint(n, axis);
@@ -168,7 +168,7 @@ function drawField(sensor) {
   }
 }
 
-// Distance in pixels within which a point is hidden by the previous one.
+// Distance between two points in pixels. If it is smaller, the previous point hides the next one.
 const MIN_DOT_DISTANCE = 0.8;
 
 /** Draws squares of `width` pixels at `points` of a sensor at `pose`, with the canvas method `how`. Returns the number of points
@@ -183,7 +183,7 @@ function dots(points, width, pose, method = "fillRect") {
     const y = top + b * points[i] + d * points[i + 1];
     if (x !== x) continue;
     count += 1;
-    // Skip points that the previous square hides: they cost as much time as visible ones.
+    // Skip points that the previous square hides, because drawing them takes as much time as drawing visible points.
     if (abs(x - px) < MIN_DOT_DISTANCE && abs(y - py) < MIN_DOT_DISTANCE) continue;
     pen[method](x, y, width, width);
     [px, py] = [x, y];
@@ -197,7 +197,7 @@ function drawScan(sensor) {
   const pose = poseOf(sensor);
   const width = scan.points.length > 2000 ? 2.5 : 3.5;
   const shades = layers.intensity && scan.byShade.length ? scan.byShade : [scan.points];
-  // Points of one shade are drawn together, so that each color is set only once.
+  // Draw all points of a shade together, so that each color is set only once.
   return shades.reduce((count, points, shade) => {
     pen.fillStyle = shades.length > 1 ? shadeColors[shade] : colors.ink;
     return count + dots(points, width, pose);

@@ -2,7 +2,8 @@
 
 function drawTopView(now) {
   const visible = shownSensors();
-  // Background and foreground in two dimensions have no meaning for a scanner on a mount: they change with its angle.
+  // Background and foreground in two dimensions have no meaning for a scanner on a mount, because they change with the
+  // mount's angle.
   const level = visible.filter((sensor) => sensor !== tiltedSensor());
   if (layers.field) visible.forEach(drawField);
   if (layers.grid) drawGrid();

@@ -1,4 +1,4 @@
-// Input of the user: buttons, keys, mouse and touch. The page starts at the end.
+// Input of the user: buttons, keys, mouse and touch. The end of this file starts the page.
 
 function selectSensor(space) {
   shownSpace = space === shownSpace ? null : space;
@@ -153,7 +153,7 @@ addEventListener("keydown", (event) => {
   event.preventDefault();
 });
 
-// Pressed pointers, fingers or the mouse: one moves the view, two zoom and turn it.
+// Pointers (fingers or the mouse) that are pressed. One pointer moves the view, and two pointers zoom and turn it.
 const fingers = new Map();
 const pointOf = (event) => [event.clientX, event.clientY];
 

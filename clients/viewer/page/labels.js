@@ -47,7 +47,7 @@ function put(element, text) {
 
 /** Writes the verdict. Called for each frame, so that text and zones describe the same moment. */
 function showVerdict() {
-  // Zones are around the robot, whose position in the map of a site is unknown.
+  // Zones are around the robot, and the position of the robot in the map of a site is unknown.
   const isSite = isReceiving() && robot.hub && robot.map;
   const shownVerdict = verdict();
   const box = $("verdict");
@@ -136,7 +136,7 @@ function showPlayer() {
   for (const one of box.querySelectorAll("button")) one.disabled = over || !isOpen;
 }
 
-/** Writes why the picture is empty, and the remedy. */
+/** Writes the reason why the picture is empty, and the remedy. */
 function showProblem() {
   const [first] = shownSensors();
   let problem = robot.problem ?? (robot.hub ? null : { what: "No hub", remedy: "scanhub run" });
@@ -164,7 +164,7 @@ const FIELDS = [
   ["damaged on the line", "loss", ({ loss }) => percent(loss)],
   ["lost on the line; missed by this program", null, ({ lost_on_line: line, missed }) => `${line ?? "–"} / ${missed}`],
 ];
-// Long values have no decimals, so that two fit in a line.
+// Long values have no decimals, so that two values fit in a line.
 const millis = (ms) => ms.toFixed(ms < 100 ? 1 : 0);
 const percent = (share) => `${(100 * share).toFixed(!share ? 0 : share < 0.1 ? 2 : 1)} %`;
 const LOSS_THRESHOLD = 0.001;

@@ -1,4 +1,4 @@
-// Figures in the picture other than points.
+// Draws everything in the picture except points.
 
 function drawZones() {
   font("600 12", "bottom");
@@ -49,7 +49,7 @@ function drawLines() {
   return walls.length;
 }
 
-/** Draws people with ID, tail and uncertainty; those who are not seen are dashed and pale. Returns the number of people. */
+/** Draws people with ID, tail and uncertainty. People who are not seen are dashed and pale. Returns the number. */
 function drawPeople() {
   ink(colors.person, 2);
   font("600 13", "bottom");

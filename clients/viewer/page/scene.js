@@ -6,9 +6,9 @@ const $ = (id) => document.getElementById(id);
 const map = $("map");
 let pen = map.getContext("2d");
 
-// By namespace, as "/front".
+// Sensors by namespace, such as "/front".
 const sensors = new Map();
-// The last message of topic `robot`.
+// Last message of topic `robot`.
 let robot = {};
 // ID of the server's run.
 let session = null;
@@ -16,25 +16,26 @@ let circles = [];
 // Beams that violate a zone.
 let beams = [];
 let marks = [];
-// Straight surfaces, as pairs of ends.
+// Straight surfaces, each as a pair of its ends.
 let walls = [];
 let corners = [];
-// Tracks, and the time of their arrival, by topic of the tracker.
+// Tracks, and the arrival time of the tracks, by topic of the tracker.
 const people = new Map();
 // Sweeps of tilted scanners, by namespace.
 const sweeps = new Map();
 // State of the replay, if this server plays a recording.
 let player = null;
-// Arrival of the last message of topic `robot`.
+// Arrival time of the last message of topic `robot`.
 let lastRobotAt = -Infinity;
 let frames = 0;
-// Time of a scan, and end of the frame that shows it, in ms since 1970, by one machine's clock.
+// Pairs of the time of a scan and the end of the frame that shows the scan, in ms since 1970. Both times come from the
+// clock of one machine.
 const ages = [];
 const drawn = { beams: 0, foreground: 0, zones: 0, marks: 0, lines: 0, tracks: 0, obstacles: 0, swept: 0, axes: 0 };
 
-// The verdict is unknown after this silence.
+// Time without a message after which the verdict is unknown.
 const SILENCE_MS = 500;
-// A scan is stale after this time.
+// Time after which a scan is stale.
 const STALE_AFTER_MS = 1000;
 const TRAIL_MS = 1600;
 const TRAIL_STEP_MS = 90;
@@ -47,7 +48,7 @@ function entryFor(all, topic, create) {
   return Object.assign(all.get(space), { session });
 }
 
-/** Returns the empty data of a sensor. `empty` does so for a source of sweeps. */
+/** Returns the empty data of a sensor. */
 const emptySensor = () => ({ scan: null, foreground: null, trail: [] });
 const emptySweep = () => ({ sweep: null, points: null, obstacles: [] });
 
@@ -60,7 +61,7 @@ const sweepAt = (topic) => entryFor(sweeps, topic, emptySweep);
 /** Returns whether the picture is the map of a site, where the robot's position is unknown. */
 const isMap = () => (heldMessages ? isHeldMap : Boolean(robot.map));
 
-/** Clears all but the background, because the hub has exited. A frozen picture stays until its release. */
+/** Clears everything except the background, because the hub has exited. A frozen picture stays until its release. */
 function clearPicture() {
   if (heldMessages) {
     heldMessages.clear();
@@ -87,7 +88,7 @@ function dropOtherRuns() {
   }
 }
 
-/** Starts with the run `id` of the server. Nothing of another run is valid. */
+/** Starts with the run `id` of the server. Data of another run is not valid. */
 function startRun(id) {
   if (session !== null && id !== session) {
     clearPicture();

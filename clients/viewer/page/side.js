@@ -1,4 +1,5 @@
-// Sweeps of tilted scanners from the side: up is x of the view, right is -y (ahead, unless turned).
+// Draws sweeps of tilted scanners from the side. Up is x of the view, and right is -y, which is ahead unless the view
+// is turned.
 
 const CLASSES = ["unknown", "background", "foreground", "behind"];
 /** Looks of the classes: class, color, width in pixels, shape and layer. The shapes differ, so that color is not the only cue.
@@ -45,7 +46,7 @@ const pointsAside = () => everySweep().filter(({ points }) => points).flatMap((o
 });
 
 const sheet = make("canvas");
-// Key of its content, and number of points.
+// Key of the canvas's content, and number of points on the canvas.
 let onSheet = {};
 
 /** Draws all points, and returns their number. They are drawn once per sweep and view on a separate canvas, which is copied to

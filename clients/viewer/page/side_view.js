@@ -1,4 +1,5 @@
-// Sweeps of tilted scanners from the side: up is x of the view, right is -y (ahead, unless turned).
+// Draws sweeps of tilted scanners from the side. Up is x of the view, and right is -y, which is ahead unless the view
+// is turned.
 
 const CLASSES = ["unknown", "background", "foreground", "behind"];
 /** Class, color, width, method of the pen, and layer. Not by color alone, for the color-blind. Later ones are drawn above earlier ones. */
@@ -44,7 +45,7 @@ const sidePoints = () => allSweeps().filter(({ points }) => points).flatMap((one
 });
 
 const pointsCanvas = make("canvas");
-// Content of the canvas, and its number of points.
+// Content of the canvas, and number of points on the canvas.
 let pointsCanvasState = {};
 
 /** Draws all points, and returns their number. They are drawn once for a sweep and a view, on a canvas that each frame copies. */

@@ -41,7 +41,7 @@ function measureMargins() {
   }
 }
 
-/** Returns the part of the window that no box covers. */
+/** Returns the part of the window that is not covered by a box. */
 function freeArea() {
   const { top, right, bottom } = covered;
   const [width, height] = [size.width - right, max(1, size.height - top - bottom)];
@@ -73,7 +73,7 @@ let [cos, sin] = [1, 0];
 
 function updateView() {
   middle = freeArea();
-  // In the side view, the robot turns, and not the picture.
+  // In the side view, the robot is turned instead of the picture.
   [cos, sin] = isSideView() ? [1, 0] : [Math.cos(view.turn), Math.sin(view.turn)];
 }
 
@@ -95,7 +95,7 @@ const MARGIN = 1.1;
 /** Fits the visible points into the picture, without a few outliers. Keeps the view if it is about right. */
 function fit() {
   const visible = allPoints();
-  // Some hundred points define the edges of the picture as well as thousands.
+  // A few hundred points are enough to find the edges of the picture.
   const stride = 2 * ceil(visible.reduce((sum, { points }) => sum + points.length, 0) / 1000);
   const [xs, ys] = [[], []];
   for (const { points, pose } of visible) {
@@ -125,7 +125,7 @@ function fit() {
   const goal = { scale, x, y };
   const now = view.goal ?? view;
   const moved = hypot(goal.x - now.x, goal.y - now.y) * scale;
-  // A moving view is hard to read: keep it while it fits.
+  // Keep the view while it fits, because a moving view is hard to read.
   const isOffFloor = isSideView() && abs(goal.x - now.x) * scale > 12;
   const isOut = scale * MARGIN < now.scale * 0.99 || moved > 0.12 * min(middle.width, middle.height) || isOffFloor;
   if (isOut || now.scale < 0.6 * scale || !view.isFitted) Object.assign(view, { goal, isFitted: true });

@@ -1,6 +1,6 @@
 // Messages of the server, and the WebSocket.
 
-/** Reader of little-endian CDR: four bytes of header, then values at multiples of their size. */
+/** Reader of little-endian CDR: a header of four bytes, and then values, each at a multiple of its size. */
 class Cdr {
   constructor(buffer, offset) {
     this.view = new DataView(buffer, offset + 4);
@@ -97,7 +97,7 @@ function takeBackground(topic, buffer, offset) {
   sensorAt(topic).background = toPoints(ranges, first, step);
 }
 
-/** Returns x and y of each range in the sensor's frame; NaN without a reading. */
+/** Returns x and y of each range in the sensor's frame; NaN for a beam without a reading. */
 function toPoints(ranges, first, step) {
   const xy = new Float32Array(2 * ranges.length);
   for (let i = 0; i < ranges.length; i++) {
@@ -173,7 +173,7 @@ const jsonHandlers = { robot: takeRobot, status: takeStatus, zones: takeZones, l
 
 /** Topics that change only the texts next to the picture. */
 const LIVE_TOPICS = ["robot", "status", "replay"];
-// The newest message of each topic, while the picture is frozen.
+// Newest message of each topic while the picture is frozen.
 let heldMessages = null;
 // Whether the frozen picture is the map of a site.
 let isHeldMap = false;

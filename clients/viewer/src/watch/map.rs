@@ -166,7 +166,7 @@ impl Layers {
         self.axes.extend(ticks(y, dots).map(|up| (0.0, up)));
     }
 
-    /// Moves each sign to the center of its cell in `grid`.
+    /// Moves each sign to its cell in `grid`.
     fn snap(&mut self, grid: &Grid) {
         let snap = |dots: &mut Dots| {
             dots.retain(|dot| grid.has(*dot));
