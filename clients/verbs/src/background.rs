@@ -27,7 +27,7 @@ use crate::text;
 pub struct BackgroundArgs {
     /// The sensor
     pub sensor: String,
-    /// Request about the background model of the sensor.
+    /// Request about its model.
     #[command(subcommand)]
     pub order: ModelRequest,
 }

@@ -17,7 +17,7 @@ pub use crate::receive_stats::ReceiveStats;
 use crate::receive_stats::{LineLossCounter, Loss};
 use crate::{json, text};
 
-/// Limits at which a verb ends by itself. Every verb that subscribes to topics has them as arguments.
+/// Limits at which a verb ends by itself. They are arguments of every verb that subscribes to topics.
 #[derive(clap::Args, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RunLimits {
     /// Stop after this number of samples
