@@ -147,8 +147,8 @@ impl ParsedFile {
         Ok(model)
     }
 
-    /// Returns whether the angles are those of version 1, which supported only the LMS: 0 was on the right, and 90
-    /// ahead.
+    /// Returns whether the angles are in the frame of version 1, which supported only the LMS: 0 was on the right, and
+    /// 90 ahead.
     fn has_version_1_angles(&self) -> bool {
         let layouts =
             [(181, 0.0, 1.0), (361, 0.0, 0.5), (101, 40.0, 1.0), (201, 40.0, 0.5), (401, 40.0, 0.25)];

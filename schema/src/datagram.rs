@@ -460,7 +460,7 @@ impl Announce {
         1 + u16::from(self.has_replaced())
     }
 
-    /// Returns the announcement with only those of its topics that are among `topics`.
+    /// Returns the announcement without the topics that are not in `topics`.
     pub fn restricted_to(&self, topics: &[Topic]) -> Announce {
         let mut restricted = Announce::new(self.boot, self.sensor(), self.kind());
         for announced in self.topics() {

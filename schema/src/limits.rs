@@ -62,7 +62,7 @@ pub const MAX_BORROWED_SAMPLES: usize = 4;
 pub const MAX_LOANED_SAMPLES: usize = 2;
 /// Maximum number of listeners of a wake service, for the subscribers of all topics of a sensor.
 pub const MAX_LISTENERS: usize = 250;
-/// Maximum number of notifiers of a wake service: the hub's link, and those of dead hubs that are not cleaned up yet.
+/// Maximum number of notifiers of a wake service: the hub's link, and links of dead hubs that are not cleaned up yet.
 pub const MAX_NOTIFIERS: usize = 4;
 /// Highest event ID of a wake service.
 pub const MAX_EVENT_ID: usize = 7;

@@ -241,7 +241,7 @@ impl Scan {
         Some(f64::from(self.range(i)?) * f64::from(self.unit_um) / 1e6)
     }
 
-    /// Returns the angle of beam `i` in radians: the exact angle if there is one, otherwise that of the grid.
+    /// Returns the angle of beam `i` in radians: the exact angle if there is one, otherwise the angle of the grid.
     #[inline]
     pub fn angle(&self, i: usize) -> f64 {
         match self.exact_angles().get(i) {

@@ -8,11 +8,12 @@ use bytemuck::Pod;
 use crate::limits::TopicLimits;
 use crate::{Failure, Kind};
 
-/// The table of topics. Calls the macro `$each` with its rows: with those of all topics, `links`: with those that a hub
-/// publishes for each link, or `makers`: with all rows in groups `MAKER { .. }`, one for each [`PublisherKind`].
+/// The table of topics. Calls the macro `$each` with rows of the table. By default, it passes the rows of all topics.
+/// With `links:`, it passes the rows of the topics that a hub publishes for each link. With `makers:`, it passes all
+/// rows in groups `MAKER { .. }`, one group for each [`PublisherKind`].
 ///
-/// A row is `VARIANT PAYLOAD, name, number, type, group, rate, word, queue, history: description;`. Its columns are
-/// those of [`TopicSpec`], in that order. A payload other than `[u8]` is a type of this crate.
+/// A row is `VARIANT PAYLOAD, name, number, type, group, rate, word, queue, history: description;`. Its columns are the
+/// fields of [`TopicSpec`], in the same order. A payload other than `[u8]` is a type of this crate.
 ///
 /// # Examples
 ///
@@ -109,7 +110,7 @@ macro_rules! payload_type {
     };
 }
 
-/// Properties of a topic, other than those of its payload.
+/// Properties of a topic, without the properties of its payload.
 #[derive(Clone, Copy, Debug)]
 pub struct TopicSpec {
     /// Name, as in `front/scan`.
@@ -314,7 +315,7 @@ impl WakeEvent {
     }
 }
 
-/// Returns the sensor and topic of a service's name, or `None` if it is not one of these names. Reverses
+/// Returns the sensor and the topic in the name of a service, or `None` if the service belongs to no topic. Reverses
 /// [`Topic::service`]. The wake service has no topic.
 pub fn parse_service_name(name: &str) -> Option<(&str, Option<Topic>)> {
     let (sensor, topic) = name.strip_prefix("scanhub/v2/")?.split_once('/')?;
@@ -345,8 +346,8 @@ pub fn check_sensor(name: &str) -> Result<(), Failure> {
     ))
 }
 
-/// Checks the name of a sensor, or of a remote sensor. The latter is `HUB.SENSOR`, and each half must be a valid name
-/// of a sensor.
+/// Checks the name of a sensor, or of a remote sensor. The name of a remote sensor is `HUB.SENSOR`, and `HUB` and
+/// `SENSOR` must each be a valid name of a sensor.
 ///
 /// # Errors
 ///
@@ -400,7 +401,7 @@ macro_rules! makers {
             /// All kinds.
             pub const ALL: [PublisherKind; [$(stringify!($maker)),*].len()] = [$(PublisherKind::$maker),*];
 
-            /// Returns its topics, in the order of [`Topic::ALL`].
+            /// Returns the topics of this kind of publisher, in the order of [`Topic::ALL`].
             pub const fn topics(self) -> &'static [Topic] {
                 match self { $(PublisherKind::$maker => &[$(Topic::$topic),*],)* }
             }

@@ -261,14 +261,14 @@ impl FixedPayload for Event {
 }
 
 impl Event {
-    /// Creates an event of person `id`, who is in `room` after it.
+    /// Creates an event of person `id`, who is in `room` after the event.
     pub fn new(kind: EventKind, id: u64, room: Option<&str>) -> Event {
         let mut event = Event { id, kind: kind as u8, ..Event::default() };
         text::write(&mut event.room_text, room.unwrap_or_default());
         event
     }
 
-    /// Adds the door and the rooms on both sides of it.
+    /// Adds the door, and the rooms on both sides of the door.
     pub fn with_door(mut self, door: &str, from: &str, to: &str) -> Event {
         text::write(&mut self.door_text, door);
         text::write(&mut self.from_text, from);

@@ -64,7 +64,7 @@ fn others_read_it() {
     assert_eq!((schema.name.as_str(), schema.encoding.as_str()), ("scanhub.Zones.v2", "scanhub.v2"));
 }
 
-/// A closed chunk can be read even if nothing follows it, as after a kill.
+/// A closed chunk can be read even if nothing follows it, for example because the process was killed.
 #[test]
 fn a_closed_chunk_outlives_its_writer() {
     struct FullDisk<'a>(&'a mut Vec<u8>);

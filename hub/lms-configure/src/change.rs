@@ -83,8 +83,8 @@ pub enum ChangeError {
     Unanswered,
     /// The scanner rejected the request. At [`Step::Enter`], the password is wrong.
     Refused,
-    /// The settings that were read back differ from those that were written. At [`Step::Compare`], they differ from
-    /// those of the plan.
+    /// The settings that were read back differ from those that were written. At [`Step::Compare`], they differ from the
+    /// settings of the plan.
     Mismatch,
 }
 

@@ -1,10 +1,10 @@
 //! Connection to a serial server on the network, which delivers the bytes of a serial line. The baud rate is set in the
 //! server and cannot be changed from here. Resolving a name and connecting can block for an unknown time, so a separate
-//! thread does both. The thread ends by itself.
+//! thread does both. No caller waits for the end of the thread.
 //!
-//! A connection can deliver bytes faster than any line. The read budget allows twice the rate of the line, and up to
-//! one second of this at once, because a network delays data and then catches up. The other bytes stay in the
-//! connection. When they are read, they are older than they seem.
+//! A connection can deliver bytes faster than any line. The read budget allows twice the rate of the line. It allows up
+//! to one second of bytes at once, because a network delays data and then catches up. Bytes beyond the budget stay in
+//! the connection. When they are read, they are older than they seem.
 
 use std::io::{self, ErrorKind, PipeReader, PipeWriter};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
@@ -54,7 +54,7 @@ impl Tcp {
     /// Discards the received bytes.
     pub(crate) fn discard_input(&self) -> io::Result<()> {
         let mut buffer = [0; 4096];
-        // Limit the loop, because the server may send as fast as it reads.
+        // Limit the number of bytes, because the server may send as fast as this loop reads.
         for _ in 0..MAX_DISCARDED / buffer.len() {
             if self.read(&mut buffer)? == 0 {
                 break;
@@ -154,7 +154,7 @@ fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
 }
 
 /// Returns the reason for `error`. If this machine has run out of a resource, neither the network nor the server is the
-/// cause. In all other cases, `otherwise` creates the reason.
+/// cause. In all other cases, `otherwise` returns the reason.
 fn connection_error(error: &io::Error, otherwise: fn(String) -> PortError) -> PortError {
     match PortError::of_io(error) {
         short @ PortError::ResourceExhausted(_) => short,
@@ -170,7 +170,7 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
 const MAX_DISCARDED: usize = 1 << 24;
 /// Interval between checks of `stop`.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Number of checks. The name and the connection together may take six seconds.
+/// Maximum number of checks. Name lookup and connection together may take six seconds.
 const MAX_POLLS: u32 = 60;
 
 /// Read budget of a network port. It grows with time, and reading consumes it. The caller passes the time.
@@ -180,7 +180,7 @@ pub struct ReadBudget {
     byte_ns: Nanos,
     /// Time until which the budget is consumed.
     spent_until: Nanos,
-    /// First and last time in the current period at which the budget was exhausted.
+    /// First and last time at which the budget was exhausted, in the current period of exhaustion.
     exhausted: Option<(Nanos, Nanos)>,
     /// Whether the last read filled its buffer, so that more bytes may be available.
     has_more: bool,
@@ -205,8 +205,8 @@ impl ReadBudget {
     }
 
     /// Returns the time at which the caller may read again, if the budget at `now` is too small for an efficient read.
-    /// Until then, the caller waits for this time only. `until` is the next deadline of the caller, for which it may
-    /// read a single byte.
+    /// Until this time, the caller must not wait for bytes. `until` is the next deadline of the caller. At this
+    /// deadline, the caller may read even a single byte.
     pub fn throttled_until(&mut self, now: Nanos, until: Nanos) -> Option<Nanos> {
         let (byte_at, resume_at) = (self.spent_until + self.byte_ns, self.spent_until + MIN_REFILL);
         if now >= resume_at {
@@ -215,7 +215,7 @@ impl ReadBudget {
         let since =
             self.exhausted.filter(|&(_, last)| now < last + RECOVERY_TIME).map_or(now, |(since, _)| since);
         self.exhausted = Some((since, now));
-        // An overdue deadline takes effect only after all available bytes were read, and there are more.
+        // An overdue deadline takes effect only after all available bytes were read, and there are more bytes to read.
         Some(if until > now { until.clamp(byte_at, resume_at) } else { resume_at })
     }
 
@@ -225,8 +225,8 @@ impl ReadBudget {
             .is_some_and(|(since, last)| now < last + RECOVERY_TIME && last >= since + FLOOD_THRESHOLD)
     }
 
-    /// Returns whether the bytes read last may have been buffered in the connection, at `now`. This is so if there were
-    /// more bytes than the caller could read, then or a moment before.
+    /// Returns whether the bytes read last may have been buffered in the connection, at `now`. Returns true if there
+    /// were more bytes than the caller could read, at the last read or shortly before.
     pub fn is_backlogged(&self, now: Nanos) -> bool {
         self.has_more || self.exhausted.is_some_and(|(_, last)| now < last + SETTLE_TIME)
     }
@@ -241,7 +241,7 @@ impl ReadBudget {
 const BUDGET_FACTOR: Nanos = 2;
 /// Maximum time for which unspent budget accumulates.
 const MAX_BURST: Nanos = 1_000 * MILLIS;
-/// Amount of budget to wait for after it was exhausted.
+/// Amount of budget that the caller waits for after the budget was exhausted.
 const MIN_REFILL: Nanos = 20 * MILLIS;
 /// Minimum duration of a flood. Bytes that a network has delayed are usually read within a second.
 const FLOOD_THRESHOLD: Nanos = 1_500 * MILLIS;

@@ -1,14 +1,14 @@
 //! Serial line of this machine, opened exclusively, raw, and at a baud rate that the driver has confirmed.
 //!
 //! The crate `serialport` sets the baud rate, the character format and the handshake, on a descriptor that this module
-//! has opened and locked. Only settings that differ are set. Each one reaches the driver separately, and a line that
-//! streams must not be disturbed. Two parts of that crate are unsuitable. Its `set_parity` makes the driver drop bytes
-//! with errors (IGNPAR), but here every byte counts. It also does not keep the number of an error.
+//! has opened and locked. Only settings that differ are set, because each setting reaches the driver separately, and
+//! setting it could disturb a stream. Two parts of that crate are unsuitable. Its `set_parity` makes the driver drop
+//! bytes with errors (IGNPAR), but here every byte counts. The crate also does not keep the numbers of errors.
 //!
-//! The kernel provides the error counters of a UART, but no safe crate reads them. Some drivers, such as that of a pty,
-//! have no counters, which is not an error. The driver counts errors when bytes reach it, but does not report in which
-//! bytes. After a telegram was read, an error may be in this telegram, in another telegram of the same read, or in
-//! bytes that have arrived since, which start the next telegram.
+//! The kernel provides the error counters of a UART, but no safe crate reads them. Some drivers, such as the driver of
+//! a pty, have no counters. This is not an error. The driver counts errors when bytes reach it, but does not report in
+//! which bytes. After a telegram was read, an error may be in this telegram, in another telegram of the same read, or
+//! in bytes that have arrived since. Those bytes start the next telegram.
 #![allow(unsafe_code)]
 
 use std::cell::Cell;
@@ -36,7 +36,8 @@ pub struct Tty {
     line: OwnedFd,
     /// Device that the port's name resolved to when it was opened.
     device: PathBuf,
-    /// Settings that this process has made, in order to detect changes by another process.
+    /// Settings that this process has made. They are compared with the present settings to detect changes by another
+    /// process.
     settings: Cell<Settings>,
     /// Number of errors that the driver had counted at the last check. `None` if the driver does not count errors.
     errors: Cell<Option<u32>>,
@@ -66,7 +67,7 @@ impl Tty {
     fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, PortError> {
         let termios = tcgetattr(&line)?;
         // Take the lock before setting the exclusive mode. A process that does not get the lock must not end the
-        // owner's mode.
+        // exclusive mode of the process that owns it.
         flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
             Errno::WOULDBLOCK => PortError::Busy,
             error => error.into(),
@@ -117,7 +118,7 @@ impl Tty {
     }
 
     /// Restores the settings of this process, at `baud`, and discards the input that arrived with other settings. If
-    /// the driver rejects the rate, the line keeps its rate, and a search tries others.
+    /// the driver rejects the rate, the line keeps its rate, and a search tries other rates.
     ///
     /// # Errors
     ///
@@ -138,7 +139,7 @@ impl Tty {
         &self.device
     }
 
-    /// Returns whether the line is a pty, so that another program simulates the scanner.
+    /// Returns whether the line is a pty. If so, another program simulates the scanner.
     pub(crate) fn is_simulated(&self) -> bool {
         self.device.starts_with("/dev/pts")
     }
@@ -153,8 +154,8 @@ impl Tty {
         tcgetattr(&self.line).ok().map(|termios| termios.output_speed())
     }
 
-    /// Returns the number of errors that the driver has counted since the last call. A change of the baud rate also
-    /// counts as a call.
+    /// Returns the number of errors that the driver has counted since the last call. After a change of the baud rate,
+    /// counting starts again.
     pub(crate) fn line_errors(&self) -> u64 {
         let Some(before) = self.errors.get() else { return 0 };
         let now = self.uart_counters().map_or(before, |counts| counts.errors());
@@ -230,7 +231,8 @@ impl AsFd for Tty {
 
 impl Drop for Tty {
     fn drop(&mut self) {
-        // The exclusive mode of a pty would outlast the close. A line that hung up is not affected.
+        // End the exclusive mode, which would survive the close of a pty. The call has no effect on a line that hung
+        // up.
         let _ = ioctl_tiocnxcl(&self.line);
     }
 }
@@ -360,7 +362,7 @@ fn clear_input(line: impl AsFd) -> serialport::Result<()> {
 }
 
 fn set_rate(port: &mut TTYPort, baud: u32) -> serialport::Result<()> {
-    // The library returns an error if the baud rates of the two directions differ. Set both then.
+    // The library returns an error if the baud rates of the two directions differ. In this case, set both rates.
     if port.baud_rate().ok() == Some(baud) { Ok(()) } else { port.set_baud_rate(baud) }
 }
 
@@ -417,8 +419,7 @@ impl UartCounters {
 }
 
 /// Enables low latency in the driver, so that an FTDI adapter delivers bytes every millisecond instead of every 16 ms.
-/// Also removes a custom divisor, which an old `setserial` may have set and which replaces the rate 38400 by another
-/// one.
+/// Also removes a custom divisor, which replaces the rate 38400 by another rate. An old `setserial` may have set it.
 pub(super) fn set_low_latency(line: impl AsFd) -> Result<(), Errno> {
     let mut serial = [0; STRUCT_WORDS];
     ioctl_words::<TIOCGSERIAL>(line.as_fd(), &mut serial)?;
@@ -458,7 +459,7 @@ const TIOCGICOUNT: Opcode = 0x545D;
 pub struct LineErrors {
     /// Whether the driver has counted errors since the last wait for bytes.
     is_current: bool,
-    /// Whether the driver counted errors in the period before.
+    /// Whether the driver counted errors between the last two waits for bytes.
     was_previous: bool,
 }
 

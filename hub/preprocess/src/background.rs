@@ -73,7 +73,7 @@ pub enum Start {
     /// Nothing.
     #[default]
     Empty,
-    /// The first scan, as soon as it is complete. Beams without a reading in it start empty.
+    /// The first scan, as soon as it is complete. Beams without a reading in this scan start empty.
     FirstScan,
 }
 
@@ -97,12 +97,12 @@ struct Limits {
 
 /// Default of both thresholds in mm: six standard deviations of a range (the paper names no value).
 const THRESHOLD_MM: u16 = 30;
-/// Default in cm mode, where the quantization adds to the noise.
+/// Default of both thresholds in cm mode, where quantization adds to the noise, in mm.
 const THRESHOLD_CM_MODE_MM: u16 = 60;
-/// Default in dm mode, where readings of surfaces 30 mm apart differ by at most one unit.
+/// Default of both thresholds in dm mode, in mm. Readings of two surfaces 30 mm apart differ by at most one unit there.
 const THRESHOLD_DM_MODE_MM: u16 = 100;
-/// Number of revolutions of an LMS's mirror in 10 s. It is the number of scans at steps of 1 degree, and twice the
-/// number of scans at half degrees.
+/// Default time until a surface is background, in ns: 750 revolutions of an LMS's mirror. They are 750 scans at steps
+/// of 1 degree, and half of this number at half degrees.
 const LEARNING_TIME_NS: f64 = 9.99e9;
 /// Maximum number of scans. The weights of `multi` grow by 8 per scan and have 16 bits.
 const MAX_SCANS: u32 = 8191;
@@ -338,8 +338,8 @@ impl BackgroundModel {
     ///
     /// # Errors
     ///
-    /// Returns [`Mismatch`] if the number of beams or the unit differs from that in the last scan, or if there are too
-    /// many beams.
+    /// Returns [`Mismatch`] if the number of beams or the unit differs from the last scan, or if there are too many
+    /// beams.
     pub fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
         let ranges = model.ranges();
         let shape = (ranges.len() as u16, model.unit_um);

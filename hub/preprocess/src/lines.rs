@@ -143,9 +143,10 @@ impl LineFinder {
         groups
     }
 
-    /// Returns the standard deviation of a range in meters, at least that of rounding to the unit of `scan`. It is
-    /// computed from the distance of each beam from the line through its two neighbors, and from the line through the
-    /// beams next to those neighbors. Edges and corners hardly change the median of these distances.
+    /// Returns the standard deviation of a range in meters, at least the standard deviation that rounding to the unit
+    /// of `scan` causes. It is computed from the distance of each beam from the line through its two neighbors, and
+    /// from the line through the beams next to those neighbors. Edges and corners hardly change the median of these
+    /// distances.
     fn noise(&mut self, groups: usize, scan: &Scan) -> f64 {
         let (mut count, mut first) = (0, 0);
         let steps = self.steps.as_flattened_mut();
@@ -191,7 +192,8 @@ impl LineFinder {
             min_points: usize::from(min_points),
             rounds: if refine { 3 } else { 1 },
             exchange: refine,
-            // After that, 19 of 20 beams still end on a line. In rooms drawn like those of PLE, 97.8 % do.
+            // After that, 19 of 20 beams still end on a line. In rooms drawn like the rooms of PLE, 97.8 % of the beams
+            // do.
             trimmed: if refine { rays / 20 } else { 0 },
         }
     }

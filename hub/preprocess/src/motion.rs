@@ -316,7 +316,7 @@ fn write(
     add_uncertainty(&mut covariance, odometry, found, step, offset);
     out.covariance = covariance::rows(&covariance);
     out.overlap = found.overlap as f32;
-    // The covariance of a step contains that of both positions.
+    // The covariance of a step contains the covariances of both positions.
     let is_degenerate = found.is_degenerate || odometry.is_degenerate;
     out.flags = if is_degenerate { Motion::DEGENERATE } else { 0 };
     out.flags |= if is_degenerate || odometry.is_open { Motion::OPEN } else { 0 };

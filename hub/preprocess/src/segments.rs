@@ -63,9 +63,9 @@ impl Segmenter {
 
     /// Fills in the segments of `foreground`, which was computed from `scan`. Writes every byte of them.
     ///
-    /// Two neighboring foreground beams belong to one segment if their points are as near to each other as those of a
-    /// surface seen at 10 degrees. The limit is r sin(step) / sin(10 degrees - step) + 15 mm, where r is the range of
-    /// the first beam. If the scan has exact angles, step is the difference between them.
+    /// Two neighboring foreground beams belong to one segment if their points are as near to each other as two points
+    /// of a surface at an angle of 10 degrees to the beam. The limit is r sin(step) / sin(10 degrees - step) + 15 mm,
+    /// where r is the range of the first beam. If the scan has exact angles, step is the difference between them.
     ///
     /// A segment is supported if it has several beams, or if its point is at most 0.3 m from a foreground point of the
     /// previous scan that was passed to this function or to [`pass`](Self::pass).
@@ -193,7 +193,8 @@ impl StepLimit {
     fn of(radians: f64) -> StepLimit {
         let step = ((radians + PI).rem_euclid(TAU) - PI).abs();
         let spread = 2.0 * (1.0 - step.cos());
-        // No scanner has steps of 10 degrees or more. With such a step, only the margin for noise can join two points.
+        // No scanner has steps of 10 degrees or more. With a step of 10 degrees or more, only the margin for noise can
+        // join two points.
         let flattest = MIN_INCIDENCE_DEG.to_radians();
         let slope = if step < flattest { step.sin() / (flattest - step).sin() } else { 0.0 };
         StepLimit { spread, slope }

@@ -367,7 +367,8 @@ impl Table {
         Beam { q: sx * ux + sy * uy, own }
     }
 
-    /// Returns the readings of `beam` inside circle `zone`: the first one, and the one after the last.
+    /// Returns the readings of `beam` inside circle `zone`, as a range: the first reading, and the reading after the
+    /// last.
     fn span(&self, beam: &Beam, zone: usize) -> (u64, u64) {
         let unit_mm = self.layout.unit_mm();
         let (sx, sy) = self.sensor_mm();

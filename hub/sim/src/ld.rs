@@ -26,9 +26,9 @@ pub use crate::rotating::TruePoint;
 pub struct LdSettings {
     /// The model.
     pub model: Model,
-    /// Mean revolutions per second; by default those of the model.
+    /// Mean revolutions per second. The default depends on `model`.
     pub revolutions_per_second: f64,
-    /// Points per second; by default those of the model.
+    /// Points per second. The default depends on `model`.
     pub points_per_second: f64,
     /// Share by which the speed varies. Real scanners stay within 1 %.
     pub speed_variation: f64,

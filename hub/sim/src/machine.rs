@@ -63,7 +63,7 @@ pub struct Settings {
     pub quirks: ProtocolQuirks,
     /// Number of bytes that arrive at once.
     pub chunk: ChunkSize,
-    /// Speed of the simulation's time, relative to that of the host. The host measures the gaps of its requests by its
+    /// Speed of the simulation's time relative to the host's time. The host measures the gaps of its requests by its
     /// own clock.
     pub speed: f64,
     /// Seed of the random delays before replies, and of the deviations.

@@ -63,11 +63,12 @@ pub struct SimulateOptions {
     pub force: bool,
     /// Type that the scanners report, which limits what they support.
     pub family: LmsModel,
-    /// Angle and resolution; `None` selects those of the recording, or those of the type without a recording.
+    /// Angle and resolution; `None` selects the values of the recording. Without a recording, it selects the values of
+    /// the type.
     pub variant: Option<Variant>,
-    /// Unit; `None` selects that of the recording, or that of the type without a recording.
+    /// Unit; `None` selects the unit of the recording. Without a recording, it selects the unit of the type.
     pub unit: Option<Unit>,
-    /// Measuring mode; `None` selects that of the recording, or 0x01 without a recording.
+    /// Measuring mode; `None` selects the mode of the recording. Without a recording, it selects 0x01.
     pub mode: Option<Mode>,
     /// Number of bytes that the host's hardware delivers at once.
     pub chunk: ChunkSize,

@@ -68,7 +68,7 @@ pub(crate) struct RequestDecoder {
     is_broken: bool,
     /// Whether the scanner is strict, so that the host must leave the minimum gap between two bytes.
     pub(crate) is_strict: bool,
-    /// Speed of the simulation's time relative to that of the host, which measures the gaps by its own clock.
+    /// Speed of the simulation's time relative to the host's time. The host measures the gaps by its own clock.
     speed: f64,
     dropped: Option<DroppedRequest>,
 }

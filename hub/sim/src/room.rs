@@ -104,8 +104,8 @@ impl Room {
         }
     }
 
-    /// Returns the measurements of the beams at `angles_mdeg`, with `shapes` in view. Consecutive beams are measured in
-    /// consecutive ones of the `revolutions` of the mirror.
+    /// Returns the measurements of the beams at `angles_mdeg`, with `shapes` in view. Beam i is measured in revolution
+    /// i modulo `revolutions` of the mirror.
     fn measure(
         &self,
         angles_mdeg: Vec<i32>,
@@ -140,8 +140,8 @@ fn angles_mdeg(variant: Variant) -> Vec<i32> {
     (0..variant.beams() as i32).map(|beam| variant.first_angle_mdeg() + beam * step_mdeg).collect()
 }
 
-/// Returns the measurements of the beams at `angles_mdeg` in `world`, with `shapes` in view. Consecutive beams are
-/// measured in consecutive ones of the `revolutions` of the mirror.
+/// Returns the measurements of the beams at `angles_mdeg` in `world`, with `shapes` in view. Beam i is measured in
+/// revolution i modulo `revolutions` of the mirror.
 #[allow(clippy::too_many_arguments)]
 fn measure(
     world: &WorldView,

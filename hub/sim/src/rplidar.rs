@@ -1,10 +1,10 @@
 //! A simulated RPLIDAR of Slamtec, without I/O. It replies to requests of a host, its motor spins up, and its head
 //! measures one point after the other, each at its own time. It sends the points in packets of the requested mode.
 //!
-//! In a scanner that triangulates, the laser is next to the lens. The angle of a point therefore lags behind that of
-//! the head by a shift that depends on the range, and points at the edge of a near object are out of angular order. The
-//! vendor's decoder of type 0x84 has a formula for the shift, which is used here for all modes of such a scanner. At an
-//! edge where the formula has no solution, there is no return.
+//! In a scanner that triangulates, the laser is next to the lens. The angle of a point therefore lags behind the angle
+//! of the head by a shift that depends on the range. Points at the edge of a near object are out of angular order. The
+//! vendor's decoder of type 0x84 has a formula for the shift. The simulator uses this formula for all modes of a
+//! scanner that triangulates. At an edge where the formula has no solution, there is no return.
 //!
 //! The sources of this behavior are the vendor's protocol manual and driver, and published measurements of a real A1M8.
 //! The simulator does not reply to requests that they do not describe.

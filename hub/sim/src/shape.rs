@@ -1,8 +1,8 @@
 //! Geometry of a world. Lengths are in millimeters.
 //!
 //! A [`Shape`] is flat and seen from the origin, with x to the right and y ahead. Angles are counted from x. For a
-//! tilted scanner, a [`Plane`] cuts everything that has a height into flat shapes. Its frame is that of the mount: x to
-//! the right, y ahead, z up, and the floor at 0.
+//! tilted scanner, a [`Plane`] cuts everything that has a height into flat shapes. The plane is in the frame of the
+//! mount: x to the right, y ahead, z up, and the floor at 0.
 
 use std::f64::consts::TAU;
 

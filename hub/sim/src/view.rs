@@ -272,7 +272,7 @@ impl View {
     }
 
     /// Copies the rays of `still` around the beam at `angle_deg`. Drops all faces that are not in `still`. The first
-    /// faces must be those of `still`.
+    /// faces of this view must be the faces of `still`.
     pub(crate) fn narrow(&mut self, still: &View, angle_deg: f64) {
         let middle = ray_index((angle_deg * 1e3) as i32) - still.first;
         self.faces.truncate(still.faces.len());

@@ -172,7 +172,7 @@ fn parse_scene(name: &str, text: &str) -> Result<Scene, Failure> {
     })
 }
 
-/// Pose in the middle of the world, facing along y, so that angles are those of a drawing with x to the right.
+/// Pose in the middle of the world, facing along y, so that angles are the same as in a drawing with x to the right.
 const PAGE_POSE: Pose = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
 
 #[derive(Deserialize)]

@@ -27,7 +27,7 @@ pub struct PathWalk {
 pub enum LinkPolicy {
     /// No other links.
     Own,
-    /// All other links, except those of other users in a sticky directory such as /tmp.
+    /// All other links, except links of other users in a sticky directory such as /tmp.
     AllButSticky,
 }
 

@@ -1,5 +1,5 @@
-//! Scans as `sensor_msgs/msg/LaserScan`, and points as `sensor_msgs/msg/PointCloud2`. The points are those of a scan,
-//! those of its foreground, or those of a sweep in three dimensions.
+//! Scans as `sensor_msgs/msg/LaserScan`, and points as `sensor_msgs/msg/PointCloud2`. The points come from a scan, from
+//! its foreground, or from a sweep in three dimensions.
 
 use std::mem::offset_of;
 

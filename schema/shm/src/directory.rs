@@ -446,8 +446,8 @@ impl StateDirectory {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] with owner and remedy if the directory, or the one above it, belongs to another user,
-    /// can be written to by others, or is reached by a link that another user could have made.
+    /// Returns [`Kind::Failed`] with owner and remedy if the directory, or the directory above it, belongs to another
+    /// user, can be written to by others, or is reached by a link that another user could have made.
     pub fn check(&self) -> Result<(), Failure> {
         self.open().map(drop)
     }

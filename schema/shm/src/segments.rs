@@ -6,7 +6,7 @@
 //!   stays as long as any process uses it.
 //! - Segments of other users are found by name, owner and mode, without opening them. The owner is reported, because
 //!   the library only reports "internal error".
-//! - The node counter is the one segment that the shared-memory library opens to all users. Anyone who can write to it
+//! - The node counter is the only segment that the shared-memory library opens to all users. Anyone who can write to it
 //!   can keep every later process out. It is therefore created here, for this user only, before the library looks for
 //!   it. The library uses the file that it finds.
 //! - A publisher's segments are allocated, because the first access to a full /dev/shm would end the process.

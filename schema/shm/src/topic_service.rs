@@ -484,8 +484,8 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
         self.failed += 1;
     }
 
-    /// Sends a sample that `fill` writes in place, starting with a default payload. Its length is `len`, or that of a
-    /// payload of fixed length. Otherwise the same as [`send_loan`](TopicPublisher::send_loan).
+    /// Sends a sample that `fill` writes in place, starting with a default payload. The payload has `len` bytes, or its
+    /// own length if that is fixed. Otherwise the same as [`send_loan`](TopicPublisher::send_loan).
     ///
     /// # Errors
     ///

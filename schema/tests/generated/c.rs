@@ -59,7 +59,7 @@ fn prefix(set: &str) -> String {
     format!("SCANHUB_{}_", name.to_uppercase())
 }
 
-/// Returns the set that already has constants for the values of this one, or `None`.
+/// Returns the set that already has constants for the values of this set, or `None`.
 fn shared_prefix(set: &str) -> Option<&'static str> {
     (set == "Obstacles").then_some("Cloud")
 }
@@ -151,7 +151,7 @@ fn comment(field: &Field) -> String {
     if text == "0." { String::new() } else { text }
 }
 
-/// Returns a line with its comment, which is above it if it is too long.
+/// Returns a line with its comment. If the comment is too long, it is above the line.
 pub(crate) fn with_comment(line: &str, comment: &str) -> String {
     let indent = &line[..line.len() - line.trim_start().len()];
     let on_same_line = format!("{line} /* {comment} */");
@@ -172,7 +172,8 @@ pub(crate) fn comment_above(indent: &str, comment: &str) -> String {
     lines.replace('\u{1}', " ")
 }
 
-/// Returns the sizes of arrays whose length depends on counts: those of a scan by its contents, and the segments.
+/// Returns the sizes of arrays whose length depends on counts: the arrays of a scan, which depend on its contents, and
+/// the segments.
 pub(crate) fn arrays(description: &Description) -> String {
     let segments =
         rules::arrays_of("Foreground").iter().find(|array| array.kind == "Segment").expect("segments");
@@ -204,7 +205,7 @@ pub(crate) fn arrays(description: &Description) -> String {
     text + ";\n}\n"
 }
 
-/// Returns the checks with which a compiler that has another layout stops.
+/// Returns the checks that fail if a compiler has another layout.
 pub(crate) fn checks(description: &Description) -> String {
     let mut text = String::new();
     for layout in &description.layouts {

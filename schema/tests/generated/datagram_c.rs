@@ -135,7 +135,7 @@ fn arrays<'a>(description: &'a Description, layout: &'a Layout) -> Vec<Array<'a>
     fields.chain(tail).collect()
 }
 
-/// Returns the name of a field with a number of elements, which must not be that of the array.
+/// Returns the name of a field with a number of elements. It must differ from the name of the array.
 fn count_name(layout: &Layout, name: &str) -> String {
     let is_count = rules::counts(layout).iter().any(|(count, _)| *count == name);
     if is_count && name != "count" {
@@ -149,7 +149,7 @@ fn element_name(element: &Layout) -> String {
     if element.name == "CloudPoint" { "point".to_owned() } else { snake(&element.name) }
 }
 
-/// Returns the fields of the head that the struct has, with those of structs in it.
+/// Returns the fields of the head that the struct has, including the fields of structs in the head.
 fn shown_layouts<'a>(
     description: &'a Description,
     layout: &'a Layout,
@@ -332,7 +332,7 @@ fn number_of(field: &Field, base: &str) -> String {
     number(kind, base, field.offset)
 }
 
-/// Returns the function that reads a payload. That of a foreground is called by one that also checks its bits.
+/// Returns the function that reads a payload. For a foreground, another function calls it and also checks the bits.
 fn reader(description: &Description, topic: Topic, layout: &Layout, arrays: &[Array]) -> String {
     let name = topic.name();
     let head = rules::fixed_part(layout);

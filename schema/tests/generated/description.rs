@@ -1,7 +1,7 @@
 //! Description of all layouts, read from the sources of this crate: every struct of a payload with its fields,
 //! their types and comments, and the constants and enums that the comments link to.
 //!
-//! Offsets are sums of sizes. That is exact, because every one of these structs derives `Pod`, which rejects padding.
+//! Offsets are sums of sizes. The sums are exact, because each of these structs derives `Pod`, which rejects padding.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -13,7 +13,7 @@ use syn::{Attribute, Expr, ImplItem, Item, Lit, Type};
 
 use super::rules;
 
-/// All layouts, those of fields and elements before those that contain them.
+/// All layouts. The layout of a field or an element is before the layouts that contain it.
 pub(crate) struct Description {
     pub(crate) layouts: Vec<Layout>,
     /// Layouts of the header of a datagram, and of an announcement with its topics.
@@ -86,11 +86,11 @@ const NUMBER_TYPES: [(&str, usize); 10] = [
     ("f64", 8),
 ];
 
-/// Character in a comment that is replaced by the values of the field's set.
+/// Character in a comment that stands for the values of the field's set.
 const VALUES_MARK: char = '\u{1}';
 
 impl Field {
-    /// Returns the comment, with `values` in place of the values that the field can have.
+    /// Returns the comment, with `values` as the text for the values that the field can have.
     pub(crate) fn doc(&self, values: &str) -> String {
         self.doc.replace(VALUES_MARK, values)
     }
@@ -384,7 +384,7 @@ impl Sources {
         (kept.join(" "), set)
     }
 
-    /// Returns the values of an enum, the bits of a type that has nothing else, or the flags of a payload.
+    /// Returns the values of an enum, the bits of a type that has only bits, or the flags of a payload.
     fn set(&self, name: &str) -> Set {
         if let Some((doc, values)) = self.enums.get(name) {
             let values = values.iter().map(|(number, name, doc)| Value {

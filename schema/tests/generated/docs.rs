@@ -9,7 +9,8 @@ use scanhub_schema::{PublisherKind, Topic};
 use super::description::{Description, Field, Kind, Layout, Value, first_sentence, lower_first};
 use super::rules::{self, ArrayRule};
 
-/// A field with more values has only their names.
+/// Maximum number of values that are listed with their meanings. If a field has more values, only their names are
+/// listed.
 const MAX_VALUES: usize = 10;
 const TABLE_HEAD: &str = "| offset | type | field |\n|---|---|---|\n";
 

@@ -68,7 +68,8 @@ fn check_blocks(path: &str, blocks: &[(&str, String)]) {
     check(path, &text);
 }
 
-/// Returns `text` in lines of at most `width` columns, the first one after `first` and the others after `next`.
+/// Returns `text` in lines of at most `width` columns. The first line starts with `first`, and the other lines start
+/// with `next`.
 fn wrap(first: &str, next: &str, text: &str, width: usize) -> String {
     let mut lines = Vec::new();
     let mut line = first.to_owned();
@@ -87,7 +88,7 @@ fn wrap(first: &str, next: &str, text: &str, width: usize) -> String {
     lines.join("\n") + "\n"
 }
 
-/// Offsets are sums of sizes, so a wrong one would also make a wrong size.
+/// Offsets are sums of sizes, so a wrong offset would also lead to a wrong size.
 #[test]
 fn sizes_are_those_of_the_structs() {
     let description = Description::read();

@@ -10,7 +10,7 @@ use super::{rules, topics_by_number, wrap};
 
 const MAX_LINE_WIDTH: usize = 120;
 
-/// Order of fields in the dataclasses where it is not that of the memory. Other fields follow.
+/// Order of fields in the dataclasses, where it differs from the order in memory. Other fields follow.
 const PARAMETER_ORDER: [(&str, &[&str]); 6] = [
     (
         "Scan",
@@ -190,7 +190,7 @@ fn comment(description: &Description, shown: &ShownField) -> String {
                 let none =
                     if kind_is_optional(set) { " None if this version does not have the value." } else { "" };
                 let doc = field.doc(&format!("one of {}", names_of(set)));
-                // The reader already does it.
+                // Leave out the sentence about other numbers, because the reader already handles them.
                 let doc = doc.split(" Treat ").next().unwrap_or_default();
                 format!("{doc}{none}")
             }

@@ -9,7 +9,7 @@ use super::wrap;
 const MAX_LINE_WIDTH: usize = 120;
 /// Column of the text after the name of a type.
 const NAME_COLUMN: usize = 25;
-/// A set of more values is not listed.
+/// Maximum number of values of a set. A larger set is not listed.
 const MAX_VALUES: usize = 10;
 /// Character for a space at which a line must not end.
 const JOIN_MARK: &str = "\u{1}";

@@ -81,7 +81,8 @@ pub(crate) struct FixedPart {
     pub(crate) fields: usize,
 }
 
-/// Returns the start of a payload: the fields before the first array, which in a datagram has only its used elements.
+/// Returns the start of a payload, which has the fields before the first array. In a datagram, this array has only its
+/// used elements.
 pub(crate) fn fixed_part(layout: &Layout) -> FixedPart {
     let fields = layout.fields.iter().position(|field| field.name.ends_with("_array"));
     let fields = fields.unwrap_or(layout.fields.len());
@@ -112,8 +113,8 @@ pub(crate) fn number_size(kind: &str) -> usize {
     kind[1..].parse::<usize>().expect("a number's type ends with its bits") / 8
 }
 
-/// Returns the size in bytes of a payload's first revision if a later one has more fields. Readers fill the missing
-/// fields with 0.
+/// Returns the size in bytes of a payload's first revision if a later revision has more fields. Readers fill the
+/// missing fields with 0.
 pub(crate) fn first_revision(layout: &str) -> Option<usize> {
     (layout == "Motion").then_some(80)
 }

@@ -551,7 +551,7 @@ impl PreparedScan {
         (variance <= MAX_DIRECTION_VARIANCE).then_some(surface)
     }
 
-    /// Returns whether reading `i` and the one before it may belong to one object.
+    /// Returns whether reading `i` and the reading before it may belong to one object.
     pub(super) fn is_connected(&self, i: usize) -> bool {
         let (one, two) = (&self.readings[i - 1], &self.readings[i]);
         let (p, q) = (self.points[i - 1], self.points[i]);
