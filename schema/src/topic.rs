@@ -315,8 +315,8 @@ impl WakeEvent {
     }
 }
 
-/// Returns the sensor and the topic in the name of a service, or `None` if the service belongs to no topic. Reverses
-/// [`Topic::service`]. The wake service has no topic.
+/// Returns the sensor and the topic in the name of a service, or `None` if it is neither the service of a topic nor a
+/// wake service. Reverses [`Topic::service`]. A wake service has no topic.
 pub fn parse_service_name(name: &str) -> Option<(&str, Option<Topic>)> {
     let (sensor, topic) = name.strip_prefix("scanhub/v2/")?.split_once('/')?;
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }

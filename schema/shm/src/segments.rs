@@ -289,7 +289,7 @@ const NODE_COUNTER_CONTENT: [u8; 16] = {
 
 /// Name of the prefix's file in the domain's directory.
 const PREFIX_FILE: &str = "prefix";
-/// Length of the random word in letters. There are 60 million words of this length.
+/// Length of the random word in characters. There are 60 million words of this length.
 const RANDOM_WORD_LEN: usize = 5;
 const ALPHABET: &[u8] = b"0123456789abcdefghijklmnopqrstuvwxyz";
 const MAX_PREFIX_FILE_BYTES: u64 = 64;
