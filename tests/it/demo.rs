@@ -185,7 +185,7 @@ fn rejects_domain_flag_and_ignores_its_variable() {
     check_summaries(&outcome, &["front", "rear"]);
 }
 
-/// Starts a verb of the program in the `domain` of a running demo.
+/// Starts a verb of the program in the domain `domain` of a running demo.
 fn run_in_demo(domain: &str, arguments: &[&str]) -> Program {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(arguments).args(["--json", "--domain", domain]).env_clear();

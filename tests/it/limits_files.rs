@@ -89,7 +89,7 @@ fn rejects_devices_pipes_and_directories_at_once() {
             &["convert", path, "x.mcap"],
             &["background", "a", "load", path],
         ] {
-            // The name of such a file is a value of the configuration, so the exit code is 78.
+            // The configuration has the name of this file as a value, so the exit code is 78.
             let code = if arguments.contains(&model.as_str()) { 78 } else { 66 };
             assert_refused(&env, arguments, code, words);
         }

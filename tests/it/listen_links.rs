@@ -1,5 +1,5 @@
-//! `scanhub listen` on links that fail for a moment. A switch that filters by multicast group forgets the members on
-//! such a link, so the listener must join its groups again.
+//! `scanhub listen` on links that fail for a moment. When a link fails, a switch that filters by multicast group
+//! forgets the members on it. The listener must then join its groups again.
 
 use std::collections::BTreeSet;
 use std::os::fd::OwnedFd;

@@ -197,7 +197,7 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         for sensor in ["front", SENSOR_NAME, "00000000000000ab.front"] {
             echo.await_line(sensor, |line| line["sensor"] == sensor && line["class"] != "notice");
         }
-        // The verdict of `robot` combines the robot's own sensors, without those of other robots.
+        // The verdict of `robot` combines the robot's own sensors, and no sensors of other robots.
         let mut robot = env.start(&["echo", "--json", "robot/zones"]);
         robot.await_lines(3, "a verdict", |line| line["sensors"][0]["sensor"] == "front");
         let outcome = robot.end(INT);

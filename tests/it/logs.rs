@@ -67,7 +67,7 @@ fn a_log_is_read_as_it_reaches_and_says_so_first() {
 #[test]
 fn zones_stay_valid_until_the_next_scan_of_a_slow_log() {
     let env = TestEnv::new();
-    // This period is much longer than that of any streaming scanner.
+    // This period is much longer than the period of any streaming scanner.
     let file = log(&env, &["1.50"], 4, 400);
     let mcap = file.replace("a.log", "a.mcap");
     assert_eq!(env.run(&["convert", &file, &mcap]).exit_code, Some(0));

@@ -335,7 +335,7 @@ fn doctor_reports_each_link_of_the_running_hub() {
     }
     let text = env.run(&["doctor", "--no-system-config"]).to_string();
     assert!(text.contains(&format!("{server} (link side)")), "{text}");
-    // Links of a configuration are checked in addition to those of the hub.
+    // `doctor` checks the links of a configuration in addition to the links of the hub.
     let named = env.run(&["doctor", "--json", "--no-system-config", &env.link("front"), &env.link("rear")]);
     let findings = named.of_class("check");
     let links = ["front", "rear", "absent", "side"];

@@ -45,7 +45,7 @@ fn reopens_a_port_by_name_on_each_new_device() {
     let port = env.path("front");
     let hub = env.hub(&[env.lms_link("front")]);
     let mut subscriber = env.echo(&["front/telegram", "front/status"]);
-    // Each device is another pty: the previous one still exists when the next one is created.
+    // Each device is another pty, because the previous device still exists when the next one is created.
     let mut line = TestLine::create(&port);
     for plugged in 1..=5 {
         // When the hub opens a line, it discards bytes that have already arrived. It sends its first request after

@@ -10,7 +10,7 @@ use serde_json::Value;
 
 #[test]
 fn subscribers_outlive_several_hubs() {
-    // A hub that gets no CPU time makes topics stale, but is not reported as gone.
+    // A hub without CPU time makes topics stale, but no client reports the hub as gone.
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=21"]);
     let link = [env.lms_link("front")];

@@ -1,5 +1,5 @@
-//! Tests of recordings for ROS 2, made live or converted later. Independent readers can read every message. The values,
-//! frame and time of a message equal those of the published scan.
+//! Tests of recordings for ROS 2, made live or converted later. Independent readers can read every message. A message
+//! has the same values, frame and time as the published scan.
 
 use std::collections::BTreeMap;
 use std::process::Command;

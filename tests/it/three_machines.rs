@@ -109,7 +109,7 @@ fn two_rooms_are_watched_from_a_third_machine() {
         // The slots of `watch` become free only after the publishers have cleaned up.
         wait_until("the end of the subscription", || watcher.subscribers("room0.front/zones") == 0);
 
-        // Without the router, the rooms continue on their own, and no other machine keeps an old verdict.
+        // Without the router, the rooms continue on their own. No other machine keeps an old verdict.
         let mut zones = watcher.echo(&["room0.front/zones"]);
         zones.await_line("a verdict", |line| line["class"] == "zones" && line["verdict"] != "unknown");
         let mut local = rooms[0].start(&["hz", "--json", "front/scan"]);

@@ -130,7 +130,7 @@ fn points_match_the_hall_and_the_post_is_an_obstacle() {
     off.sort_by(f64::total_cmp);
     // If the machine stalls, the hub stamps scans late.
     assert!(off[off.len() * 9 / 10] < 0.08, "{:?}", [off[off.len() / 2], off[off.len() * 9 / 10]]);
-    // A name that a link, a mount or another `tilt` has is refused.
+    // `tilt` refuses a name that a link, a mount or another `tilt` has.
     let again = hall.tilt(&["--as=hall"]).wait();
     let held = |name: &str, pid: u32| format!("the name {name} is published by process {pid} (scanhub)");
     assert!(again.exit_code == Some(75) && reports_error(&again, &held("hall", tilt.pid())), "{again}");

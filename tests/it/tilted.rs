@@ -114,7 +114,7 @@ pub(crate) fn hub(env: &TestEnv) -> Program {
     env.hub(&[env.link("front")])
 }
 
-/// Asserts that lines of `class` that both programs printed agree in `keys`. Returns the count of such lines.
+/// Asserts that lines of `class` that both programs printed agree in `keys`. Returns the number of these lines.
 fn assert_same_lines(first: &Outcome, other: &Outcome, class: &str, keys: &[&str]) -> usize {
     let others = other.of_class(class);
     let mut same = 0;

@@ -234,7 +234,7 @@ fn tmux_shows_picture_help_and_narrow_windows() {
     let line = format!("{program} demo --for=60s; echo ended with $?; sleep 20");
     let Some(tmux) = Tmux::start(&env, &line, (80, 30)) else { return };
     let is_picture = |rows: &[String]| rows[1..].iter().flat_map(|row| row.chars()).any(is_braille);
-    // The sensors have the order in which the hub has created their topics.
+    // The sensors have the order in which the hub created their topics.
     let streams = |rows: &[String], sensor: &str| {
         let mut of_sensor = rows.iter().filter(|row| row.starts_with("1 ") || row.starts_with("2 "));
         of_sensor.any(|row| row[2..].starts_with(sensor) && row.contains("streaming"))

@@ -139,8 +139,8 @@ fn screen_readers_get_names_states_and_the_verdict() {
 fn reduced_motion_disables_animations() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
-    // Script that returns the number of different scales of the view on its way back from a larger one, until it is
-    // unchanged for 20 frames.
+    // Script that follows the view on its way back from a larger scale. It returns the number of different scales until
+    // the view is unchanged for 20 frames.
     let places = "new Promise((done) => {
         const scales = new Set();
         let [last, still] = [0, 0];

@@ -30,8 +30,8 @@ fn pose() -> Pose {
 /// Time of a message in ns since 1970, and its body.
 type ChannelMessage = (u64, Vec<u8>);
 
-/// A viewer that behaves like npm's `@foxglove/ws-protocol` 0.8.0: it numbers subscriptions from 0 and sends a message
-/// for each.
+/// A viewer that behaves like npm's `@foxglove/ws-protocol` 0.8.0: it numbers subscriptions from 0, and sends a
+/// separate message for each of them.
 struct Viewer {
     socket: WebSocket<TcpStream>,
     /// Channels by the number of their subscription.

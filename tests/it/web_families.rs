@@ -14,8 +14,8 @@ use scanhub_viewer::scene::{PointerPosition, Scene};
 const HALL_WORLD: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n
 [[thing]]\nradius_mm = 150\npose = [900, 1300]\n";
 
-/// Returns the points of `sensor` on the page, in the robot's frame in meters. Coordinates are NaN for beams without a
-/// point.
+/// Returns the points of `sensor` on the page, in the robot's frame in meters. A beam without a point has the
+/// coordinates NaN.
 fn drawn_points(page: &mut Browser, sensor: &str) -> Vec<(f64, f64)> {
     let points = page.ask(&format!("scanhub.points('{sensor}')"));
     let numbers: Vec<f64> =
@@ -28,7 +28,7 @@ fn pair(value: &Value) -> (f64, f64) {
     (value[0].as_f64().expect("a number"), value[1].as_f64().expect("a number"))
 }
 
-/// Returns where the beams in a line of class `scan` end, for a sensor at `pose`, in meters.
+/// Returns the points at which the beams in a line of class `scan` end, in meters. The sensor is at `pose`.
 fn measured_points(scan: &Value, pose: &Pose) -> Vec<(f64, f64)> {
     let unit_mm = number(scan, "unit_um") as f64 / 1000.0;
     let (first, step) =

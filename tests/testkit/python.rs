@@ -16,7 +16,7 @@ pub(crate) fn python(modules: &str) -> Option<Command> {
     python_for("python-packages", modules)
 }
 
-/// Returns the same as [`python`]. Skips the test because of `need` if there is no such interpreter.
+/// Returns the same as [`python`]. If there is no interpreter with `modules`, skips the test because of `need`.
 pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
     let made = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/venv/bin/python");
     let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);

@@ -1,4 +1,4 @@
-//! Tests that run again in a prepared process, such as one in another network, with other mounts or as another user.
+//! Tests that run again in a prepared process: in another network, with other mounts, or as another user.
 
 use std::io::{BufRead, BufReader};
 use std::process::{Command, Stdio};

@@ -66,7 +66,7 @@ impl Supervisor {
         (command, line.into())
     }
 
-    /// Waits until the hub has sent the line `message`. Each call takes one such line.
+    /// Waits until the hub has sent the line `message`. Each call uses up one line.
     pub(crate) fn wait_for_message(&mut self, message: &str) {
         self.socket.set_read_timeout(Some(WAIT_TIMEOUT)).expect("a socket");
         while !self.unread_messages.iter().any(|line| line == message) {

@@ -124,7 +124,7 @@ fn golden_datagrams_are_shown_field_by_field() {
                 }
                 target.insert("scanhub.refused".to_owned(), Vec::new());
             }
-            // These results depend on a key or on earlier datagrams, which the capture does not have.
+            // These results depend on a key or on earlier datagrams. The capture has neither.
             Some("unauthenticated" | "mac" | "epoch" | "twin" | "stale" | "capacity") => {}
             Some(refusal) => {
                 target.insert("scanhub.refused".to_owned(), vec![refusal.to_owned()]);

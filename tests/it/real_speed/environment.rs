@@ -18,7 +18,7 @@ pub(super) struct RealSpeedEnvironment {
     started: Instant,
     sensors: Sensors,
     hub: Option<Program>,
-    /// Tasks that follow from earlier actions, each with its time.
+    /// Tasks that follow from earlier actions, each with the time at which it is due.
     scheduled: Vec<(Nanos, ScheduledTask)>,
     /// Subscribers of topic `telegram`, one for each sensor, which run all the time.
     telegrams: Vec<Program>,

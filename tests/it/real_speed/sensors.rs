@@ -1,4 +1,5 @@
-//! Simulated sensors in threads of the test. Events are applied to them while they run, and what they send is recorded.
+//! Simulated sensors in threads of the test. Events are applied to them while they run, and everything that they send
+//! is recorded.
 
 use std::collections::{HashMap, VecDeque};
 use std::os::unix::net::UnixStream;
@@ -62,7 +63,7 @@ impl Sensors {
         events.get_mut(&env.path(SENSORS[sensor])).expect("a sensor").push_back(event);
     }
 
-    /// Ends the simulator. Returns what each sensor sent, in its order, and the summaries.
+    /// Ends the simulator. Returns the records that each sensor sent, in the order of sending, and the summaries.
     pub(super) fn end(self, env: &TestEnv) -> ([Vec<Record>; 2], Vec<Summary>) {
         drop(self.stop);
         let summaries =
