@@ -23,9 +23,9 @@
 //! - For each sample, the shared-memory library checks all possible subscriber slots three times. For one small message
 //!   to one receiver, a pipe or a Unix socket needs less memory than the slots. At 37.5 Hz, the slots have left the
 //!   caches before each message. For the same reason, spinning does not reach the microsecond that it reaches when
-//!   messages arrive without a pause.
-//! - For the event, the library sends one datagram to each listener, and the listener needs one more system call to
-//!   receive it. The event takes about twice as long as a futex. The doorbell wakes all sleeping subscribers at once, so
+//! - For the event, the library sends one datagram to each listener, and the listener needs one more system call for
+//!   it. The event takes about twice as long as a futex. The doorbell wakes all sleeping subscribers at once, so they
+//!   compete for two cores.
 //!   they compete for two cores.
 
 mod baselines;

@@ -19,8 +19,8 @@
 //!   and about a hundred sensors because of the second-level cache. For each sample, the library checks all possible
 //!   subscriber slots of the topic, which are 1168 bytes apart.
 //! - A table of growth has the line `fixed + for each * n`, which minimizes the squares of relative errors. It also has
-//!   the slope of the logarithms from a sixteenth of the largest number upward. A slope that exceeds the slope of linear
-//!   growth by 0.25 is reported as worse than linear.
+//!   the slope of the logarithms from a sixteenth of the largest number upward. If a slope exceeds the slope of linear
+//!   growth by 0.25, it is reported as worse than linear.
 //! - Latency is the latency of the last subscriber. Numbers above 125 are measured once.
 //! - `program and libraries` are pages of the executable, which the machine holds only once. Touched shared memory is
 //!   the part of the samples that is in use. It is small because the same few samples are used repeatedly.

@@ -151,5 +151,5 @@ const MAP_SETTINGS: Settings = Settings {
 /// A hundredth of the minimum variance of a range, which is (5 mm)^2. A beam that grazes its wall has a twentieth of
 /// the minimum variance.
 const MIN_VARIANCE: f64 = 2.5e-7;
-/// Maximum number of scans. It is small because the background of a moving robot takes long to drop.
+/// Maximum number of scans, because the background of a moving robot takes long to forget.
 const SCANS: usize = 40;

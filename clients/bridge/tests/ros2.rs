@@ -147,7 +147,7 @@ fn check_graph(report: &Value) {
 }
 
 /// Checks that the decoded scans are the measured ones, and that nearly all of them arrived. With best effort, a busy
-/// machine drops those that are late.
+/// machine drops late scans.
 fn check_scans(report: &Value, sensor: &str) {
     let scans = &report["scans"][format!("/robot1/{sensor}/scan")];
     let number = |key: &str| scans[key].as_u64().unwrap_or_default();
@@ -163,7 +163,7 @@ fn check_scans(report: &Value, sensor: &str) {
     assert!(100 * lost <= number("published") + 100, "{sensor}: {lost} lost: {scans}");
 }
 
-/// Checks that every other topic had messages, and checks their contents.
+/// Checks that every other topic had messages, and checks the contents of the messages.
 fn check_others(report: &Value) {
     for (name, count) in report["heard"].as_object().expect("counts") {
         assert!(count.as_u64() > Some(0), "{name}: {report:#}");
@@ -181,7 +181,8 @@ fn check_others(report: &Value) {
     }
 }
 
-/// Runs the bridge commands of the page on a port of this machine. The first one listens, and the others connect to it.
+/// Runs the bridge commands of the page on a port of this machine. The first bridge listens, and the others connect to
+/// it.
 #[test]
 fn the_examples_of_the_page_run() {
     let page =

@@ -30,8 +30,8 @@ polygon = [[0, 0], [5, 0], [5, 4], [0, 4]]
 const MS: u64 = 1_000_000;
 const RANGES: [u16; 4] = [300; 4];
 
-/// Runs `track`, and sends scans of `rear` that are half a second late until a line with `text` reports one. Returns
-/// the lines and the notes.
+/// Runs `track`, and sends scans of `rear` that are half a second late. Continues until a line with `text` reports a
+/// late scan. Returns the lines and the notes.
 fn run_with_late_scans(json: bool, text: &str) -> (String, String) {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 7);
@@ -50,7 +50,7 @@ fn run_with_late_scans(json: bool, text: &str) -> (String, String) {
     for seq in [1_000 * MS, 1_200 * MS, 1_400 * MS] {
         hub.sensors[0].publish_scan_with_foreground(seq, &RANGES);
     }
-    // A scan is late only if the tracker has received a later one of `front` before it, so several attempts may be
+    // A scan is late only if the tracker has received a later scan of `front` before it, so several attempts may be
     // needed.
     let mut seq = 700 * MS;
     wait_until("a late scan is reported", || {

@@ -1,5 +1,5 @@
-//! Test that a slow viewer and many connections do not cost other viewers any message. The next message is published
-//! once all readers have the last one, so the test does not depend on the speed of the machine.
+//! Test that other viewers miss no message because of a slow viewer and many connections. The next message is published
+//! when all readers have the previous one, so the test does not depend on the speed of the machine.
 
 use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,9 +14,9 @@ use serde_json::json;
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
 
-/// Timeout for a message, far longer than it takes.
+/// Timeout for a message. A message takes far less time.
 const TIMEOUT: Duration = Duration::from_secs(60);
-/// Number of messages; together they are longer than the buffers of the system.
+/// Number of messages. Together, the messages are longer than the system's buffers.
 const MESSAGE_COUNT: u32 = 400;
 const MESSAGE_LEN: usize = 20_000;
 /// Number of viewers that read.
@@ -41,7 +41,7 @@ fn connect_viewer(address: SocketAddr) -> WebSocket<TcpStream> {
     tungstenite::client(request, stream).unwrap().0
 }
 
-/// Returns subscription and body of the next message.
+/// Returns the subscription ID and the body of the next message.
 fn next_message(viewer: &mut WebSocket<TcpStream>) -> (u32, Vec<u8>) {
     loop {
         if let Message::Binary(frame) = viewer.read().unwrap() {
@@ -50,7 +50,7 @@ fn next_message(viewer: &mut WebSocket<TcpStream>) -> (u32, Vec<u8>) {
     }
 }
 
-/// Subscribes to both channels, and waits for the last state, which is sent at once.
+/// Subscribes to both channels, and waits for the last state. The server sends the last state at once.
 fn subscribe(viewer: &mut WebSocket<TcpStream>) {
     let both: Vec<_> = (1..=2).map(|id| json!({ "id": id, "channelId": id })).collect();
     let wish = json!({ "op": "subscribe", "subscriptions": both });
@@ -66,7 +66,7 @@ fn publish(channels: &ChannelStore, scans: ChannelPublisher<'_>, number: u32) {
     channels.wake_if_new();
 }
 
-/// Returns the number in a message of subscription 1.
+/// Returns the number in a message of the subscription with ID 1.
 fn number((subscription, body): (u32, Vec<u8>)) -> u32 {
     assert_eq!(subscription, 1);
     u32::from_le_bytes(body[..4].try_into().unwrap())

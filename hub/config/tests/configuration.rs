@@ -58,8 +58,8 @@ fn the_page_holds() {
         (top.family(), top.scanner.is_auto(), set.mode, set.stop_when_idle),
         (Some(Family::Rplidar), true, None, false)
     );
-    // The default configuration shows the default values. The sections of the first link change them, so compare with
-    // the second.
+    // The default configuration shows the default values. The sections of the first link change the values, so compare
+    // with the second link.
     let Processing { zones, marks, lines, background, early, .. } = Processing::default();
     let shown = &rear.processing;
     assert_eq!((&shown.zones, shown.marks, &shown.background), (&zones, marks, &background));
@@ -67,7 +67,7 @@ fn the_page_holds() {
     assert_eq!(shown.early, early);
 }
 
-/// Every family has a section in the output of `config default`. All sections but the first are comments.
+/// Every family has a section in the output of `config default`. All sections except the first are comments.
 #[test]
 fn the_default_has_a_section_for_each_family() {
     let is_setting = |line: &&str| *line == "[[link]]" || line.contains(" = ");
@@ -260,8 +260,8 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
         &["zones.min_beams=300", "link.rear.resolution=1"],
         "link rear: min_beams = 300, but a scan has 181",
     );
-    // Two meters ahead of the center, the sensor faces away from the circle. Turned by 180 degrees, it sees 30 degrees
-    // of the circle: 61 beams.
+    // The sensor is two meters ahead of the center and faces away from the circle. If it is turned by 180 degrees, it
+    // sees 30 degrees of the circle, which is 61 beams.
     let facing_away = "link.front.pose.x=2";
     refused(
         &[facing_away, "link.front.pose.y=0"],

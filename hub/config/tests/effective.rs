@@ -1,5 +1,5 @@
-//! Tests of the values in effect: each value of each link has a place in its source, and the reported values are those
-//! that the hub uses.
+//! Tests of the values in effect. Each value of each link has a position in its source. The reported values are the
+//! values that the hub uses.
 
 use std::fs;
 
@@ -63,7 +63,7 @@ fn reports_the_deciding_source_of_each_value() {
         ("link.a.pose.x", json!(-0.25), "--set link.a.pose.x=-0.25".to_owned()),
         ("link.a.pose.yaw", json!(1.5), first.location("4:25")),
         ("link.b.pose.x", json!(0.0), "default".to_owned()),
-        // A value for one link takes precedence over a value for all links, in any order.
+        // A value for one link takes precedence over a value for all links, in any order of the two.
         ("link.a.zones.margin", json!(0.05), first.location("6:10")),
         ("link.b.zones.margin", json!(0.01), second.location("2:10")),
         ("link.b.zones.radii", json!([1.2, 0.7]), "--set zones.radii=[1.2,0.7]".to_owned()),
@@ -181,7 +181,7 @@ fn default_file_has_default_values_and_every_key() {
     let line = |line: &str| line.strip_prefix("# ").filter(|rest| is_key(rest)).unwrap_or(line).to_owned();
     let all: Vec<String> = DEFAULT.lines().map(line).collect();
     let all = TempConfig::new("all.toml", &all.join("\n"));
-    // Every key of the output is set in the file, for all links or for one.
+    // The file sets every key of the output, for all links or for one link.
     let values = values(&sources(&[&all], &[], &[])).unwrap();
     let of_link = |key: &str| Some(key.strip_prefix("link.")?.split_once('.')?.1.to_owned());
     let key = |value: &Value| of_link(&value.key).unwrap_or_else(|| value.key.clone());

@@ -1,5 +1,5 @@
-//! Tests of the minimum intensity of marks. It has one key for levels of reflectors, and another one for intensities of
-//! any surface. A link rejects the key that does not apply to its scanner if it is set for this link alone.
+//! Tests of the minimum intensity of marks. One key is for reflector levels, and another key is for intensities of any
+//! surface. If a key is set for one link alone and does not apply to the link's scanner, the link rejects it.
 
 use scanhub_config::{Config, Link, Sources, values};
 

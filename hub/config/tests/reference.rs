@@ -1,6 +1,6 @@
 //! Generator of the default configuration and of the tables of `docs/configuration.md`, from the keys of the sections.
-//! The tests fail if the files are not as generated. To write them again: `SCANHUB_REWRITE=1 cargo test -p
-//! scanhub-config --test reference`.
+//! The tests fail if the files differ from the generated text. This command writes the files again: `SCANHUB_REWRITE=1
+//! cargo test -p scanhub-config --test reference`.
 
 use std::fs;
 use std::path::Path;
@@ -16,7 +16,7 @@ const PAGE_HEAD: &str = "\
 # `scanhub probe PORT` finds the scanner at a port, and `scanhub probe PORT --toml` prints its section.
 ";
 
-/// Links of the default configuration: title, name, port and family. All of them but the first are comments.
+/// Links of the default configuration: title, name, port and family. All links except the first are comments.
 const LINKS: [(&str, &str, &str, Option<Family>); 5] = [
     ("", "front", "/dev/ttyUSB0", None),
     ("A SICK LMS 2xx.", "rear", "/dev/ttyUSB1", Some(Family::Lms)),
@@ -50,7 +50,7 @@ fn line(setting: &str, comment: &str) -> String {
     }
 }
 
-/// Returns the line of a key with its default, or as a comment with an example.
+/// Returns the line of a key with its default. If the key has no default, the line is a comment with an example.
 fn with_default(key: &Key, default: &str) -> String {
     let setting = match key.example {
         "" => format!("{} = {default}", key.name),
@@ -157,7 +157,7 @@ fn with_tables(page: &str) -> String {
     text
 }
 
-/// Returns the comment `text` as a sentence: with an upper-case letter and a full stop.
+/// Returns the comment `text` as a sentence that starts with an uppercase letter and ends with a period.
 fn sentence(text: &str) -> String {
     format!("{}{}.", text[..1].to_uppercase(), &text[1..])
 }

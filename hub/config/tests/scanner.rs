@@ -1,5 +1,5 @@
-//! Tests of the scanner of a link: the keys that determine it, and that a key or value that its family does not support
-//! is rejected with place, value and remedy.
+//! Tests of the scanner of a link. They cover the keys that determine the scanner. If the family does not support a key
+//! or value, it is rejected with its position, the value and a remedy.
 
 use scanhub_config::{Config, Link, Sources};
 use scanhub_drivers::{Settings, features};
@@ -45,7 +45,7 @@ fn family_determines_rate_beams_and_valid_settings() {
         // A model implies its family.
         (&["link.front.model=LD19"], set("ld19", None), 230_400, 450),
         (&["link.front.model=s2"], Some(("rplidar", "s2", None)), 1_000_000, 3200),
-        // There is space for every model but one. For that model, a status names the remedy.
+        // Shared memory has enough space for every model but one. For that model, a status reports the remedy.
         (&[family, "link.front.model=auto"], set("auto", None), 230_400, 720),
         // A link may set the defaults explicitly.
         (&[family, "link.front.mode=auto", "link.front.idle=run"], set("auto", None), 230_400, 720),
@@ -56,7 +56,7 @@ fn family_determines_rate_beams_and_valid_settings() {
         let link = front(setting).unwrap();
         assert_eq!(known(&link), (scanner, rate, beams), "{setting:?}");
     }
-    // A key for all links applies to those that support it.
+    // A key for all links applies to the links that support it.
     let config =
         load(&[family, "marks.level=240", "marks.min_level=2", "link.front.marks.level=250"]).unwrap();
     let marks = |link: &Link| (link.processing.marks.min_level, link.processing.marks.level);
@@ -243,7 +243,7 @@ fn a_family_may_be_searched_for() {
     assert_eq!(load(&[]).unwrap().with_remedy(short()).hint, format!("free some of it; {remedy}"));
     let named = load(&["link.front.family=ld", "link.rear.family=lms"]).unwrap();
     assert_eq!(named.with_remedy(short()), short());
-    // An LMS has its own number of beams, which is greater.
+    // An LMS has its own number of beams, which is greater than 300.
     let beams = front(&["link.front.beams=300"]).unwrap();
     assert_eq!((beams.scanner.settings.beams, beams.max_beams()), (Some(300), 401));
     for (set, family) in [

@@ -12,7 +12,8 @@ fn run_openssl(env: &TestEnv, words: &str) {
     assert!(output.status.success(), "openssl {words}: {}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// Creates an authority `ca`, and for each name a certificate of it for the loopback address.
+/// Creates an authority `ca`, and a certificate of this authority for each name. The certificates are for the loopback
+/// address.
 fn make_certificates(env: &TestEnv, ca: &str, names: &[&str]) {
     run_openssl(
         env,
@@ -86,7 +87,7 @@ fn only_certificates_of_the_authority_can_connect() {
     await_ready(&mut here);
     await_ready(&mut robot);
     assert_eq!(here.end(INT).exit_code, Some(0));
-    // The first peer does not trust the robot's authority, and the robot does not trust the second one's.
+    // The first peer does not trust the robot's authority. The robot does not trust the second peer's authority.
     for (file, ca) in [("a.json5", "stranger"), ("b.json5", "ca")] {
         let config = of(file, ca, "thief");
         let mut intruder = bridge_without_peer(&other, &["--connect", &at, "--publish", "--config", &config]);

@@ -66,7 +66,7 @@ fn invalid_datagrams_do_not_block_a_valid_sender() {
     for (topic, bytes, _) in &wrong {
         (0..50).for_each(|_| put(&session, &format!("{SENSOR_KEY}/{topic}"), bytes));
     }
-    // IDs of other hubs, an invalid ID, and a key with another sensor's name.
+    // The IDs belong to other hubs, except for an invalid ID and a key with another sensor's name.
     for key in [
         "scanhub/0000000000000001/front/zones",
         "scanhub/5f3a12bc00d1e2f3/rear/zones",
@@ -85,8 +85,8 @@ fn invalid_datagrams_do_not_block_a_valid_sender() {
     for _ in 0..20_000 {
         put(&session, &format!("{SENSOR_KEY}/zones"), &broken);
     }
-    // The honest sender continues. It announces again, because it sent for less than a second and its entry was
-    // evicted.
+    // The honest sender continues. It sends an announcement again, because it had sent for less than a second and its
+    // entry was evicted.
     wait_until("who is honest is heard", || {
         put(&session, &format!("{SENSOR_KEY}/announce"), &sender.announcement(&topics));
         put(&session, &format!("{SENSOR_KEY}/zones"), &zones(&mut sender, Verdict::Stop));

@@ -42,7 +42,7 @@ fn hub_is_published_on_another_machine_without_loss() {
     let far = far.end(INT);
     let far = far.of_class("scan");
     let both: Vec<_> = far.iter().map(|line| (number(line, "seq"), &line["ranges"])).collect();
-    // On a busy machine, a newer scan replaces one that waits.
+    // On a busy machine, a newer scan replaces a queued one.
     let pairs =
         near.iter().filter_map(|(seq, ranges)| Some((ranges, both.iter().find(|far| far.0 == *seq)?.1)));
     let pairs: Vec<_> = pairs.collect();
@@ -69,7 +69,7 @@ fn hub_is_published_on_another_machine_without_loss() {
         "{sent}{received}"
     );
     assert_eq!(assert_counters_agree(&sent, &received), 0, "{received}");
-    // The late joiner lost nothing, because samples sent before it connected do not count.
+    // The late joiner lost nothing, because samples that were sent before it connected do not count.
     let (all, of_latest) =
         (final_counters(&sent, &["sent"]), final_counters(&latest, &["received", "lost", "duplicate"]));
     assert!(of_latest["front/scan"][0] > 0, "{latest}");
@@ -130,7 +130,7 @@ fn plain_zenoh_client_gets_samples_and_query_replies() {
     assert_eq!(answers(&client, &all[1]), all[1..2]);
     assert_eq!(answers(&client, "scanhub/*/*/scan"), all[..0], "no scan is kept");
 
-    // Without a hub, the bridge still announces its sensors, but neither the hub nor they have a token.
+    // Without a hub, the bridge still announces the hub's sensors, but neither the hub nor the sensors have a token.
     assert_eq!(hub.end(INT).exit_code, Some(0));
     let tokens = || {
         let replies = client.liveliness().get("scanhub/*/*/@live").wait().expect("a query");
@@ -191,8 +191,8 @@ impl TestEnv {
     }
 }
 
-/// Runs a copy of `scanhub` as `scanhub bridge`, alone in its directory or next to a script as `scanhub-bridge`.
-/// Returns the line that it prints.
+/// Runs a copy of `scanhub` as `scanhub bridge`. The copy is alone in its directory, or next to a script with the name
+/// `scanhub-bridge`. Returns the line that it prints.
 fn error_of_lone_program(env: &TestEnv, bridge_script: Option<&str>) -> String {
     let program = env.command(&["bridge", "--connect=tcp/127.0.0.1:1"]).get_program().to_owned();
     let alone = env.path("scanhub");
@@ -231,7 +231,7 @@ fn it_is_ready_when_the_router_is_there() {
         waits.get() && why.get()
     });
     assert!(!there.prints(|line| line["class"] == "bridge_ready"));
-    // A bridge that listens reports that it is ready once others can connect.
+    // A bridge that listens reports that it is ready when other programs can connect.
     let _router = bridge(&middle, &["--listen", &at]);
     let socket = at.strip_prefix("tcp/").expect("tcp");
     std::net::TcpStream::connect(socket).expect("it listens");

@@ -22,15 +22,15 @@ use zenoh::{Config, Session, Wait};
 /// Flags of a simulator without any changes.
 const NO_FLAGS: &[&str] = &[];
 
-/// Returns an address on the loopback on which no program listens.
+/// Returns an address on the loopback at which no program listens.
 fn address(protocol: &str) -> String {
     let port =
         TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port").port();
     format!("{protocol}/127.0.0.1:{port}")
 }
 
-/// Starts a bridge with these flags, and waits until it listens or is connected. Returns it with its hub ID, which is
-/// empty if it does not send.
+/// Starts a bridge with these flags, and waits until it listens or is connected. Returns the bridge and its hub ID. The
+/// hub ID is empty if the bridge does not send.
 fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut program = bridge_without_peer(env, flags);
     let line = program.await_line("its begin", |line| line["class"] == "bridge_ready");
@@ -55,7 +55,7 @@ fn router(env: &TestEnv, listen: &str, connect: &[&str]) -> Program {
     bridge(env, &flags).0
 }
 
-/// Returns a plain Zenoh client of the router at this address.
+/// Returns a plain Zenoh client that is connected to the router at this address.
 fn open_peer(at: &str) -> Session {
     let mut config = Config::default();
     for (key, value) in [
@@ -74,8 +74,8 @@ fn open_peer(at: &str) -> Session {
     session.expect("a session")
 }
 
-/// Returns the values of `keys` in the last statistics of a bridge, by sensor and topic. Earlier statistics are not
-/// used, because a received sensor may have had no name yet.
+/// Returns the values of `keys` in the last statistics of a bridge, by sensor and topic. Earlier statistics do not
+/// count, because a received sensor may have had no name yet.
 fn final_counters(outcome: &Outcome, keys: &[&str]) -> CounterValues {
     last_counters(&outcome.lines(), keys)
 }
@@ -118,8 +118,8 @@ fn text(value: &Value) -> &str {
     value.as_str().unwrap_or_default()
 }
 
-/// Checks that both ends agree: for each topic, the sum of received and lost samples is the number of sent ones.
-/// Returns the number of lost samples.
+/// Checks that the counters of both bridges agree: for each topic, the number of received samples plus the number of
+/// lost samples is the number of sent samples. Returns the number of lost samples.
 fn assert_counters_agree(sent: &Outcome, received: &Outcome) -> u64 {
     let there = final_counters(sent, &["sent", "replaced"]);
     let here = final_counters(received, &["received", "lost", "replaced"]);

@@ -1,4 +1,5 @@
-//! Tests that the commands in docs/bridge.md run as written, except for names and ports of this machine.
+//! Tests that the commands in docs/bridge.md run as written. Only names and ports are replaced with those of this
+//! machine.
 
 use std::fs;
 use std::path::Path;

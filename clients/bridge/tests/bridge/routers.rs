@@ -58,7 +58,7 @@ fn losses_of_a_restarted_router_are_all_counted() {
     assert_counters_agree(&sent, &here.end(INT));
 }
 
-/// The link to a stopped router ends after Zenoh's lease, even while a sample waits for room on it.
+/// The link to a stopped router ends after Zenoh's lease, even while a sample waits until the link has room for it.
 #[test]
 fn stopped_router_loses_its_link_and_gets_it_back() {
     let (robot, desk) = (TestEnv::new(), TestEnv::new());

@@ -1,5 +1,5 @@
-//! Tests with a link that is slower than the samples require: arriving samples are new, counters of replaced and lost
-//! samples are exact, and nothing on the robot waits.
+//! Tests with a link that is too slow for the samples. Arriving samples are new, counters of replaced and lost samples
+//! are exact, and no program on the robot waits.
 
 use std::process::Command;
 
@@ -19,9 +19,9 @@ fn limit_rate() -> bool {
         && run("tc", "qdisc add dev lo root tbf rate 500kbit burst 5000 latency 200ms")
 }
 
-/// Waits until everything has arrived, and then ends the bridges. The hub must have exited, so that the link becomes
-/// empty; a bridge that ends drops the samples that are still on its link. Returns the sender's output, and the number
-/// of lost samples.
+/// Waits until everything has arrived, and then ends the bridges. The hub must have exited, because only then does the
+/// link become empty. A bridge that ends drops the samples that are still on its link. Returns the sender's output and
+/// the number of lost samples.
 fn end_after_delivery(mut sender: Program, mut receiver: Program) -> (Outcome, u64) {
     let mut received = || current_counters(&mut receiver, &["received", "lost"]);
     wait_until("all samples have arrived", || {
@@ -70,11 +70,12 @@ fn on_a_slow_link_the_newest_comes_first() {
     });
 }
 
-/// Number of zones that newer ones must replace before the stalled link continues. It corresponds to more than 1 s.
+/// Number of queued zones that newer zones must replace before the stalled link continues. It corresponds to more than
+/// 1 s.
 const MIN_REPLACED: u64 = 60;
 
-/// Stops the receiving program until newer samples have replaced many others. The robot's bridge or the receiving one
-/// listens.
+/// Stops the receiving program until newer samples have replaced many others. Either the robot's bridge or the
+/// receiving bridge listens.
 fn stall(robot_listens: bool) {
     let (robot, desk) = (TestEnv::new(), TestEnv::new());
     let _sensor = robot.simulator(&["front"], NO_FLAGS);
@@ -105,7 +106,7 @@ fn stall(robot_listens: bool) {
     here.signal(Signal::CONT);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
     let (sent, lost) = end_after_delivery(there, here);
-    // A receiver that is stopped for longer than 5 s loses the link, and the samples on it.
+    // If a receiver is stopped for longer than 5 s, it loses the link and the samples on the link.
     let is_broken = sent.of_class("bridge_link").iter().any(|line| line["state"] == "down");
     assert!(lost == 0 || is_broken, "{lost} samples were not sent: {sent}");
 }

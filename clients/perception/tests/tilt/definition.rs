@@ -1,5 +1,5 @@
-//! Comparison of points with their definition. The test computes each point again from all scans and the complete list
-//! of angles, with quaternions.
+//! Comparison of points with their definition. The test calculates each point again from all scans and the complete
+//! list of angles, with quaternions.
 
 use std::collections::BTreeMap;
 
@@ -47,7 +47,7 @@ fn each_point_is_where_all_angles_together_say() {
             yaw_rad: draw(3.0),
             is_upside_down: seed % 3 == 0,
         };
-        // Up and down at 40 degrees per second, reported every 5 to 25 ms.
+        // The mount moves up and down at 40 degrees per second, and reports its angle every 5 to 25 ms.
         let swing = |ms: f64| (20.0 - ((ms / 1000.0) % 2.0 - 1.0).abs() * 40.0).to_radians();
         let mut angles: Vec<(u64, f64)> = vec![(0, swing(0.0))];
         while angles[angles.len() - 1].0 < 6000 * MS {

@@ -1,5 +1,5 @@
 //! Tests with a scanner on a mount in a simulated hall. They compare points, background and obstacles with the
-//! simulated truth, also for angles that stop, jump, are wrong or arrive late.
+//! simulated truth. They also cover angles that stop, jump, are wrong or arrive late.
 
 mod definition;
 #[expect(dead_code, reason = "figures needs more of it")]
@@ -43,9 +43,9 @@ fn obstacles_are_found_and_become_background() {
     assert!(score.recall() > 0.95 && score.precision() > 0.97, "{score:?}");
 }
 
-/// Runs a fault from 7 to 10 s in a room in which nothing is new. Returns the dropped beams by reason, and the number
-/// of unreliable sweeps. Asserts that there are no false obstacles, that no returned point is wrong, and that the run
-/// recovers.
+/// Runs a fault from 7 to 10 s in a room without new objects. Returns the number of dropped beams for each reason, and
+/// the number of unreliable sweeps. Asserts that there are no false obstacles, that no returned point is wrong, and
+/// that the run recovers.
 fn run_with_fault(kind: FaultKind) -> ([u64; DropReason::COUNT], u64) {
     let room = "[[thing]]\nline = [[-2500, -1000], [2500, -1000], [2500, 4000], [-2500, 4000], [-2500, -1000]]\n\
                 [[thing]]\nbox = [600, 400]\nheight_mm = 350\npose = [-900, 2200, 35]\n";
@@ -73,7 +73,7 @@ fn run_with_fault(kind: FaultKind) -> ([u64; DropReason::COUNT], u64) {
 fn points_of_a_halted_mount_are_dropped_as_standing() {
     let ([silent, jumped, inconsistent, standing], unreliable) = run_with_fault(FaultKind::Halt);
     assert_eq!([silent, jumped, inconsistent, unreliable], [0; 4]);
-    // Points are dropped only while the mount stands.
+    // Points are dropped only while the mount does not move.
     assert!((35_000..42_000).contains(&standing), "{standing}");
 }
 
@@ -110,7 +110,7 @@ fn an_encoder_that_lies_is_unreliable() {
 #[test]
 fn late_angles_are_awaited_for_a_limited_time() {
     let ([silent, others @ ..], unreliable) = run_with_fault(FaultKind::Delay(0.2));
-    // When angles arrive in time again, the last late ones arrive after them.
+    // When the delay ends, the last late angles arrive after angles that are in time.
     assert!(silent < 4_000 && others == [0; 3] && unreliable == 0, "{silent} {others:?} {unreliable}");
     let ([silent, ..], _) = run_with_fault(FaultKind::Delay(1.0));
     assert!(silent > 20_000, "{silent}");

@@ -1,11 +1,11 @@
-//! Tests of doors with moving leaves. No person is counted if only the leaves move. Each person is counted once,
+//! Tests of doors with moving leaves. If only the leaves move, no person is counted. Each person is counted once,
 //! whether they walk through the door or stand in the opening.
 
 use crate::hall::{DOOR_KINDS, DoorKind, HALL_SITE, SCANNERS, Scene, Walker, events};
 use scanhub_perception::track::geometry::Point;
 use scanhub_perception::track::{Event, Kind};
 
-/// Positions of the scanner: in the middle of the wall, at its side, and nearer to the door.
+/// Positions of the scanner: in the middle of the wall, at the side of the wall, and nearer to the door.
 const DOOR_POSITIONS: [Point; 3] = [[0.0, 0.0], [0.0, -2.5], [2.5, -2.5]];
 
 fn describe(events: &[(f64, Event)]) -> String {
@@ -21,9 +21,9 @@ fn reported_passages(events: &[(f64, Event)]) -> Vec<(f64, bool)> {
     events.iter().filter_map(door).collect()
 }
 
-/// Returns the number of passages of `walkers` without a report, and of reports without a passage. A person who stands
-/// in the opening is counted when they leave it, so the report may be earlier or later than the passage by the time
-/// that they stand.
+/// Returns the number of passages of `walkers` without a report, plus the number of reports without a passage. A person
+/// who stands in the opening is counted when they leave it. The report may therefore be earlier or later than the
+/// passage, by at most `stand_s`.
 fn count_errors(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (usize, usize) {
     let mut reports = reported_passages(events);
     let mut missed = 0;
@@ -40,7 +40,7 @@ fn count_errors(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (u
     (missed, reports.len())
 }
 
-/// Simulated time of each scanner in each position, in minutes. Together, it is an hour.
+/// Simulated time of each scanner in each position, in minutes. The sum over all scanners and positions is an hour.
 const EMPTY_MINUTES: u64 = 5;
 
 fn check_no_events(leaves: DoorKind) {
@@ -93,12 +93,13 @@ fn leaves_swinging_into_the_lobby_cause_no_events() {
 
 /// Number of seeds for each scanner.
 const SEED_COUNT: u64 = 20;
-/// Maximum share of wrong passages with one degree and ten scans per second, where a leg at the door is a single beam.
+/// Maximum share of wrongly counted passages at one degree and ten scans per second. With these settings, a leg at the
+/// door is a single beam.
 const MAX_ERROR_SHARE: f64 = 0.05;
 
-/// Runs the walkers of each seed with all leaves and scanners. The door opens for people within the first value of
-/// `opens`, in meters, and stays open for the second one, in seconds. People stand in the opening for up to `stand_s`
-/// seconds.
+/// Runs the walkers of each seed with all leaves and scanners. The first value of `opens` is the distance at which the
+/// door opens for people, in meters. The second value is the time for which the door stays open, in seconds. People
+/// stand in the opening for up to `stand_s` seconds.
 fn check_counts(
     of_seed: impl Fn(&mut fastrand::Rng) -> Vec<Walker>,
     seconds: u64,

@@ -36,14 +36,14 @@ const HALL_WALLS: [[Point; 2]; 7] = [
     [[6.0, 4.0], [10.0, 4.0]],
     [[10.0, -4.0], [10.0, 4.0]],
 ];
-/// Width of a leaf, which is half of the opening, and distance by which a sliding leaf moves.
+/// Width of a leaf, which is half of the opening. A sliding leaf moves by the same distance.
 const LEAF_WIDTH_M: f64 = 0.9;
 const SLIDE_DISTANCE_M: f64 = 0.85;
 /// Time in which a leaf opens or closes.
 const MOVE_TIME_S: f64 = 1.5;
-/// Interval at which a door that moves by itself opens.
+/// Interval at which a door opens that moves by itself.
 const MOVE_INTERVAL_S: f64 = 20.0;
-/// Angle that a beam covers, standard deviation of a range, and share of beams on an edge with a mixed range.
+/// Angle that a beam covers; standard deviation of a range; and share of beams on an edge that have a mixed range.
 const BEAM_RAD: f64 = 0.5 * PI / 180.0;
 const NOISE_M: f64 = 0.01;
 const MIXED_SHARE: f64 = 0.2;
@@ -53,9 +53,9 @@ const START_NS: u64 = 1_800_000_000_000_000_000;
 /// Movement of the two leaves.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum DoorKind {
-    /// Along the wall, in a plane at this distance behind it, in meters.
+    /// The leaves slide along the wall, in a plane at this distance behind the wall, in meters.
     Slide(f64),
-    /// About the two jambs by a right angle, into the hall or into the lobby.
+    /// The leaves swing about the two jambs by a right angle, into the hall or into the lobby.
     SwingIn,
     SwingOut,
 }
@@ -92,19 +92,19 @@ impl DoorKind {
     }
 }
 
-/// A person who appears at `from_s` and walks from point to point. Each point has the time for which they stand there,
-/// in seconds.
+/// A person who appears at `from_s` and walks from point to point. Each point has the time for which the person stands
+/// there, in seconds.
 pub(crate) struct Walker {
     pub(crate) from_s: f64,
     pub(crate) path: Vec<(Point, f64)>,
     pub(crate) speed: f64,
-    /// Share of a double step by which they are ahead at the start.
+    /// Share of a double step that the person has already walked at the start.
     pub(crate) phase: f64,
 }
 
 impl Walker {
-    /// Returns position, heading, walked distance, and whether the person stands. Returns `None` before they appear and
-    /// after they have left.
+    /// Returns the person's position, heading and walked distance, and whether the person stands. Returns `None` before
+    /// the person appears and after they have left.
     pub(crate) fn at(&self, now_s: f64) -> Option<(Point, Point, f64, bool)> {
         let mut left_s = now_s - self.from_s;
         let mut walked_m = 0.0;
@@ -130,7 +130,7 @@ impl Walker {
         None
     }
 
-    /// Returns the centers of both legs.
+    /// Returns the centers of the person's two legs.
     fn legs(&self, now_s: f64) -> Option<[Point; 2]> {
         let (place, [hx, hy], walked_m, stands) = self.at(now_s)?;
         let stride = if stands { 0.0 } else { 0.25 * (TAU * (self.phase + walked_m / 1.4)).sin() };
@@ -142,7 +142,8 @@ impl Walker {
         }))
     }
 
-    /// Returns the times at which this person goes through the door, and whether into the hall.
+    /// Returns the times at which the person goes through the door. The flag of each is true if the person goes into
+    /// the hall.
     pub(crate) fn passages(&self) -> Vec<(f64, bool)> {
         let mut passages = Vec::new();
         let mut before: Option<Point> = None;
@@ -171,8 +172,8 @@ pub(crate) struct Scene<'a> {
     pub(crate) seconds: u64,
     /// Whether the door opens every 20 s even without a person near it.
     pub(crate) is_door_moving: bool,
-    /// Distance in meters from the middle of the door at which a person opens it, and the time for which it then stays
-    /// open.
+    /// Distance from the middle of the door at which a person opens the door, in meters; and time for which the door
+    /// then stays open.
     pub(crate) opens_m: f64,
     pub(crate) open_time_s: f64,
     pub(crate) walkers: &'a [Walker],
@@ -268,7 +269,7 @@ pub(crate) fn run(scene: &Scene<'_>, mut on_sample: impl FnMut(&Snapshot)) {
     }
 }
 
-/// Returns the range of the nearest wall in a direction from the scanner, and the index of this wall.
+/// Returns the range of the nearest wall in the direction `ray` from the scanner, and the index of this wall.
 fn nearest<'a>(ray: Point, walls: impl Iterator<Item = (usize, &'a [Point; 2])>) -> (f64, usize) {
     let meets = |(number, &[a, b]): (usize, &[Point; 2])| {
         let along = [b[0] - a[0], b[1] - a[1]];

@@ -1,6 +1,6 @@
 //! Test with recordings of real people, whose legs were labeled by hand: tracks must cover the labels. The recordings
-//! are not a part of the project. Without them, the test is skipped with a message. All are from one scanner in one
-//! place, so the background is learned from the recordings that are not scored, like that of a hub that ran before.
+//! are not a part of the project. Without them, the test is skipped with a message. One scanner in one place made all
+//! recordings. The background is therefore learned from the recordings that are not scored, as if a hub had run before.
 
 #[path = "../../../../tests/testkit/skip.rs"]
 mod skip;
@@ -22,8 +22,8 @@ const BEAM_COUNT: usize = 768;
 const SCANS_PER_WALK: u32 = 75;
 /// Maximum distance between a label and a track that covers it, in meters.
 const SEGMENT_MATCH_M: f64 = 0.35;
-/// Minimum shares of the labels that are covered, with a background at the start and without one. They are measured
-/// values, rounded down.
+/// Minimum share of the labels that are covered: with a background at the start, and without one. The values were
+/// measured and rounded down.
 const MIN_SHARE_WITH_BACKGROUND: f64 = 0.94;
 const MIN_SHARE_WITHOUT_BACKGROUND: f64 = 0.75;
 
@@ -59,7 +59,8 @@ fn read_walks() -> Option<Vec<Vec<RecordedScan>>> {
     Some((1..=3).map(read).collect())
 }
 
-/// Parses a scan. Ranges are in meters; null is a beam without a return, mostly in the open direction ahead.
+/// Parses a scan. Ranges are in meters. Null is a beam without a return; most of these beams look ahead, where the room
+/// is open.
 fn read_scan(text: &str) -> Option<RecordedScan> {
     let line: Value = serde_json::from_str(text).ok()?;
     let step = line["step"].as_f64()?;
@@ -84,7 +85,7 @@ fn read_scan(text: &str) -> Option<RecordedScan> {
     })
 }
 
-/// Returns the background that a hub has saved after these walks.
+/// Returns the background that a hub saves after it has processed these walks.
 fn background<'a>(walks: impl Iterator<Item = &'a Vec<RecordedScan>>) -> Box<Background> {
     let (mut model, mut foreground) = (
         BackgroundModel::new(Settings { scans: Some(SCANS_PER_WALK), ..Settings::default() }, BEAM_COUNT),
@@ -96,7 +97,7 @@ fn background<'a>(walks: impl Iterator<Item = &'a Vec<RecordedScan>>) -> Box<Bac
     background
 }
 
-/// Returns the number of labels of a walk that a track covers, for a hub that starts with `background`.
+/// Returns the number of labels in a walk that a track covers. The hub starts with `background`.
 fn covered_legs(walk: &[RecordedScan], background: Option<&Background>) -> usize {
     let mut people = PeopleTracker::new(Site::parse("room.toml", ROOM_SITE).expect("a room"), 0);
     let (mut model, mut segmenter) = (

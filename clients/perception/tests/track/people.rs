@@ -1,5 +1,6 @@
-//! Tests of the tracker in the house of the proof. The tracks must not depend on the order of arrival. The tests also
-//! cover late scans, clock jumps, IDs that are never reused, a sensor that is interrupted, and a person who sits down.
+//! Tests of the tracker in the simulated house. The tracks must not depend on the order in which scans arrive. The
+//! tests also cover late scans, clock jumps, IDs that are never reused, a sensor that is interrupted, and a person who
+//! sits down.
 
 use std::collections::BTreeSet;
 
@@ -36,8 +37,8 @@ fn simulate(count: usize, seconds: u64) -> Vec<SentScan> {
     simulate_house(IDEAL, (count, 0.0), 3, seconds, |_| {})
 }
 
-/// Returns the scans of a `house`. People spend the second value of the pair as the share of their rests on a chair.
-/// `each` receives the crowd every 10 ms.
+/// Returns the scans of a `house`. `sits` is the share of their rests that people spend on a chair. `each` receives the
+/// crowd every 10 ms.
 fn simulate_house(
     house: House,
     (count, sits): (usize, f64),
@@ -118,7 +119,7 @@ fn late_scans_and_clock_jumps_are_counted_and_dropped() {
     people.finish(|sample| shown.push(sample.clone()));
     let counts = people.counts();
     assert_eq!((counts.late, counts.jumped, counts.invalid), (9, 9, 0));
-    // Sensors send in turn, so every 200th scan comes from the first one.
+    // Sensors send one after another, so every 200th scan comes from the first sensor.
     assert_eq!(people.late(), [9, 0, 0, 0]);
     assert!(in_order == shown);
     let other = Foreground::of(181);
@@ -177,7 +178,7 @@ fn misplaced_sensor_is_reported_once_and_corrected() {
         (misplaced[0].offset[0] + 0.4).abs() < 0.1 && (misplaced[0].offset[1] - 0.3).abs() < 0.1,
         "{misplaced:?}"
     );
-    // After the correction, no person is seen twice.
+    // After the correction, the tracker sees no person twice.
     let since = shown.iter().position(|sample| !sample.misplaced.is_empty()).expect("it is told");
     let is_known = |track: &&scanhub_perception::track::Track| {
         matches!(track.state, TrackState::Confirmed | TrackState::Hidden)
@@ -198,7 +199,7 @@ fn returning_sensor_adds_no_person() {
     };
     let max_people = samples.iter().map(|sample| sample.tracks.iter().filter(is_known).count()).max();
     assert!(max_people <= Some(4), "three people, and one who is not yet joined: {max_people:?}");
-    // While no sensor sees them, the positions of people become uncertain.
+    // While no sensor sees a person, the person's position becomes uncertain.
     let at = |second: u64| {
         let sample = samples.iter().find(|sample| sample.wall_ns >= START_NS + 1_000 * MS * second);
         sample.expect("a picture").tracks.iter().map(|track| track.covariance[0]).fold(0.0, f64::max)

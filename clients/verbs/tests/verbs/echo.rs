@@ -49,7 +49,7 @@ fn count(count: u64) -> RunLimits {
     RunLimits { count: Some(count), ..RunLimits::default() }
 }
 
-/// Returns all lines but the last, which has times.
+/// Returns all lines except the last one, which contains times.
 fn all_but_last_line(text: &str) -> Vec<&str> {
     let mut lines: Vec<_> = text.lines().collect();
     lines.pop();
@@ -247,7 +247,7 @@ fn all_sensors_and_all_topics() {
     ] {
         assert_eq!(out.matches(begin).count(), 1, "{out}");
     }
-    // One topic of the front sensor and all of the rear sensor, each once.
+    // The output has one topic of the front sensor and all topics of the rear sensor, each once.
     assert_eq!(out.matches(r#"{"class":"summary""#).count(), 1 + 10, "{out}");
 }
 
@@ -335,7 +335,7 @@ fn summary_reports_line_loss_during_the_run() {
     assert!(!out.contains(r#""class":"status""#), "{out}");
 }
 
-/// A subscriber can borrow at most four statuses, and that number may be waiting.
+/// A subscriber can borrow at most four statuses. The same number of statuses may be queued.
 #[test]
 fn statuses_that_waited_do_not_hide_later_ones() {
     let test_domain = TestDomain::new();
@@ -343,7 +343,8 @@ fn statuses_that_waited_do_not_hide_later_ones() {
     let names = [TopicName { sensor: "front".to_owned(), topic: Topic::Scan }];
     let (places, bounds, stop) = (test_domain.locations(), RunLimits::default(), AtomicBool::new(false));
     let mut following = TopicRun::new(&names, &[], &places, &bounds, &stop).with_lines();
-    // Handles events until the status with this count arrives, or with 0 until the topic has a subscriber.
+    // Handles events until a status has the line error count `errors`. If `errors` is 0, handles events until the topic
+    // has a subscriber.
     let mut follow = |hub: &mut FakeHub, errors: u64| loop {
         match following.next(None).unwrap().expect("the run has no end") {
             Event::Line(_, status) if status.counters[Counter::LineErrors] == errors => break,

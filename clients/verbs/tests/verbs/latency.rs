@@ -22,7 +22,8 @@ fn start(test_domain: &TestDomain, is_json: bool, arguments: &str) -> RunningVer
     })
 }
 
-/// Runs `latency` while a fake hub publishes zones, stamped when they are sent. Returns end, output and notes.
+/// Runs `latency` while a fake hub publishes zones. The hub stamps the zones when it sends them. Returns the result,
+/// the output and the notes.
 fn run_with_three_zones(
     test_domain: &TestDomain,
     is_json: bool,
@@ -31,7 +32,7 @@ fn run_with_three_zones(
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(test_domain, is_json, arguments);
     hub.front_sensor().zones.await_subscribers(1);
-    // Only the samples that it receives show that it has completed the subscription, so repeat them.
+    // The verb has completed its subscription when it receives samples. There is no other sign, so repeat the samples.
     while !verb.finished() {
         hub.front_sensor().publish_zones(Verdict::Clear, 700);
         std::thread::sleep(Duration::from_millis(5));
@@ -94,7 +95,7 @@ fn samples_from_before_the_start_have_no_age() {
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(&test_domain, true, "front/scan front/scan -n 5 --max-p99 60s");
     hub.front_sensor().scan.await_subscribers(1);
-    // The fake hub's stamps are from the first seconds after the machine's start.
+    // The fake hub's stamps lie in the first seconds after the start of the machine.
     while !verb.finished() {
         hub.front_sensor().publish_scan(&[100]);
         std::thread::sleep(Duration::from_millis(5));

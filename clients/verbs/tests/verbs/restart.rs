@@ -11,10 +11,10 @@ use scanhub_schema::Scan;
 use scanhub_shm::{Domain, hub_pid};
 use scanhub_verbs::RunLimits;
 
-/// Duration of one mirror revolution of an LMS (75 Hz). It measures the half degrees one revolution later.
+/// Duration of one mirror revolution of an LMS (75 Hz), in ns. The LMS measures the half degrees one revolution later.
 const REVOLUTION_NS: u64 = 13_320_000;
 
-/// Hub of these tests as a separate process. They start it, and it is ignored otherwise.
+/// The hub of these tests, as a separate process. The other tests start it. Otherwise, it is ignored.
 #[test]
 #[ignore = "a helper process of the tests here"]
 fn hub_process() {
@@ -134,7 +134,7 @@ fn a_client_that_comes_between_two_hubs() {
         Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).timeout(timeout).open().unwrap();
     assert!(scans.next().unwrap().is_none() && !scans.hub_is_running());
     let hub = HubProcess::start(&test_domain, 2);
-    // The subscriber polls for a hub all the time, so it may receive a scan while the hub still starts.
+    // The subscriber polls for a hub continuously, so it may receive a scan while the hub still starts.
     let mut is_heard = false;
     let mut receive = || {
         is_heard |= scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted);

@@ -130,7 +130,7 @@ fn rates_of_all_topics() {
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let args = HzArgs { topics: Vec::new(), window: Duration::from_secs(10), limits: RunLimits::default() };
     let domain = domain_options(&test_domain);
-    // A status from before any subscription waits for late joiners.
+    // A status that was published before any subscription is queued for late joiners.
     hub.front_sensor().publish_status(|_| {});
     let verb =
         RunningVerb::start(move |out, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
@@ -138,7 +138,7 @@ fn rates_of_all_topics() {
     // The verb also subscribes to the state of the line.
     hub.front_sensor().status.await_subscribers(2);
     hub.front_sensor().publish_status(|_| {});
-    // From here on, samples have stamps after all subscriptions.
+    // From this point on, the stamps of samples are later than all subscriptions.
     hub.front_sensor().start_ns = u64::MAX / 2;
     while !verb.out.text().contains(r#""topic":"scan","hz":"#) {
         hub.front_sensor().publish_scan(&[1]);
@@ -163,7 +163,7 @@ fn rates_of_all_topics() {
     assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 10);
     let statuses: Vec<_> = out.lines().filter(|line| line.contains(r#""topic":"status""#)).collect();
     let (summary, lines) = statuses.split_last().unwrap();
-    // A rate over the history would be hundreds of thousands per second.
+    // A rate that includes the history would be hundreds of thousands per second.
     assert!(lines.iter().all(|line| line.contains(r#""hz":null"#)), "{statuses:?}");
     assert!(summary.contains(r#""received":2,"#) && summary.contains(r#""hz":null"#), "{statuses:?}");
 }

@@ -10,8 +10,8 @@ use scanhub_schema::Verdict;
 use scanhub_verbs::RunLimits;
 use scanhub_verbs::hz::HzArgs;
 
-/// Period of slow scans in us, so that a delay of a busy machine does not count as a silence. Zones become stale after
-/// two periods and 40 ms.
+/// Period of slow scans in us. It is so long that a delay on a busy machine does not count as a silence. Zones become
+/// stale after two periods and 40 ms.
 const PERIOD_US: u32 = 300_000;
 
 /// Creates a hub whose sensors have slow scans.
@@ -181,7 +181,7 @@ fn echo_of_the_robot() {
     let bounds = RunLimits { count: Some(3), ..RunLimits::default() };
     let verb = start(&test_domain, &["robot/zones"], Format::Json, bounds);
     hub.sensors.iter().for_each(|sensor| sensor.zones.await_subscribers(1));
-    // There is no combined verdict until each sensor has sent one.
+    // There is no combined verdict until each sensor has sent its verdict.
     hub.sensors[1].publish_zones(Verdict::Stop, 500);
     hub.sensors[0].publish_zones(Verdict::Slow, 700);
     verb.out.await_lines(r#""verdict":"stop","nearest_mm":500,"nearest_sensor":"front""#, 1);

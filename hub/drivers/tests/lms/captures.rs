@@ -1,6 +1,6 @@
-//! Tests of the framer on recordings of real scanners. It must find every telegram at its position, bit by bit, and
-//! nothing else, and have a reason for every rejected start byte. The recordings are not part of this project. Without
-//! them, the tests pass without a check.
+//! Tests of the framer on recordings of real scanners. The framer must find every telegram at its position, bit by bit,
+//! and nothing else. It must have a reason for every rejected start byte. The recordings are not part of this project.
+//! Without them, the tests pass without a check.
 
 #[path = "../../../../tests/testkit/skip.rs"]
 mod skip;
@@ -12,7 +12,8 @@ use scanhub_drivers::lms::telegram::{ACK, STX};
 use skip::skip;
 use std::path::PathBuf;
 
-/// Returns a file of `$SCANHUB_DATA/captures` or `../shared/data/captures`, or `None` if it does not exist.
+/// Returns the content of a file in `$SCANHUB_DATA/captures` or `../shared/data/captures`, or `None` if the file does
+/// not exist.
 fn capture(name: &str) -> Option<Vec<u8>> {
     let default_directory = || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     let path = std::env::var_os("SCANHUB_DATA")
@@ -28,8 +29,8 @@ fn capture(name: &str) -> Option<Vec<u8>> {
     }
 }
 
-/// Returns offset and length of each telegram in the table of a recording. `columns` are the columns of offset and
-/// length; if there is no column for the length, it is `every_len`.
+/// Returns the offset and the length of each telegram in the table of a recording. `columns` are the columns of offset
+/// and length. If there is no column for the length, every length is `every_len`.
 fn telegram_ranges(csv: &[u8], columns: (usize, Option<usize>), every_len: usize) -> Vec<(usize, usize)> {
     let text = std::str::from_utf8(csv).expect("a table is text");
     let number = |line: &str, column: usize| line.split(',').nth(column).and_then(|n| n.parse().ok());
@@ -83,7 +84,7 @@ impl FramedCapture {
         assert_eq!(read, in_telegrams + acknowledge + discarded + self.framer.buffered() as u64);
     }
 
-    /// Handles silence, then the end of the recording: discards undecided bytes and prints a line of the table.
+    /// Handles a silence and then the end of the recording. Discards undecided bytes and prints a line of the table.
     fn end(&mut self, legend: &str) -> FramerCounters {
         self.framer.release(VETO_HOLD_TIME);
         self.drain();
@@ -102,7 +103,8 @@ impl FramedCapture {
         tally
     }
 
-    /// Checks that each start byte outside telegrams was rejected for exactly one reason, or began an aborted scan.
+    /// Checks each start byte outside of telegrams. It was rejected for exactly one reason, or it began an aborted
+    /// scan.
     fn assert_every_start_byte_has_a_reason(&self, tally: &FramerCounters) {
         let inside = |at: usize| self.found.iter().any(|&(start, len)| (start..start + len).contains(&at));
         let starts = (0..self.bytes.len()).filter(|&at| self.bytes[at] == STX && !inside(at)).count();
@@ -144,12 +146,12 @@ fn seven_sessions_as_a_session_listens_to_them() {
             stream = Some(header_of(telegram));
             line.framer.expect_acknowledge(false);
         } else {
-            // The recording lacks the ACK before each reply.
+            // The recording does not contain the ACK before each reply.
             line.framer.expect_acknowledge(true);
             line.feed(&[ACK], 1);
         }
         expected.push((line.bytes.len(), len));
-        // The acceptable headers change in the middle of a scan, during which a request is sent, or after a reply.
+        // The acceptable headers change in the middle of a scan while a request is sent, or after a reply.
         let open = places.get(i + 1).map(command).filter(|&command| command != MEASURED);
         let (before, after) = telegram.split_at(if telegram[4] == MEASURED { len / 2 } else { len });
         line.feed(before, 16);
@@ -219,7 +221,7 @@ fn a_scan_broken_off_by_a_reply() {
             line.framer.expect_acknowledge(true);
             line.feed(&bytes, piece);
             let known = if expect == ExpectedHeaders::Anything { "anything" } else { "stream" };
-            // 15 bytes of a scan, ACK, a reply of 29 bytes, and the beginning of the next scan.
+            // The bytes are 15 bytes of a scan, an ACK, a reply of 29 bytes, and the beginning of the next scan.
             assert_eq!((line.found.as_slice(), bytes[20]), (&[(16, 29)][..], 0xBA));
             assert_eq!(line.framer.buffered(), 687);
             let tally = line.end(&format!("scan_interrupted_by_reply, {known}, by {piece}"));

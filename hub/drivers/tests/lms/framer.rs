@@ -1,5 +1,5 @@
-//! Tests of the framer: first single situations, then property tests with any contents, any damage, and any division of
-//! the bytes into reads.
+//! Tests of the framer: first single situations, then property tests. The property tests use any contents, any damage,
+//! and any division of the bytes into reads.
 
 use proptest::prelude::*;
 use scanhub_drivers::line::suspect;
@@ -24,7 +24,8 @@ fn framer(expect: ExpectedHeaders) -> Framer {
     framer
 }
 
-/// Feeds `bytes` in pieces of at most `max_piece_len`, and returns the telegrams found with their suspect reasons.
+/// Passes `bytes` to the framer in pieces of at most `max_piece_len` bytes. Returns the telegrams that the framer
+/// found, with their suspect reasons.
 fn feed(framer: &mut Framer, mut bytes: &[u8], max_piece_len: usize) -> Vec<(Vec<u8>, u8)> {
     let mut telegrams = Vec::new();
     while !bytes.is_empty() {
@@ -80,10 +81,10 @@ fn a_telegram_behind_a_shortened_one_is_not_lost() {
     }
 }
 
-/// Returns a damaged telegram whose checksum is right by chance, and whose last byte is the first byte of the next
-/// telegram.
+/// Returns a damaged telegram whose checksum is valid by chance. Its last byte is the first byte of the next telegram.
 fn false_frame_that_ends_with(next: &[u8]) -> Vec<u8> {
-    // The last two bytes are the checksum. Search a scan whose checksum's high byte is the STX of the next telegram.
+    // The last two bytes are the checksum. Search for a scan in which the high byte of the checksum is the STX of the
+    // next telegram.
     (0..=u16::MAX)
         .map(|seed| scan(|i| if i == 7 { seed & 0x1FFF } else { 100 + (seed >> 13) }))
         .find(|bytes| bytes[731] == next[0])
@@ -99,7 +100,7 @@ fn frame_ending_in_stx_waits_for_the_next_byte() {
     assert_eq!(feed(&mut framer, &ends_with_stx, 16), []);
     assert_eq!(framer.hold(), Some(SUFFIX_HOLD_TIME));
     assert_eq!(feed(&mut framer, &next[..1], 1), [(ends_with_stx.clone(), 0)]);
-    // No byte follows: the frame is released after the idle time, not earlier.
+    // No byte follows, so the framer releases the frame after the idle time and not earlier.
     let mut framer = self::framer(STREAM_EXPECT);
     feed(&mut framer, &ends_with_stx, 999);
     framer.release(SUFFIX_HOLD_TIME - 1);
@@ -135,7 +136,7 @@ fn a_frame_with_a_header_inside_waits_for_it_to_fail() {
     let mut late = Vec::new();
     drain(&mut framer, &mut late);
     assert_eq!(late, [(spelled.clone(), suspect::HEADER_INSIDE)]);
-    // Or the next telegram arrives completely, and the false one would overlap it.
+    // Alternatively, the next telegram arrives completely, and the false telegram would overlap it.
     let next = scan(|_| 4000);
     let mut framer = self::framer(STREAM_EXPECT);
     let mut bytes = spelled.clone();
@@ -157,7 +158,7 @@ fn scan_interrupted_by_reply_counts_as_aborted() {
     assert_eq!(feed(&mut framer, &bytes, 16), [(reply.bytes().to_vec(), 0), (next, 0)]);
     let tally = framer.counters();
     assert_eq!((tally.aborted, tally.acknowledge, tally.discarded), (1, 1, 15));
-    // The high byte of the telegram's length is a start byte too.
+    // The high byte of the telegram's length is also a start byte.
     let mut rejected = [0; Reject::COUNT];
     rejected[Reject::Address as usize] = 1;
     assert_eq!(tally.rejected, rejected);
@@ -185,7 +186,8 @@ fn every_refusal_has_its_reason() {
     wrong[400] ^= 1;
     feed(&mut framer, &wrong, 100);
     let mut expected = [0; Reject::COUNT];
-    // 02 02, and D6 02 B0 and D6 02 B1, in which the high byte of the length is a start byte, and D7 02 02.
+    // The rejected headers are 02 02; D6 02 B0 and D6 02 B1, in which the high byte of the length is a start byte; and
+    // D7 02 02.
     expected[Reject::Length as usize] = 1;
     expected[Reject::Command as usize] = 1;
     expected[Reject::Count as usize] = 1;
@@ -203,14 +205,13 @@ fn a_flood_of_headers_is_bounded() {
         assert_eq!(feed(&mut framer, &flood, piece), []);
     }
     let good = scan(|_| 3000);
-    // Headers of the flood announce up to 814 bytes. The telegram after them is found anyway.
+    // Headers of the flood announce up to 814 bytes. The framer must still find the telegram after them.
     assert_eq!(feed(&mut framer, &good, 16).len(), 1);
 }
 
 #[test]
 fn frames_that_refute_each_other_leave_room() {
-    // The longest frames, each with a right checksum, and each beginning eight bytes before the end of the previous
-    // one.
+    // The longest frames. Each has a valid checksum, and each begins eight bytes before the end of the previous frame.
     let header = [0x02, 0x80, 0x28, 0x03, 0xB1];
     let frame = |begins_with: &[u8]| {
         let mut writer = lms::telegram::Writer::new(0x80, 0xB1).slice(begins_with);

@@ -1,6 +1,6 @@
-//! Tests of the framer on a simulated line that loses bytes, with thousands of telegrams: no intact telegram is lost,
-//! no wrong one is clean, and none is delayed by more than the hold. Two other parsers read the same line for
-//! comparison.
+//! Tests of the framer on a simulated line that loses bytes, with thousands of telegrams. No intact telegram is lost,
+//! and no wrong telegram is clean. No telegram is delayed by more than the hold. For comparison, two other parsers read
+//! the same line.
 
 use crate::line::LineContent;
 use crate::line::{DiscardingParser, RewindingParser};
@@ -15,7 +15,8 @@ fn no_intact_telegram_is_lost_and_none_is_late() {
         let (mut stats, mut framer) = (TelegramCounts::default(), framer(&line));
         stats.run_parser(&line, &mut framer);
         eprintln!("{:<14} {stats:?}", scene.name());
-        // Four in ten, as in the paper. With fewer damaged telegrams, the test would prove nothing.
+        // Four of ten telegrams are damaged, as in the paper. With fewer damaged telegrams, the test would prove
+        // nothing.
         assert!((700..=900).contains(&stats.damaged), "{} damaged", stats.damaged);
         assert_eq!((stats.intact_lost, stats.wrong_clean), (0, 0), "{}", scene.name());
         assert!(stats.extra_max_ms() <= 2.1, "{} ms late", stats.extra_max_ms());
@@ -27,8 +28,8 @@ fn no_intact_telegram_is_lost_and_none_is_late() {
     }
 }
 
-/// Shows that the line is hard: other parsers lose intact telegrams on it. A parser that discards what it has collected
-/// loses nearly one intact telegram for each damaged one.
+/// Shows that the line is difficult: other parsers lose intact telegrams on it. A parser that discards all collected
+/// bytes loses nearly one intact telegram for each damaged one.
 #[test]
 fn loses_no_intact_telegram_unlike_discarding_framer() {
     let line = SimulatedLine::new(LineContent::Furnished, 2_000, 0);
@@ -36,8 +37,8 @@ fn loses_no_intact_telegram_unlike_discarding_framer() {
     discarding.run_parser(&line, &mut DiscardingParser::new(line.header));
     rewinding.run_parser(&line, &mut RewindingParser::new(line.header));
     ours.run_parser(&line, &mut framer(&line));
-    // If a share p of the telegrams is damaged, that parser loses a share of 2p/(1+p), including the damaged ones. For
-    // the 41 % here, 17 % of all telegrams are intact but lost.
+    // If a share p of the telegrams is damaged, a parser that discards all collected bytes loses a share of 2p/(1+p),
+    // including the damaged telegrams. At 41 % here, 17 % of all telegrams are intact but lost.
     assert!((280..=400).contains(&discarding.intact_lost), "{discarding:?}");
     assert!(rewinding.intact_lost < 5, "{rewinding:?}");
     assert_eq!(ours.intact_lost, 0);

@@ -1,8 +1,9 @@
-//! Simulated line that loses bytes in bursts, in virtual time. It has the chunks that a reader receives, and the
-//! telegrams that the scanner sent. [`TelegramCounts`] runs a parser on the line and counts the fate of each telegram.
+//! Simulated line that loses bytes in bursts, in virtual time. It contains the chunks that a reader receives and the
+//! telegrams that the scanner sent. [`TelegramCounts`] runs a parser on the line and counts the result for each
+//! telegram.
 //!
-//! Two ordinary parsers serve as a comparison. Both check headers as strictly as the framer, and differ only in their
-//! treatment of bytes that are not a telegram. The test of the framer and the benches `line_loss` and `host_load` use
+//! Two ordinary parsers serve as a comparison. Both check headers as strictly as the framer. They differ only in how
+//! they treat bytes that are not a telegram. The test of the framer and the benches `line_loss` and `host_load` use
 //! this file.
 //!
 //! Losses come in bursts (paper III.B.4: 0.135 % of the bytes, 40.8 % of the telegrams). A burst begins at a byte with
@@ -22,19 +23,19 @@ use scanhub_schema::{MICROS, MILLIS, Nanos};
 pub(crate) const TELEGRAM_LEN: usize = 732;
 /// Time from the first byte of a telegram to the first byte of the next one: 361 beams take two revolutions.
 const TELEGRAM_PERIOD: Nanos = 2 * MIRROR_PERIOD;
-/// Time of a byte at 500,000 baud.
+/// Transmission time of a byte at 500,000 baud.
 const BYTE_TIME: Nanos = 20 * MICROS;
 /// Number of bytes that a UART collects before it passes them on.
 const UART_PIECE_LEN: usize = 16;
-/// Time without a byte after which a UART passes on fewer bytes.
+/// Time without a byte after which a UART passes on fewer bytes than [`UART_PIECE_LEN`].
 const UART_FLUSH_TIME: Nanos = 4 * BYTE_TIME;
 
-/// Chunk of bytes that become readable at the same time.
+/// A chunk of bytes that become readable at the same time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ReadablePiece {
-    /// Time at which they become readable.
+    /// Time at which the bytes become readable.
     pub(crate) at: Nanos,
-    /// End of the chunk in [`SimulatedLine::received`]. It begins at the end of the previous chunk.
+    /// End of the chunk in [`SimulatedLine::received`]. The chunk begins at the end of the previous chunk.
     pub(crate) end: usize,
 }
 
@@ -44,7 +45,7 @@ pub(crate) struct SimulatedLine {
     pub(crate) sent: Vec<u8>,
     /// Bytes that arrived.
     pub(crate) received: Vec<u8>,
-    /// Chunks of these bytes in their order.
+    /// Chunks of the received bytes in their order.
     pub(crate) pieces: Vec<ReadablePiece>,
     /// Header of every telegram.
     pub(crate) header: StreamHeader,
@@ -76,13 +77,13 @@ impl SimulatedLine {
         line
     }
 
-    /// Returns the index in `sent` of the byte at index `received` of the received bytes.
+    /// Returns the index in `sent` of the received byte with the index `received`.
     pub(crate) fn origin(&self, received: usize) -> usize {
         let holes = self.cuts.partition_point(|&cut| cut <= received);
         received + holes.checked_sub(1).map_or(0, |last| self.lost[last])
     }
 
-    /// Returns the time at which the byte at index `received` of the received bytes became readable.
+    /// Returns the time at which the received byte with the index `received` became readable.
     pub(crate) fn readable_at(&self, received: usize) -> Nanos {
         self.pieces[self.pieces.partition_point(|piece| piece.end <= received)].at
     }
@@ -158,10 +159,10 @@ fn bursts(len: usize, rng: &mut Rng) -> Vec<(usize, usize)> {
     holes
 }
 
-/// Moves each run of lost bytes to the left as far as the bytes there are equal, and merges it with a run that it
-/// reaches. A lost byte next to an equal byte that arrived could as well be that byte, because the reader sees the same
-/// bytes. At the border of a telegram, the two cases would blame different telegrams, so all equivalent cases get the
-/// same form.
+/// Gives equivalent losses the same form. If a byte is lost next to an equal byte that arrived, the reader sees the
+/// same bytes as if the other byte was lost. At the border of two telegrams, the two cases would count different
+/// telegrams as damaged. Each run of lost bytes is therefore moved to the left as long as the bytes are equal. A run
+/// that reaches another run is merged with it.
 fn normalize_runs(sent: &[u8], runs: Vec<(usize, usize)>) -> Vec<(usize, usize)> {
     let mut slid: Vec<(usize, usize)> = Vec::with_capacity(runs.len());
     for (mut start, mut end) in runs {
@@ -186,7 +187,7 @@ fn normalize_runs(sent: &[u8], runs: Vec<(usize, usize)>) -> Vec<(usize, usize)>
 /// A frame that a parser has accepted.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct AcceptedFrame<'a> {
-    /// Offset of its first byte among all bytes read.
+    /// Offset of the frame's first byte among all bytes read.
     pub(crate) offset: usize,
     /// Bytes of the frame.
     pub(crate) bytes: &'a [u8],
@@ -259,18 +260,18 @@ pub(crate) struct TelegramCounts {
     pub(crate) intact_lost: u64,
     /// Number of delivered frames that are not a sent telegram.
     pub(crate) wrong: u64,
-    /// Number of these without a suspect mark.
+    /// Number of wrong frames without a suspect mark.
     pub(crate) wrong_clean: u64,
     /// Number of delivered frames that were held because of a header inside them.
     pub(crate) held: u64,
     /// Sum of the times from the arrival of the last byte to the delivery, for telegrams that were not held.
     pub(crate) extra_time: Nanos,
-    /// Maximum of these times.
+    /// Maximum time from the arrival of the last byte to the delivery, for telegrams that were not held.
     pub(crate) extra_time_max: Nanos,
 }
 
 impl TelegramCounts {
-    /// Runs `parser` on the whole `line` like a session: it reads every chunk on its arrival, and calls `release` when
+    /// Runs `parser` on the whole `line` like a session. It reads every chunk on its arrival. It calls `release` when
     /// no byte has arrived for the hold.
     pub(crate) fn run_parser(&mut self, line: &SimulatedLine, parser: &mut impl Parser) {
         let mut delivered = vec![false; line.telegrams()];
@@ -319,8 +320,8 @@ impl TelegramCounts {
         let number = line.origin(offset) / TELEGRAM_LEN;
         let held = reasons & suspect::HEADER_INSIDE != 0;
         self.held += u64::from(held);
-        // Only the bytes count. If equal bytes of the next telegram completed a damaged one, it is what the scanner
-        // sent.
+        // Only the bytes count. If equal bytes of the next telegram complete a damaged telegram, the result equals the
+        // telegram that the scanner sent.
         if bytes == line.telegram(number) && !delivered[number] {
             delivered[number] = true;
             let extra = now - line.readable_at(last);
@@ -331,7 +332,7 @@ impl TelegramCounts {
             return;
         }
         self.wrong += 1;
-        // The session adds this reason to those of the framer.
+        // The session adds this reason to the framer's reasons.
         let transmit_time = sent_at(line.origin(last)) - sent_at(line.origin(offset));
         let slow = transmit_time > sent_at(TELEGRAM_LEN - 1) - sent_at(0) + SUSPECT_DELAY;
         self.wrong_clean += u64::from(reasons == 0 && !slow);
@@ -352,10 +353,11 @@ impl core::ops::AddAssign for TelegramCounts {
     }
 }
 
-/// A telegram that takes longer than usual by more than this time is suspect.
+/// Maximum additional transmission time of a telegram that is not suspect.
 const SUSPECT_DELAY: Nanos = 8 * MILLIS;
 
-/// A parser with six states that collects a telegram, and discards all collected bytes if they are not a telegram.
+/// A parser with six states that collects a telegram. If the collected bytes are not a telegram, it discards all of
+/// them.
 pub(crate) struct DiscardingParser {
     header: StreamHeader,
     collected: Vec<u8>,
@@ -398,8 +400,8 @@ impl Parser for DiscardingParser {
     }
 }
 
-/// A parser that collects a telegram after a strict header. If the bytes are not a telegram, it continues with the byte
-/// after the start byte.
+/// A parser that collects a telegram after a strict header. If the collected bytes are not a telegram, it continues
+/// with the byte after the start byte.
 pub(crate) struct RewindingParser {
     header: StreamHeader,
     open: Vec<u8>,
@@ -446,9 +448,10 @@ const BEAM_COUNT: usize = 361;
 pub(crate) enum LineContent {
     /// Walls and furniture with noise, in mm, as in an ordinary room.
     Furnished,
-    /// Only a few grains of dust in range. There are long runs of equal bytes, in which different losses look the same.
+    /// Only a few grains of dust are in range. There are long runs of equal bytes. In such a run, different losses look
+    /// the same.
     Empty,
-    /// A wall at 640 cm in all directions. Its words are the first two bytes of a header.
+    /// A wall at 640 cm in all directions. The value of each beam equals the first two bytes of a header.
     Wall,
     /// Random words, with every byte value at every position.
     Random,
@@ -493,7 +496,7 @@ impl LineContent {
     }
 }
 
-/// Draws flat surfaces. Each is a run of beams whose ranges rise or fall evenly.
+/// Draws flat surfaces. Each surface is a run of beams whose ranges rise or fall evenly.
 fn furniture(rng: &mut Rng) -> [u16; BEAM_COUNT] {
     let mut ranges = [0; BEAM_COUNT];
     let mut at = 0;

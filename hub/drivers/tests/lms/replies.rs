@@ -1,6 +1,6 @@
-//! Tests of the codec of replies, in both directions: printed and captured replies, and those that follow from the
-//! layout. The checksum rejects the misprints of the documents. Telegrams with any bytes and a right checksum cause no
-//! panic, and are encoded as they were decoded.
+//! Tests of the codec of replies, in both directions. They use printed replies, recorded replies, and replies that
+//! follow from the layout. The checksum reveals the misprints of the documents. Telegrams with any bytes and a valid
+//! checksum cause no panic, and are encoded as they were decoded.
 
 use proptest::prelude::*;
 use scanhub_drivers::lms::command::{Request, SubRange};
@@ -78,19 +78,19 @@ fn printed_and_captured_replies_both_ways() {
     assert_eq!(reply::variant_reply(0, true, Variant::HALF, 0x10).bytes()[11..], [0x03, 0x9D]);
 }
 
-/// Misprints of the documents. The right bytes were found by computing the checksums.
+/// Misprints in the documents. The right bytes were found by calculating the checksums.
 #[test]
 fn misprints_are_refused() {
     let a_zero_lost =
         format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {} 02 00 10 C5 7A", &ZERO_BYTES[3..]);
     for text in [
-        // Installation mode with the checksum of table 6-4, which programs have copied.
+        // Installation mode with the checksum of table 6-4. Programs have copied this checksum.
         "02 00 0A 00 20 00 \"SICK_LMS\" 5F B2",
         // The boot message of tables 6-2 and 7-5.
         "02 80 17 00 90 \"LMS200;301063;V02.10 \" 10 63 56",
         // STX and address are swapped, with a matching checksum (7-105).
         "00 02 01 00 69 7D 0A",
-        // A byte is missing in print, as in 6-8.
+        // A byte is missing in the document, as in 6-8.
         &a_zero_lost,
         // LENGTH 0, as in C1h, C2h and E6h.
         "02 80 00 00 C1 10 00 00",
@@ -191,7 +191,7 @@ fn data() -> impl Strategy<Value = Vec<u8>> {
     ]
 }
 
-/// Explains `telegram`, and checks that every byte is in one field, in order.
+/// Explains `telegram`. Checks that every byte belongs to exactly one field, in order.
 fn explain_all(telegram: Telegram<'_>, mode: Option<Mode>) -> String {
     let mut text = Headline(telegram).to_string();
     let mut at = 0;
@@ -247,7 +247,7 @@ proptest! {
         let telegram = encoded.telegram();
         prop_assert_eq!(Request::decode(telegram), None);
         if let Some(reply) = Reply::decode(telegram) {
-            // Some values have several encodings, such as names with trailing spaces. They are encoded in one of them.
+            // Some values have several encodings, for example names with trailing spaces. The encoder uses one of them.
             let again = reply.encode(address, status).expect("it was short enough before");
             prop_assert_eq!(again.telegram().status(), telegram.status());
             prop_assert_eq!(Reply::decode(again.telegram()), Some(reply));

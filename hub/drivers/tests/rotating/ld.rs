@@ -1,4 +1,4 @@
-//! Tests of sessions with LDROBOT scanners, on lines that damage bytes, in virtual time. Whatever arrives, the session
+//! Tests of sessions with LDROBOT scanners, on lines that damage bytes, in virtual time. For any input, the session
 //! counts every byte once and does not panic.
 
 use scanhub_drivers::Settings;
@@ -81,7 +81,7 @@ impl TestBench {
         assert_eq!(stats.read, stats.in_telegrams + stats.discarded + stats.buffered);
     }
 
-    /// Returns the end of the session's sleep, if it sleeps, and the end of its wait.
+    /// Returns two times: the end of the session's sleep, if it sleeps, and the end of its wait.
     fn drain(&mut self) -> (Option<Nanos>, Nanos) {
         loop {
             match self.session.poll_action() {
@@ -131,8 +131,8 @@ impl TestBench {
         }
     }
 
-    /// Checks that the points of every revolution are right, in order, and from one revolution of the head. An unmarked
-    /// revolution must be complete. Returns the largest error of a stamp.
+    /// Checks the points of every revolution: they are right, in order, and from one revolution of the head. An
+    /// unmarked revolution must be complete. Returns the largest error of a stamp.
     fn check_revolutions(&self) -> Nanos {
         let beams = self.session.beams().expect("known");
         let edge = 18_000.0 / beams as f64;
@@ -197,7 +197,7 @@ fn uneven_speed_does_not_change_the_models_beams() {
 #[test]
 fn receives_every_revolution_of_every_model() {
     for model in Model::ALL {
-        // At this speed, no two revolutions have their points at the same angles.
+        // At this speed, the points of any two revolutions have different angles.
         let head =
             SimulatedScanner::new(model, points_per_revolution(model) * 1.000_7, 1, DamageRates::default());
         let mut bench = TestBench::new(settings_of(model), head);
@@ -320,7 +320,7 @@ fn long_host_stall_is_not_a_scanner_restart() {
         let head = SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default());
         let mut bench = TestBench::new(settings_of(Model::Ld19), head);
         bench.run(3 * ONE_SECOND);
-        // The tty keeps the first bytes and has no room for the rest.
+        // The tty keeps the first bytes and has no room for the others.
         bench.now += stall * ONE_SECOND;
         bench.scanner.lose_until(bench.now);
         bench.read(true);
@@ -335,8 +335,8 @@ fn revolution_cut_by_a_gap_keeps_previous_period() {
         settings_of(Model::Ld19),
         SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default()),
     );
-    // In the twentieth revolution, the head slows down, and at the end of the gap it is at the same angle, one
-    // revolution later.
+    // In the twentieth revolution, the head slows down. At the end of the gap, the head has the same angle as at its
+    // start, one revolution later.
     bench.run(ONE_SECOND + 1_970 * MILLIS);
     bench.scanner.points_per_revolution = 450.0 * 19.7 / 18.7;
     bench.scanner.lose_until(bench.now + 200 * MILLIS);
@@ -448,14 +448,14 @@ struct SimulatedScanner {
     model: Model,
     /// Points per revolution.
     points_per_revolution: f64,
-    /// Fraction by which its clock is slow.
+    /// Fraction by which the scanner's clock is slow.
     drift: f64,
     /// Fraction by which the speed in every other packet differs from the true speed.
     jitter: f64,
     random: fastrand::Rng,
     line: DamagedLine,
     sent: Vec<SentPacket>,
-    /// Time of power-on, and number of packets sent since.
+    /// Time of power-on; and number of packets sent since then.
     switched_on_at: Nanos,
     packets: u64,
 }
@@ -537,7 +537,7 @@ impl SimulatedScanner {
         }
     }
 
-    /// Drops the bytes on the line and the following ones up to `until`.
+    /// Drops the bytes that are on the line, and all bytes that follow until `until`.
     fn lose_until(&mut self, until: Nanos) {
         self.send_until(until);
         self.line.bytes.retain(|(at, _)| *at > until);

@@ -1,4 +1,5 @@
-//! Tests of sessions with rotating scanners, with the simulated line from such a scanner, which damages bytes.
+//! Tests of sessions with rotating scanners. This file has the simulated line from a rotating scanner, which damages
+//! bytes.
 
 mod ld;
 mod rplidar;
@@ -30,7 +31,7 @@ pub(crate) struct DamagedLine {
 pub(crate) struct SentPacket {
     bytes: Vec<u8>,
     intact: bool,
-    /// Time at which its last byte has left the line, if that byte was not lost.
+    /// Time at which the packet's last byte has left the line, or would have left it without a loss.
     at: Nanos,
 }
 

@@ -1,6 +1,6 @@
-//! Test bench with a session, a simulated RPLIDAR and the line between them, in virtual time, and the invariants of all
-//! tests. The scanner replies to requests and measures without a room: the range of each point identifies it. Its
-//! packets are encoded according to the description of the formats and independently of the decoder.
+//! Test bench with a session, a simulated RPLIDAR and the line between them, in virtual time; and the invariants of all
+//! tests. The scanner replies to requests and measures without a room: the range of each point identifies the point.
+//! The packets are encoded according to the description of the formats, independently of the decoder.
 
 mod start;
 mod stream;
@@ -71,7 +71,7 @@ impl TestBench {
         }
     }
 
-    /// Runs the session until `is_done`, for at most `max_time`. Returns how long it took.
+    /// Runs the session until `is_done` returns true, for at most `max_time`. Returns the elapsed time.
     pub(crate) fn run_until(&mut self, max_time: Nanos, is_done: impl Fn(&TestBench) -> bool) -> Nanos {
         let started = self.now;
         while !is_done(self) {
@@ -99,7 +99,7 @@ impl TestBench {
         assert_eq!(stats.read, stats.in_telegrams + stats.discarded + stats.buffered);
     }
 
-    /// Returns the end of the session's sleep or wait, and whether it is a wait.
+    /// Returns the end of the session's sleep or wait. The flag is true for a wait.
     fn drain(&mut self) -> (Nanos, bool) {
         loop {
             match self.session.poll_action() {
@@ -157,7 +157,7 @@ impl TestBench {
         }
     }
 
-    /// Checks the revolutions of the current stream: each has points of one revolution of the head, at the right
+    /// Checks the revolutions of the current stream. Each contains points of one revolution of the head, at the right
     /// angles. An unmarked revolution must be complete. Returns the largest error of a stamp, and the number of wrong
     /// points in unmarked revolutions.
     pub(crate) fn check_revolutions(&self, revolutions: &[DeliveredRevolution]) -> (Nanos, usize) {
@@ -201,7 +201,7 @@ impl TestBench {
         (from.max(0.0) as u64..to.max(0.0) as u64).any(|point| {
             let sample = SimulatedScanner::sample(point);
             let range = if range == line::NO_RETURN { 0 } else { u32::from(range) };
-            // The difference to a missing return cannot be encoded.
+            // The packet format encodes differences, and cannot encode the difference to a point without a return.
             let is_untold = kind == PacketFormat::Ultra
                 && point % 3 == 2
                 && SimulatedScanner::sample(point + 1).range == 0;
@@ -219,7 +219,7 @@ impl TestBench {
     }
 }
 
-/// Mean angle in degrees by which points lie before their nominal angles.
+/// Mean angle by which points lie before their nominal angles, in degrees.
 fn mean_shift(kind: PacketFormat) -> f64 {
     match kind {
         PacketFormat::Express => 4.0,
@@ -257,20 +257,20 @@ pub(crate) struct SimulatedScanner {
     pub(crate) hz: f64,
     /// Additional time from a request to its first point.
     pub(crate) spin_up: Nanos,
-    /// Fraction by which its points take longer than it reports.
+    /// Fraction by which the scanner's points take longer than the scanner reports.
     pub(crate) drift: f64,
     /// Health status and error code.
     pub(crate) health: (u8, u16),
     /// Whether a reboot clears the error.
     pub(crate) clears_on_reboot: bool,
-    /// Requests that the scanner ignores, one entry for each time.
+    /// Requests that the scanner ignores. Each entry applies to one request.
     pub(crate) ignored_requests: Vec<u8>,
     /// Whether the scanner has power.
     pub(crate) is_on: bool,
-    /// Bytes that it sends before its boot message.
+    /// Bytes that the scanner sends before its boot message.
     pub(crate) junk: Vec<u8>,
     pub(crate) dtr: bool,
-    /// Whether its bytes look like text at another rate.
+    /// Whether the scanner's bytes look like text at another rate.
     pub(crate) is_text: bool,
     /// The last value for the motor: duty cycle or speed.
     pub(crate) motor: Option<u16>,
@@ -599,7 +599,7 @@ impl SimulatedScanner {
         }
     }
 
-    /// Drops the bytes on the line and the following ones up to `until`.
+    /// Drops the bytes that are on the line, and all bytes that follow until `until`.
     pub(crate) fn lose_until(&mut self, until: Nanos) {
         self.send_until(until);
         let oldest = self.line.bytes.front().map_or(until, |(at, _)| *at);
@@ -608,7 +608,8 @@ impl SimulatedScanner {
         self.sent.iter_mut().filter(is_hit).for_each(|sent| sent.intact = false);
     }
 
-    /// Drops complete packets, as when the host does not read until `until` and the buffer has only about `room` bytes.
+    /// Drops complete packets. This happens if the host does not read until `until` and the buffer has room for only
+    /// about `room` bytes.
     pub(crate) fn overflow(&mut self, until: Nanos, room: usize) {
         self.send_until(until);
         let Some(kind) = self.kind() else { return };
@@ -617,7 +618,7 @@ impl SimulatedScanner {
         self.sent.iter_mut().rev().take(dropped).for_each(|sent| sent.intact = false);
     }
 
-    /// Returns the format of the packets that it sends.
+    /// Returns the format of the packets that the scanner sends.
     pub(crate) fn kind(&self) -> Option<PacketFormat> {
         if let ScannerState::Measuring { kind, .. } = self.state { Some(kind) } else { None }
     }
@@ -628,17 +629,17 @@ impl SimulatedScanner {
     }
 }
 
-/// A point before it is encoded. Its raw angle is that of its index.
+/// A point before it is encoded. Its raw angle follows from its index.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct TestPoint {
     /// Range in mm; 0 for no return.
     pub(crate) range: u32,
-    /// Eighths of a degree by which it lies before its nominal angle; express packets only.
+    /// Eighths of a degree by which the point lies before its nominal angle. Only express packets have this value.
     pub(crate) eighths: u32,
     pub(crate) quality: u32,
 }
 
-/// Encodes a packet that starts at `start` degrees. `next` is the first point after it.
+/// Encodes a packet that starts at `start` degrees. `next` is the first point of the next packet.
 pub(crate) fn encode(kind: PacketFormat, start: f64, samples: &[TestPoint], next: TestPoint) -> Vec<u8> {
     let word = ((start.rem_euclid(360.0) * 64.0) as u16).to_le_bytes();
     let mut bytes = match kind {
@@ -699,8 +700,8 @@ pub(crate) fn encode(kind: PacketFormat, start: f64, samples: &[TestPoint], next
     bytes
 }
 
-/// Returns the encoded value of a range, the range that the value decodes to, and the number of bits by which its
-/// quantization is coarser.
+/// Returns three values: the encoded value of a range, the range that this value decodes to, and the number of bits by
+/// which the quantization is coarser.
 fn encode_major(range: u32) -> (u32, i64, u32) {
     let (from, base, level) = match range {
         0x4000.. => (3328, 0x4000, 4),

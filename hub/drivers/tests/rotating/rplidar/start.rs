@@ -1,4 +1,4 @@
-//! Tests of the start of a session with an RPLIDAR in any previous state.
+//! Tests of the start of a session with an RPLIDAR that may be in any state.
 
 use scanhub_drivers::Settings;
 use scanhub_drivers::line::{Action, Control, Event, Protocol as _, ScannerSession as _, State};
@@ -144,7 +144,7 @@ fn reports_health_error_and_retries_until_it_clears() {
     assert!(!bench.scanner.is_measuring());
     bench.scanner.health = (1, 7);
     bench.run_until(3 * ONE_SECOND, is_streaming);
-    // The scanner measures, and warns that it may stop soon.
+    // The scanner measures, and reports a warning that it may stop soon.
     let warning = Health::Warning(7);
     assert_eq!(
         (bench.session.problem(), bench.session.health()),
@@ -337,7 +337,7 @@ fn a_second_without_data_begins_again() {
     assert_eq!(bench.session.stats().lost, 0, "silence is no loss on the line");
 }
 
-/// Returns a test bench whose scanner has announced its stream and spins up.
+/// Returns a test bench whose scanner has announced its stream. The scanner's motor is not yet at its speed.
 fn spinning_up(model: Model) -> TestBench {
     let mut bench = TestBench::new(
         Settings::default(),
@@ -351,7 +351,7 @@ fn spinning_up(model: Model) -> TestBench {
 
 #[test]
 fn identifies_a_scanner_streaming_during_spin_up() {
-    // Packets of another format, and packets of the same format with another time per point.
+    // The earlier packets have another format, or the same format with another time per point.
     for (before, model) in [(Model::S1, Model::A3), (Model::A3, Model::S1), (Model::A1, Model::A2m8)] {
         let mut bench = spinning_up(before);
         bench.run(bench.now + 500 * MILLIS);
@@ -424,7 +424,7 @@ fn boot_message_during_a_stream_restarts_at_once() {
 
 #[test]
 fn a_greeting_after_other_bytes_is_a_restart() {
-    // A dip of the supply makes the scanner send other bytes first, some of which are text.
+    // A dip of the supply makes the scanner send other bytes first. Some of these bytes are text.
     let junk = [vec![0x00; 1], vec![0xFF, 0x00, 0x80], vec![0xA5; 300], vec![b'x'; 45], vec![0xF0; 2_000]];
     for (model, junk) in
         [Model::A1, Model::S2].into_iter().flat_map(|model| junk.each_ref().map(|it| (model, it)))
@@ -441,7 +441,7 @@ fn a_greeting_after_other_bytes_is_a_restart() {
 
 #[test]
 fn ranges_that_are_text_are_no_greeting() {
-    // A single point counts if another one follows it.
+    // A single point counts if another point follows it.
     for (mode, lost) in [(Mode::Standard, 65), (Mode::DenseBoost, 60)] {
         let mut bench = TestBench::new(
             Settings { mode: Some(mode.name()), ..settings_of(Model::S2) },

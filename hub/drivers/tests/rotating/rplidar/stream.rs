@@ -1,5 +1,5 @@
-//! Tests of sessions with packets of RPLIDAR scanners: revolutions, stamps, damage, and sessions on recordings, which
-//! have no scanner. Whatever arrives, the session counts every byte once and does not panic.
+//! Tests of sessions with packets of RPLIDAR scanners. They cover revolutions, stamps, damage, and sessions on
+//! recordings, which have no scanner. For any input, the session counts every byte once and does not panic.
 
 use scanhub_drivers::line::{Action, Control, Event, Protocol as _, RawScan, ScannerSession as _};
 use scanhub_drivers::rplidar::packet::PacketFormat;
@@ -139,7 +139,8 @@ fn counts_packets_lost_in_a_full_buffer() {
     }
 }
 
-/// Checks that whole dropped packets are counted. The remaining packets begin where the previous one ended, even if
+/// Checks that the session counts dropped packets. The remaining packets begin where the previous packet ended, even if
+/// whole revolutions were dropped.
 /// whole revolutions were dropped.
 #[test]
 fn counts_loss_of_whole_packets_in_a_full_buffer() {
@@ -169,7 +170,8 @@ fn counts_loss_of_whole_packets_in_a_full_buffer() {
     }
 }
 
-/// A pty and its driver buffer more bytes. The host reads them in pieces while more arrive.
+/// A pty and its driver buffer more bytes than one read returns. The host reads the bytes in pieces while more bytes
+/// arrive.
 #[test]
 fn stamps_after_pty_overflow_are_within_3_ms() {
     for kind in [(Model::A3, Mode::Sensitivity), (Model::S2, Mode::DenseBoost), (Model::S3, Mode::UltraDense)]
@@ -276,7 +278,7 @@ struct ReplayedRevolution {
     incomplete: bool,
 }
 
-/// Runs a session with these `settings` on `outputs`. Returns it with its revolutions.
+/// Runs a session with these `settings` on `outputs`. Returns the session and its revolutions.
 fn replay(settings: Settings, outputs: &[RecordedOutput]) -> (RplidarSession, Vec<ReplayedRevolution>) {
     let settings = Settings { fixed_rate: true, listen_only: true, ..settings };
     let mut session = RplidarSession::new(settings, outputs[0].first);
@@ -345,7 +347,7 @@ fn replayed_recording_yields_the_same_revolutions() {
             let behind = live.log.revolutions.len() - revolutions.len();
             for (replayed, delivered) in revolutions.iter().zip(&live.log.revolutions[behind..]) {
                 assert_eq!(replayed.incomplete, delivered.incomplete, "{model:?} {mode:?}");
-                // Without the mode, the grid of beams is different and begins at a different angle.
+                // Without the mode, the grid of beams is different and starts at a different angle.
                 let off = if settings.mode.is_some() { 0 } else { 2 };
                 assert!(replayed.points.abs_diff(delivered.points.len()) <= off, "{model:?} {mode:?}");
                 assert!(settings.mode.is_none() || replayed.beams == delivered.beams);
@@ -378,7 +380,7 @@ fn one_that_begins_in_the_midst_has_turns_soon() {
     }
 }
 
-/// For each of `revolutions`, returns the smallest difference between its stamp and the stamp of a delivered one.
+/// Returns the smallest difference between the stamp of each of `revolutions` and the stamp of a delivered revolution.
 fn stamp_errors(live: &TestBench, revolutions: &[ReplayedRevolution]) -> Vec<Nanos> {
     let off = |replayed: &ReplayedRevolution| {
         live.log.revolutions.iter().map(|delivered| delivered.first.abs_diff(replayed.first)).min()
@@ -386,7 +388,8 @@ fn stamp_errors(live: &TestBench, revolutions: &[ReplayedRevolution]) -> Vec<Nan
     revolutions.iter().map(|replayed| off(replayed).expect("some")).collect()
 }
 
-/// A recording contains no damaged packets. Only the marks of the following packets show that they are missing.
+/// A recording contains no damaged packets. Only the suspect marks of the following packets show that packets are
+/// missing.
 #[test]
 fn lossy_recording_from_mid_stream_has_right_stamps() {
     for (model, mode) in STREAM_MODES {
@@ -409,8 +412,8 @@ fn lossy_recording_from_mid_stream_has_right_stamps() {
     }
 }
 
-/// While a busy host does not run, packets wait in its driver. Their stamps are then late and close together, and do
-/// not depend on the time per point.
+/// While a busy host does not run, packets are queued in its driver. The stamps of these packets are late and close
+/// together, and do not depend on the time per point.
 #[test]
 fn backlogged_packets_do_not_change_time_per_point() {
     for (model, mode) in STREAM_MODES {
@@ -422,7 +425,7 @@ fn backlogged_packets_do_not_change_time_per_point() {
         let mut free = 0;
         for output in &mut stalled {
             let into = output.last % (300 * MILLIS);
-            // The hub needs 0.1 ms for each waiting packet.
+            // The hub needs 0.1 ms for each queued packet.
             let at = if into < 40 * MILLIS { output.last - into + 40 * MILLIS } else { output.last };
             free = at.max(free + MILLIS / 10);
             output.last = free;
@@ -435,7 +438,7 @@ fn backlogged_packets_do_not_change_time_per_point() {
     }
 }
 
-/// Ranges of one format are meaningless when they are decoded in the other one.
+/// If the ranges of one format are decoded as the other format, they are meaningless.
 #[test]
 fn refuses_packets_that_may_be_of_two_kinds() {
     let live = record(Model::S1, Mode::DenseBoost, 4);
