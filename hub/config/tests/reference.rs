@@ -50,7 +50,7 @@ fn line(setting: &str, comment: &str) -> String {
     }
 }
 
-/// Returns the line of a key with its default. If the key has no default, the line is a comment with an example.
+/// Returns the line of a key with its default. If the key has an example, the line is a comment with the example.
 fn with_default(key: &Key, default: &str) -> String {
     let setting = match key.example {
         "" => format!("{} = {default}", key.name),

@@ -1,6 +1,6 @@
 //! Tests of background models. Each method is compared with a slow, independent version in floating point, beam by
-//! beam, in many surroundings and with commands in between. Other tests cover shapes, commands, saved models, and scans
-//! that no scanner sends.
+//! beam. The comparison uses many surroundings, with commands between the scans. Other tests cover shapes, commands,
+//! saved models, and scans that no scanner sends.
 
 mod surroundings;
 
@@ -12,7 +12,7 @@ use surroundings::{
     ranges_mm, reading_mm, unit_mm,
 };
 
-/// State of one beam by the paper's method.
+/// State of one beam in the paper's method.
 #[derive(Clone, Default)]
 struct Beam {
     /// Background in mm; 0 if it is unknown.
@@ -196,22 +196,23 @@ impl SlowSurface {
     }
 }
 
-/// Range in device units that is farther than any other.
+/// Range in device units that is greater than any other range.
 const FAR_RANGE: f64 = 1e9;
 const NO_SURFACE: SlowSurface = SlowSurface { range: -FAR_RANGE, weight: 0.0 };
 
 struct ReferenceMulti {
     settings: Settings,
     beams: Vec<[SlowSurface; 3]>,
-    /// For each beam, the number of consecutive readings without a return. Scans in which the beam had no reading do
-    /// not count.
+    /// Number of consecutive readings without a return, for each beam. Scans in which the beam had no reading do not
+    /// count.
     lost_scans: Vec<u32>,
-    /// Foreground beams of the last scan with their readings. `reported` has those that counted as objects.
+    /// Foreground beams of the last scan with their readings. `reported` contains the foreground beams that counted as
+    /// objects.
     foreground: Vec<(usize, f64)>,
     reported: Vec<(usize, f64)>,
     is_frozen: bool,
     is_fresh: bool,
-    /// Number of scans until a surface is background, as of the last scan.
+    /// Number of scans after which a surface is background, as of the last scan.
     scans: f64,
 }
 
@@ -322,7 +323,7 @@ impl ReferenceMulti {
             .map(|i| (i, readings[i].expect("only readings are in the foreground")))
             .collect();
         let mut reported = Vec::new();
-        // Two beams belong to one run if only codes are between them.
+        // Two beams belong to one run if all beams between them have codes.
         let codes = |from: usize, to: usize| (from + 1..to).all(|i| readings[i].is_none());
         for run in foreground.chunk_by(|a, b| codes(a.0, b.0)) {
             let (first, last) = (run[0].0, run[run.len() - 1].0);
@@ -527,13 +528,13 @@ fn a_saved_model_is_taken_if_it_fits() {
         let out = update_times(&mut early, &scan(361, 1, 1_000), 1);
         assert_eq!((out.generation, out.beams), (1, 360));
 
-        // The loaded background does not fit the first scan, so the model is reset.
+        // The loaded background does not match the first scan, so the model is reset.
         let mut wrong = model(method);
         wrong.load(&saved).unwrap();
         assert_eq!(update_times(&mut wrong, &scan(181, 1, 1_000), 1).generation, 2);
         assert_eq!((background_of(&wrong).known_beams, background_of(&wrong).count), (0, 181));
 
-        // After the first scan, a background that does not fit is refused, and the model stays as it was.
+        // After the first scan, the model refuses a background that does not match, and does not change.
         let before = background_of(&wrong);
         let refusal = wrong.load(&saved).unwrap_err();
         assert_eq!(refusal, Mismatch { model: (361, 1000), sensor: (181, 1000) });
@@ -568,8 +569,8 @@ fn the_first_scan_may_be_the_background() {
     }
 }
 
-/// A wall that returns 15 % of the beams is learned in 20 s. A person who stands there for 5 s is not, even if some
-/// beams that meet the person are lost.
+/// A wall that returns 15 % of the beams is learned in 20 s. A person who stands there for 5 s is not learned, even if
+/// some beams that meet the person have no return.
 #[test]
 fn learns_faint_wall_but_not_a_standing_person() {
     let mut random = fastrand::Rng::with_seed(3);

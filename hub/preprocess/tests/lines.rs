@@ -22,7 +22,7 @@ fn head(count: usize, first_angle: f64, step: f64) -> ScanHead {
     }
 }
 
-/// Returns a scan whose ranges `range` returns in meters for each angle. `None` becomes the code of no return.
+/// Returns a scan. `range` returns the range in meters for each angle. `None` becomes the code of no return.
 fn scan(head: ScanHead, range: impl Fn(f64) -> Option<f64>) -> Box<Scan> {
     let angle = |i: usize| head.first_angle + i as f64 * head.step;
     let unit = |i| range(angle(i)).map_or(head.no_return, |range: f64| (1000.0 * range).round() as u16);
@@ -50,7 +50,7 @@ fn room(angle: f64) -> f64 {
     x.min(y)
 }
 
-/// Returns a scan of a room of `seed`, a star of 6 to 20 corners, with 20 mm of noise.
+/// Returns a scan of a room that is drawn from `seed`. The room is a star of 6 to 20 corners, and the noise is 20 mm.
 fn star(seed: u64, beams: usize) -> Box<Scan> {
     let mut random = Rng::with_seed(seed);
     let corners = random.usize(6..=20);
@@ -70,8 +70,8 @@ fn star(seed: u64, beams: usize) -> Box<Scan> {
     scan(head, |angle| ranges.get(((angle + PI) / head.step).round() as usize).copied())
 }
 
-/// Returns the minimum sum of squares along the beams for one line. Searches distance and direction of the line step by
-/// step, which is slow.
+/// Returns the minimum sum of squares along the beams for one line. The slow search varies the distance and the
+/// direction of the line step by step.
 fn slow_line(beams: &[(f64, f64)]) -> f64 {
     let error = |r: f64, alpha: f64| -> f64 {
         let off = |&(angle, range): &(f64, f64)| {
@@ -175,7 +175,7 @@ fn is_near(one: f32, two: f64, tolerance: f64) -> bool {
     (f64::from(one) - two).abs() < tolerance
 }
 
-/// The lines are the walls with their ends and corners, wherever the sensor is mounted.
+/// The found lines are the walls with their ends and corners, for any mount of the sensor.
 #[test]
 fn a_room_has_four_lines_and_its_corners() {
     let mut random = Rng::with_seed(3);
@@ -215,7 +215,7 @@ fn a_room_has_four_lines_and_its_corners() {
     }
 }
 
-/// The reported deviations equal those of the lines of many scans.
+/// The reported deviations equal the measured deviations of lines over many scans.
 #[test]
 fn a_line_says_how_well_it_is_known() {
     let mut random = Rng::with_seed(4);
@@ -233,7 +233,7 @@ fn a_line_says_how_well_it_is_known() {
             found.push(*line);
         }
     }
-    // By the criterion, noise splits a line in about one of N scans, where N is the number of beams.
+    // The criterion lets noise split a line in about one of N scans, where N is the number of beams.
     assert!(found.len() >= 390, "noise alone makes no lines: one line in {} of 400", found.len());
     let count = found.len() as f64;
     let spread = |of: fn(&Line) -> f32| {
@@ -247,7 +247,7 @@ fn a_line_says_how_well_it_is_known() {
     assert!((0.8..1.25).contains(&(said_alpha / alpha)), "{said_alpha}, and it is {alpha}");
 }
 
-/// The points of a scanner with exact angles lie off the grid.
+/// The points of a scanner with exact angles do not lie on the grid of beams.
 #[test]
 fn exact_angles_are_those_that_count() {
     let mut random = Rng::with_seed(5);
@@ -297,7 +297,7 @@ fn assert_sound(lines: &Lines, scan: &Scan, settings: &Settings) {
     assert!(unused.iter().all(|line| *line == Line::default()));
 }
 
-/// Input without information gives no line, or a line with large deviations.
+/// Input without information yields no line, or a line with large deviations.
 #[test]
 fn input_that_says_nothing() {
     let mut random = Rng::with_seed(6);
@@ -317,7 +317,7 @@ fn input_that_says_nothing() {
         assert_sound(&lines, &scan, &settings);
         assert_eq!(lines.count, 0, "{lines:?}");
     }
-    // With noise alone, no line is more certain than its points.
+    // If there is only noise, no line is more certain than its points.
     for refine in [false, true] {
         let settings = Settings { refine, ..settings };
         let ranges: Vec<f64> = (0..361).map(|_| 3.0 + random.f64()).collect();

@@ -1,4 +1,4 @@
-//! Tests of marks, against a slow version that follows their definition in floating point.
+//! Tests of marks. They are compared with a slow version that follows the definition of marks in floating point.
 
 mod scans;
 
@@ -14,7 +14,7 @@ struct Hit {
     intensity: u8,
 }
 
-/// Returns the beams that qualify, in groups that end where beams are too far apart or ranges jump.
+/// Returns the beams that can belong to marks, in groups. A group ends where beams are too far apart or ranges jump.
 fn groups(scan: &Scan, settings: Settings) -> Vec<Vec<Hit>> {
     let mut groups: Vec<Vec<Hit>> = Vec::new();
     for beam in 0..usize::from(scan.count) {
@@ -42,7 +42,7 @@ fn assert_mark(scan: &Scan, group: &[Hit], mark: &Mark) {
     let weight: f64 = sum(&|_| 1.0);
     let angle: f64 = sum(&|hit| 1000.0 * (scan.first_angle + hit.beam as f64 * scan.step).to_degrees());
     let range: f64 = sum(&|hit| hit.range_mm);
-    // Values are rounded to a thousandth of a degree and a tenth of a millimeter; halves are rounded up.
+    // Values are rounded to a thousandth of a degree and a tenth of a millimeter. Halves are rounded up.
     let nearest = |exact: f64, reported: f64| (-0.5 - 1e-6..0.5 + 1e-6).contains(&(exact - reported));
     assert!(nearest(angle / weight, f64::from(mark.angle_mdeg)), "{} {mark:?}", angle / weight);
     assert!(nearest(10.0 * range / weight, f64::from(mark.range_dmm)), "{} {mark:?}", range / weight);
@@ -159,8 +159,8 @@ fn without_reflector_bits_nothing_is_known() {
     assert_eq!((nothing.count, nothing.is_available()), (0, true), "nothing there is something known");
 }
 
-/// Returns a revolution of eight beams at 1 m with these intensities. Each exact angle is an eighth of a beam after the
-/// middle of its beam.
+/// Returns a revolution of eight beams at 1 m with these intensities. Each exact angle is an eighth of a beam beyond
+/// the middle of its beam.
 fn revolution(intensities: [u8; 8]) -> Box<Scan> {
     let mut scan = Scan::of(ScanHead::of_revolution(Family::Ld, 8), &[1000; 8]);
     let step = scan.step;
@@ -198,7 +198,7 @@ fn a_mark_is_at_the_exact_angles() {
     let near = |angle: f64, expected: f64| assert!((angle - expected).abs() < 1e-3, "{angle} {expected}");
     near(angle([0, 0, 100, 100, 0, 0, 0, 0]), -45.0 * (2.5 + 0.125));
     near(angle([200, 0, 0, 0, 0, 0, 0, 0]), -45.0 * 0.125);
-    // Behind the scanner, the angle continues from the other side, as sectors do.
+    // Behind the scanner, the angle continues from the other side, as for sectors.
     near(angle([0, 0, 0, 0, 200, 0, 0, 0]), 360.0 - 45.0 * 4.125);
     near(angle([0, 0, 0, 0, 0, 0, 0, 200]), 360.0 - 45.0 * 7.125);
 }

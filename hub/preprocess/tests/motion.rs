@@ -1,5 +1,6 @@
-//! Tests of the motion of a robot: comparison with a slow version that tries all pairs of points, drives with known
-//! motion, surroundings that leave directions open, and input without information.
+//! Tests of the motion of a robot. They include a comparison with a slow version that tries all pairs of points, and
+//! drives with known motion. They also include surroundings in which some directions are undetermined, and input
+//! without information.
 
 mod drives;
 
@@ -27,14 +28,14 @@ fn step(motion: &Motion) -> Pose2 {
     Pose2::new(motion.dx_m.into(), motion.dy_m.into(), motion.dyaw_rad.into())
 }
 
-/// Returns how far apart two poses are, in meters and radians.
+/// Returns the distance between two poses, in meters and radians.
 fn pose_difference(one: &Pose2, other: &Pose2) -> (f64, f64) {
     let between = one.inverse().then(other);
     (between.x.hypot(between.y), between.yaw.abs())
 }
 
-/// Returns the position of `now` relative to `reference` by all pairs of points. Each point is pulled to the line
-/// through the nearest point and its neighbors, near points more than far ones.
+/// Returns the position of `now` relative to `reference`, calculated from all pairs of points. Each point is pulled to
+/// the line through the nearest point and its neighbors. Near points have more weight than far ones.
 fn reference_match(reference: &Scan, now: &Scan) -> Pose2 {
     let points = |scan: &Scan| -> Vec<(f64, f64)> {
         let of = |i: usize| Some((scan.distance_m(i)?, scan.angle(i)));
@@ -136,8 +137,8 @@ fn steps_sum_to_the_pose_with_right_covariance() {
     assert!((0.5..2.0).contains(&mean), "in variances: {mean}");
 }
 
-/// Returns the square of `error` in standard deviations of `covariance`. Its mean is 3 if the covariance is right. It
-/// is NaN if the covariance is not positive definite.
+/// Returns the square of `error` in standard deviations of `covariance`. The mean of this square is 3 if the covariance
+/// is right. The square is NaN if the covariance is not positive definite.
 fn normalized(error: [f64; 3], covariance: &[f32; 9]) -> f64 {
     let (mut lower, mut whitened) = ([[0.0; 3]; 3], [0.0; 3]);
     for i in 0..3 {
@@ -152,8 +153,8 @@ fn normalized(error: [f64; 3], covariance: &[f32; 9]) -> f64 {
     whitened.iter().map(|value| value * value).sum()
 }
 
-/// Returns the mean square of the errors of the sums at the end of `drives`, in variances, and the share of the errors within two
-/// standard deviations.
+/// Returns two values about the errors of the sums at the end of `drives`: the mean of their squares, in variances; and
+/// the share of the errors within two standard deviations.
 fn errors_of_sums(drives: impl Iterator<Item = Drive>) -> (f64, f64) {
     let (mut squares, mut within, mut count) = (0.0, 0.0, 0.0);
     for drive in drives {
@@ -172,7 +173,8 @@ fn errors_of_sums(drives: impl Iterator<Item = Drive>) -> (f64, f64) {
     (squares / count, within / count)
 }
 
-/// All positions of a robot that stands are found on the same scan, so the covariance does not grow with the number of steps.
+/// If a robot does not move, all its positions are found on the same scan, so the covariance does not grow with the
+/// number of steps.
 #[test]
 fn pose_covariance_is_right_while_standing() {
     let standing = (1000..1100).map(|seed| {
@@ -242,8 +244,9 @@ fn a_robot_that_is_already_fast_is_corrected_too() {
     assert!(errors[errors.len() / 2] < 0.006, "{errors:?}");
 }
 
-/// A robot turns at 120 degrees/s, and moves by 0.2 m between two scans. Either a person has carried it and it stands now, or it
-/// was pushed and still turns. Both scans must be corrected by the right velocity, because the later steps use them.
+/// A robot turns at 120 degrees/s, and moves by 0.2 m between two scans. In one case, a person has carried the robot,
+/// and it does not move now. In the other case, the robot was pushed and still turns. Both scans must be corrected with
+/// the right velocity, because the later steps use them.
 #[test]
 fn carried_or_pushed_robot_uses_the_right_velocity() {
     for deg_per_s in [0.0, 120.0] {
@@ -399,7 +402,8 @@ fn uninformative_scans_are_refused_or_uncertain() {
     assert!((42..60).all(|at| found[at].has_step()), "it goes on");
 }
 
-/// Scan 30 sees one wall. The step after it contains the uncertainty of that position, and the sum does from there on.
+/// Scan 30 sees only one wall. The next step includes the uncertainty of that position, and from then on the sum
+/// includes it.
 #[test]
 fn a_step_from_an_open_position_is_open_too() {
     let mut open = 0;

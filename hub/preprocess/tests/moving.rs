@@ -1,6 +1,6 @@
-//! Tests of the map of a scanner that moves: comparison with a slow version whose map does not scroll, drives with
-//! known people, and positions without information. Other tests check lines, motion and map of a lifted robot, with few
-//! returns, and with a clock that jumps: they must not panic, and no result may be too certain.
+//! Tests of the map of a moving scanner. They include a comparison with a slow version whose map does not scroll,
+//! drives with known people, and positions without information. Other tests check lines, motion and map for a lifted
+//! robot, for few returns, and for a clock that jumps. The processors must not panic, and no result may be too certain.
 
 mod drives;
 
@@ -31,7 +31,7 @@ fn motion_at(pose: &Pose2, is_first: bool) -> Motion {
     Motion { x_m: pose.x, y_m: pose.y, yaw_rad: pose.yaw, method: method as u8, ..Motion::default() }
 }
 
-/// Returns the robot's velocity during the scan with this number.
+/// Returns the robot's velocity during the scan with index `number`.
 fn velocity(drive: &Drive, number: usize) -> Velocity {
     let step = drive.poses[number.saturating_sub(1)].inverse().then(&drive.poses[number]);
     Velocity::of_step((step.x, step.y, step.yaw), drives::SCAN_PERIOD_S)
@@ -120,7 +120,7 @@ fn classes_are_those_of_a_slow_version() {
             model.set_motion(&Pose::default(), &motion_at(place, number == 0), &velocity);
             model.update(scan, &mut out);
             for (one, other) in model.classes().iter().zip(&expected) {
-                // The filter of runs makes foreground of short runs unknown, which this version does not do.
+                // The filter of runs changes foreground of short runs to unknown. This version does not do that.
                 let is_same = one == other || (*one, *other) == (Class::Unknown, Class::Foreground);
                 same += usize::from(is_same);
                 foreground += usize::from(*one == Class::Foreground && is_same);
@@ -133,8 +133,8 @@ fn classes_are_those_of_a_slow_version() {
     }
 }
 
-/// Returns the number of beams from scan `from` on that met people and are foreground, that met people and are not, and
-/// that are foreground without having met people.
+/// Returns three numbers of beams from scan `from` on: beams that met people and are foreground, beams that met people
+/// and are not foreground, and beams that are foreground and met no person.
 fn count_moving(drive: &Drive, from: usize) -> (usize, usize, usize) {
     let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), 361);
     let mut model = BackgroundModel::new(Settings { scans: None, ..MAP_SETTINGS }, 361);
@@ -166,7 +166,7 @@ fn distinguishes_walkers_from_a_driving_robot() {
     }
 }
 
-/// A beam meets the leg of a chair only in some scans.
+/// A beam meets the leg of a chair in only some of the scans.
 #[test]
 fn legs_of_chairs_stand_while_people_walk() {
     for seed in 200..203 {
@@ -229,7 +229,7 @@ fn shows_the_static_scene_as_background() {
     };
     let count = (0..361).filter(near).count();
     assert!(count > 300, "{count} of 361, those along walls aside");
-    // A background of one position is not a map.
+    // A background from a single position is not a map.
     let generation = model.generation();
     model.load(&shown).unwrap();
     model.update(scan, &mut out);
@@ -260,7 +260,7 @@ fn any_place_and_any_scan_are_taken() {
     }
 }
 
-/// Ten seconds of an LMS. The default depends on the time of a scan.
+/// Number of scans of an LMS in ten seconds. The default depends on the duration of a scan.
 const TEN_SECONDS: Settings = Settings { scans: Some(375), ..MAP_SETTINGS };
 
 /// All results of a scan.
@@ -272,7 +272,7 @@ struct ScanResult {
     foreground: usize,
 }
 
-/// Returns the results of all scans, in the order of the hub.
+/// Returns the results of all scans. The processors run in the same order as in the hub.
 fn process_all(scans: &[Box<Scan>]) -> Vec<ScanResult> {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
     let mut finder = LineFinder::new(Pose::default(), lines::Settings::default(), beams);
@@ -310,8 +310,8 @@ fn change_ranges(scan: &mut Scan, mut change: impl FnMut(usize, f64) -> f64) {
     }
 }
 
-/// A lifted sensor sees other objects at other ranges. A tilted one has shorter ranges on one side and longer ones on
-/// the other.
+/// A lifted sensor sees other objects at other ranges. A tilted sensor has shorter ranges on one side and longer ranges
+/// on the other.
 #[test]
 fn lifting_the_scanner_is_refused_or_uncertain() {
     for seed in 0..6 {
@@ -345,7 +345,7 @@ fn lifting_the_scanner_is_refused_or_uncertain() {
     }
 }
 
-/// One beam in ten returns, which is too few to detect motion.
+/// One beam in ten has a return, which is too few to detect motion.
 #[test]
 fn where_little_returns_nothing_moves() {
     let mut random = Rng::with_seed(9);
@@ -376,7 +376,7 @@ fn where_little_returns_nothing_moves() {
     }
 }
 
-/// A scan whose beams have impossible times is not corrected by them.
+/// If the beams of a scan have impossible times, the times do not correct the scan.
 #[test]
 fn impossible_times_of_beams_are_ignored() {
     let mut random = Rng::with_seed(4);

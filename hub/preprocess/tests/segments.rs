@@ -1,5 +1,5 @@
-//! Tests of segments, against a slow version that computes each point with sine and cosine, and each distance from two
-//! points.
+//! Tests of segments. They are compared with a slow version that calculates each point with sine and cosine, and each
+//! distance from two points.
 
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{ArrayFlags, Foreground, ForegroundHead, MAX_SEGMENTS, Pose, Scan, ScanHead, Segment};
@@ -63,7 +63,7 @@ fn segments_are_those_of_the_formula() {
         let (mut range_mm, share) = (2_000.0, 0.3 + 0.7 * random.f64());
         let mut ranges = Vec::new();
         for i in 0..BEAM_COUNT {
-            // Most ranges are a surface with noise, and some have a step that may divide it.
+            // Most ranges are a surface with noise. Some have a step that may divide the surface.
             let step_mm = if random.u8(..8) == 0 { 600.0 } else { 30.0 };
             range_mm = (range_mm + step_mm * (random.f64() - 0.5)).clamp(50.0, 8_000.0);
             if random.f64() < share {
@@ -142,7 +142,7 @@ fn several_beams_or_the_scan_before_support_a_segment() {
         for round in 0..2_000 {
             let mut ranges = Vec::new();
             for i in (0..BEAM_COUNT).filter(|i| i % 3 != 2) {
-                // One beam in two has a neighbor, at another range or at that of a wall.
+                // One beam in two has a neighbor, at another range or at the range of a wall.
                 let range_mm = if random.bool() { 2_000 } else { random.u32(500..8_000) };
                 if random.u8(..10) == 0 {
                     ranges.push((i, (range_mm / unit_mm) as u16));

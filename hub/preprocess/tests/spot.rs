@@ -1,6 +1,6 @@
-//! Tests of segments, lines and marks of simulated scans against the truth of the world. The beams are as wide as real
-//! ones, and can report ranges between two surfaces. `cargo test -p scanhub-preprocess --test spot -- --nocapture`
-//! prints the figures.
+//! Tests of segments, lines and marks of simulated scans. They are compared with the truth of the world. The beams are
+//! as wide as real ones, and can report ranges between two surfaces. `cargo test -p scanhub-preprocess --test spot --
+//! --nocapture` prints the figures.
 
 #[path = "../../../tests/testkit/decoded_scan.rs"]
 mod decoded_scan;
@@ -29,7 +29,7 @@ fn room(name: &str, change: impl Fn(NoiseModel) -> NoiseModel) -> Room {
     Room::of_port(&world.with_noise(layers), SEED, 0)
 }
 
-/// Returns two rooms of a world: one as in its file, and one whose beams have no width.
+/// Returns two rooms of a world: one as in its file, and one in which beams have no width.
 fn wide_and_narrow(name: &str) -> [Room; 2] {
     [room(name, |layers| layers), room(name, |layers| NoiseModel { spot: false, ..layers })]
 }
@@ -40,8 +40,8 @@ fn scan_and_targets(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
     (decoded_scan::scan(&look.words, Unit::Mm), look.truth)
 }
 
-/// Counts false segments in 1400 scans: all, and those with support. A false segment is one whose beams meet neither a
-/// person nor an object that was put down, moved or taken away.
+/// Counts false segments in 1400 scans: all of them, and those with support. The beams of a false segment meet neither
+/// a person nor an object that was put down, moved or taken away.
 fn false_segments(room: &Room) -> [usize; 2] {
     let beams = Variant::HALF.beams();
     let mut model = BackgroundModel::new(BackgroundSettings::default(), beams);
@@ -80,12 +80,13 @@ fn values_between_hardly_make_segments_with_support() {
     assert!(sums[0] <= 21 && sums[0] <= sums[1] + 10, "{sums:?}");
 }
 
-/// Counts lines in 100 scans, without lines at people and at things that were put down or moved:
+/// Counts lines in 100 scans. Lines at people and at objects that were put down or moved do not count. The three
+/// numbers are:
 ///
 /// - all lines
-/// - lines with a mixed range: the range of a beam is off by more than 60 mm from that of a beam without width and
-///   noise
-/// - false ones among these: more than 60 mm from the surfaces that most of their beams meet
+/// - lines with a mixed range: the range of a beam differs by more than 60 mm from the range of a beam without width
+///   and noise
+/// - false lines among these: more than 60 mm from the surfaces that most of their beams meet
 fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
     let mut finder = LineFinder::new(Pose::default(), LineSettings::default(), Variant::HALF.beams());
     let mut lines = Lines::default();
@@ -133,8 +134,8 @@ fn values_between_make_no_lines() {
     assert!(lines > 3_000 && mixed > 50 && wrong * 500 <= lines, "{sums:?}");
 }
 
-/// Returns a room with a reflecting strip that is perpendicular to its beam, half a meter in front of a wall. Its scans
-/// have the usual noise, but no constant error of the device, and no codes, which would split a mark.
+/// Returns a room with a reflecting strip half a meter in front of a wall. The strip is perpendicular to its beam. The
+/// scans have the usual noise, but no constant error of the device. They also have no codes, which would split a mark.
 fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: NoiseModel, seed: u64) -> Room {
     let (sin, cos) = angle_deg.to_radians().sin_cos();
     let board = |width_mm: f64, range_mm: f64, surface: &str| {
@@ -182,8 +183,8 @@ fn marks_are_accurate_to_0_14_degrees_and_5_mm() {
             let [(deg, mm, missing), narrow] = [layers, NoiseModel { spot: false, ..layers }]
                 .map(|layers| mark_errors(width_mm, 1000.0 * f64::from(range_m), layers, &mut random));
             println!("{range_m} m, {width_mm} mm: {deg:.3} deg, {mm:.2} mm, {missing}; {narrow:.3?}");
-            // At 7 and 8 m, the narrow strip is 0.41 and 0.36 degrees wide. Often it has one beam only, wherever that meets
-            // it, or none.
+            // At 7 and 8 m, the narrow strip is 0.41 and 0.36 degrees wide. Often only one beam meets the strip, at any
+            // point of it, or no beam meets it.
             let (most_deg, most_missing) = match range_m {
                 7.. if width_mm == 50.0 => (0.14, 20),
                 _ => (0.1, 0),

@@ -1,7 +1,7 @@
-//! Tests of zones, verdicts and early warnings. Zones are compared with two slow versions without tables: the formula,
-//! beam by beam, which must give the same results, and plain geometry, which must agree except within a millimeter of a
-//! circle. Warnings of a partial scan are compared with a new check that gets the same scans, without objects in the
-//! beams that have not arrived.
+//! Tests of zones, verdicts and early warnings. Zones are compared with two slow versions without tables. The formula,
+//! beam by beam, must give the same results. Plain geometry must agree, except within a millimeter of a circle.
+//! Warnings of a partial scan are compared with a new check. The new check gets the same scans, but the beams that have
+//! not arrived meet no objects.
 
 mod scans;
 
@@ -41,7 +41,8 @@ impl Case {
         ZoneChecker::new(self.pose, &self.settings, 401)
     }
 
-    /// Returns the direction of a beam as a unit vector, and the range in mm at which the robot's own body ends.
+    /// Returns the direction of a beam as a unit vector, and the range in mm at which the beam leaves the robot's own
+    /// body.
     fn beam(&self, scan: &Scan, i: usize) -> ([f64; 2], f64) {
         let mdeg = (1000.0 * (scan.first_angle + i as f64 * scan.step).to_degrees()).round() as i32;
         let sense = if self.pose.upside_down == 1 { -1.0 } else { 1.0 };
@@ -56,7 +57,7 @@ impl Case {
         [self.pose.x_m * 1000.0, self.pose.y_m * 1000.0]
     }
 
-    /// Returns the ranges in mm between which a beam is inside a circle, by the formula.
+    /// Returns the two ranges between which a beam is inside a circle, calculated by the formula, in mm.
     fn chord(&self, u: [f64; 2], radius: f64) -> (f64, f64) {
         let [x, y] = self.sensor_mm();
         let (q, square) = (x * u[0] + y * u[1], x * x + y * y);
@@ -72,14 +73,14 @@ impl Case {
         ((lo - margin + 1e-6).floor().max(0.0), (hi + margin - 1e-6).ceil())
     }
 
-    /// Returns whether a reading is inside a circle by the formula.
+    /// Returns whether a reading is inside a circle, calculated by the formula.
     fn violates(&self, u: [f64; 2], own_range: f64, range: f64, radius: f64) -> bool {
         let (lo, hi) = self.chord(u, radius);
         range >= own_range && range < hi && (!self.settings.exact || lo == 0.0 || range > lo)
     }
 
     /// Returns whether a reading of this beam can be inside the largest circle. Checks the shortest readings beyond the
-    /// robot's own body and the circle's near side.
+    /// robot's own body and beyond the circle's near side.
     fn can_violate(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
         let (unit, radius) = (scans::unit_mm(scan), f64::from(self.settings.radii_mm[0]));
         let shortest = (own.max(self.chord(u, radius).0) / unit).floor();
@@ -87,8 +88,9 @@ impl Case {
         values.into_iter().any(|value| self.violates(u, own, value * unit, radius))
     }
 
-    /// Returns the minimum distance from the center of the part of a beam that counts as occupied by this reading. The
-    /// part has the point, the margin on both sides, and everything behind the point unless `exact` is set.
+    /// Returns the minimum distance from the center to the part of a beam that this reading marks as occupied. The part
+    /// consists of the point and the margin on both sides. Unless `exact` is set, it also includes everything behind
+    /// the point.
     fn distance(&self, u: [f64; 2], range: f64) -> f64 {
         let [x, y] = self.sensor_mm();
         let margin = f64::from(self.settings.margin_mm);
@@ -205,7 +207,7 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> CaseTally {
     tally
 }
 
-/// Tally of one scan, for the expected verdict and for the coverage of the test.
+/// Counts from one scan. They give the expected verdict and the coverage of the test.
 #[derive(Default)]
 struct CaseTally {
     sure: u32,
@@ -213,7 +215,7 @@ struct CaseTally {
     unknown: bool,
     /// Whether too many beams are invalid.
     invalid: bool,
-    /// Whether fewer beams are relevant than a violation takes.
+    /// Whether the number of relevant beams is too small for a violation.
     blind: bool,
 }
 
@@ -267,7 +269,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
     assert!(close > 1000 && sure > 10_000 && blind > 100, "{close} {sure} {blind}");
 }
 
-/// An object stays inside the circle, but one scan in between is invalid.
+/// An object stays inside the circle, but one scan in this time is invalid.
 #[test]
 fn invalid_scan_delays_a_clear_verdict() {
     let settings = Settings { radii_mm: vec![1000, 600], min_scans: 2, ..Settings::default() };
@@ -289,7 +291,7 @@ fn invalid_scan_delays_a_clear_verdict() {
 #[test]
 fn on_a_circle_is_outside_wherever_it_is_seen_from() {
     let mut random = Rng::with_seed(2);
-    // Position of a sensor that looks ahead, and the ranges at which the beam ahead enters and leaves the circle of 1
+    // Position of a sensor that looks ahead; and the ranges at which the beam ahead enters and leaves the circle of 1
     // m.
     let places = [
         ([0.0, 0.0], 0, 1000),
@@ -302,7 +304,7 @@ fn on_a_circle_is_outside_wherever_it_is_seen_from() {
     ];
     for (place, lo_mm, hi_mm) in places {
         for round in 0..200 {
-            // Turn the sensor about the robot's center, which changes nothing for the beam.
+            // Turn the sensor about the robot's center. This changes nothing for the beam.
             let yaw_rad = if round < 4 { f64::from(round).to_radians() * 90.0 } else { 7.0 * random.f64() };
             let (sin, cos) = yaw_rad.sin_cos();
             let pose = Pose {
@@ -425,7 +427,8 @@ fn too_many_invalid_beams_hide_all_but_a_stop() {
 
 #[test]
 fn the_robot_itself_is_neither_near_nor_invalid() {
-    // The sectors cover beams 0 to 10. The body ends inside the circle, or hides all of it.
+    // The sectors cover beams 0 to 10. The body ends inside the circle in one case, and hides the whole circle in the
+    // other.
     let partly = [Sector { from_mdeg: -90_000, to_mdeg: -72_000, range_mm: 400 }];
     let wholly = [Sector { range_mm: 1000, ..partly[0] }, partly[0]];
     let body: Vec<_> = (0..12).map(|i| (i, 399)).collect();
@@ -488,7 +491,8 @@ fn a_circle_that_cannot_be_violated_is_never_clear() {
         of(whole, &Settings { body_mask: all.to_vec(), ..settings.clone() }, &scan(&[])).0,
         Verdict::Unknown
     );
-    // A sensor 2 m ahead of the center looks away from the circle. Turned by 180 degrees, it looks into the circle.
+    // A sensor 2 m ahead of the center looks away from the circle. If it is turned by 180 degrees, it looks into the
+    // circle.
     let facing_away = Pose { x_m: 2.0, ..Pose::default() };
     assert_eq!(of(facing_away, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
     let back = Pose { yaw_rad: std::f64::consts::PI, ..facing_away };
@@ -501,8 +505,8 @@ fn a_circle_that_cannot_be_violated_is_never_clear() {
     assert_eq!(of(far, &settings, &cm).0, Verdict::Clear);
 }
 
-/// Returns a clockwise revolution of 200 beams, 1.8 degrees apart, of a scanner whose own points are 1.8 degrees apart.
-/// All ranges are 5 m, except those in `beams`, which have an exact angle in degrees.
+/// Returns a clockwise revolution of 200 beams, 1.8 degrees apart. The scanner's own points are also 1.8 degrees apart.
+/// All ranges are 5 m, except the ranges in `beams`, which have an exact angle in degrees.
 fn revolution(beams: &[(usize, u16, f32)]) -> Box<Scan> {
     let head = ScanHead {
         step: -1.8_f64.to_radians(),
@@ -537,8 +541,8 @@ fn the_exact_point_counts_where_there_is_one() {
         zones_of_revolution(Pose::default(), &settings, &revolution(&[(7, 700, -12.0), (190, 999, 17.5)]));
     assert_eq!((near.verdict(), near.nearest()), (Verdict::Slow, Some((7, 700))));
     assert_eq!((near.zones()[0].beams, near.zones()[1].beams), (2, 0));
-    // From a sensor 2 m ahead of the center, an object straight behind at 1001 mm is just inside, and an object half a
-    // beam to the side is not.
+    // The sensor is 2 m ahead of the center. An object straight behind it at 1001 mm is just inside the circle. An
+    // object half a beam to the side is not.
     let ahead = Pose { x_m: 2.0, ..Pose::default() };
     assert_eq!(
         zones_of_revolution(ahead, &settings, &revolution(&[(100, 1001, -180.0)])).zones()[0].beams,
@@ -598,14 +602,14 @@ fn changing_speed_does_not_interrupt_scan_counting() {
 const BEAM_COUNT: usize = 100;
 const FAR_MM: u16 = 5000;
 
-/// Returns a scan of 180 degrees, in which only `near` beams have short ranges.
+/// Returns a scan of 180 degrees. Only `near` beams have short ranges.
 fn random_scan(random: &mut Rng, near: usize) -> Box<Scan> {
     let mut scan = Scan::of(ScanHead::lms(BEAM_COUNT, -90_000, 1800, 1, 13), &[FAR_MM; BEAM_COUNT]);
     (0..near).for_each(|_| scan.arrays().ranges[random.usize(..BEAM_COUNT)] = random.u16(..1200));
     scan
 }
 
-/// Returns the zones of the last of `scans` by a new check that has seen the others.
+/// Returns the zones of the last of `scans`. They come from a new check that has processed the earlier scans.
 fn zones_of(pose: Pose, settings: &Settings, scans: &[Box<Scan>]) -> Zones {
     let (mut check, mut out) = (ZoneChecker::new(pose, settings, BEAM_COUNT), Zones::unknown());
     scans.iter().for_each(|scan| check.update(scan, &mut out));
@@ -677,7 +681,7 @@ fn scans_of_another_form_warn_of_nothing() {
     assert_eq!(check.check_partial(BEAM_COUNT, 1000, &[], &[]), None);
 }
 
-/// The spacing of the points of a rotating scanner may vary by an arc second without changing the layout.
+/// If the spacing of a rotating scanner's points varies by an arc second, the layout does not change.
 #[test]
 fn slightly_uneven_revolutions_count_in_a_row() {
     let settings = Settings { min_scans: 2, ..Settings::default() };

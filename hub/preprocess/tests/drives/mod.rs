@@ -10,7 +10,7 @@ use scanhub_schema::{Code, Scan, ScanHead};
 
 type Point = (f64, f64);
 
-/// Consecutive scans, with the truth about them.
+/// Consecutive scans with the truth about them.
 pub(crate) struct Drive {
     pub(crate) scans: Vec<Box<Scan>>,
     /// Position of the robot at the end of each scan.
@@ -26,7 +26,8 @@ pub(crate) struct Drive {
     random: Rng,
 }
 
-/// Squares of 0.1 m that were seen free, with the number of scans. They are computed from the true positions.
+/// Squares of 0.1 m that scans saw free, each with the number of these scans. The squares are calculated from the true
+/// positions.
 #[derive(Default)]
 pub(crate) struct ObservedSquares {
     squares: HashMap<(i32, i32), (u32, u32)>,
@@ -57,7 +58,7 @@ impl ObservedSquares {
     }
 }
 
-/// Returns the square in which a beam of the scan with index `at` is at this range.
+/// Returns the square that contains the point on a beam at this `range`, for the scan with index `at`.
 fn square(drive: &Drive, at: usize, beam: usize, range: f64) -> (i32, i32) {
     let (scan, before) = (&drive.scans[at], &drive.poses[at.saturating_sub(1)]);
     let (pose, angle) = (relative_pose(before, &drive.poses[at], scan, beam), scan.angle(beam));
@@ -72,7 +73,7 @@ fn relative_pose(before: &Pose2, pose: &Pose2, scan: &Scan, beam: usize) -> Pose
     before.then(&Pose2::new(part * step.x, part * step.y, part * step.yaw))
 }
 
-/// Time of a scan of an LMS at half degrees, two revolutions of its mirror, in seconds.
+/// Duration of a scan of an LMS at half degrees, in seconds. It is two revolutions of the mirror.
 pub(crate) const SCAN_PERIOD_S: f64 = 0.026_64;
 
 /// Returns the stamp of the scan with this number, in ns.
@@ -85,7 +86,7 @@ struct Walker {
     by_scan: Point,
 }
 
-/// Returns the head of a scan of `count` beams, with ranges in mm.
+/// Returns the head of a scan of `count` beams. The scan's ranges are in mm.
 pub(crate) fn beams_at(count: usize, first_angle: f64, step: f64) -> ScanHead {
     let no_return = Code::NoReturn.value();
     ScanHead {
@@ -101,7 +102,7 @@ pub(crate) fn beams_at(count: usize, first_angle: f64, step: f64) -> ScanHead {
     }
 }
 
-/// Returns a scan whose ranges `range` returns in meters for each angle. `None` becomes the code of no return.
+/// Returns a scan. `range` returns the range in meters for each angle. `None` becomes the code of no return.
 pub(crate) fn scan(head: ScanHead, mut range: impl FnMut(f64) -> Option<f64>) -> Box<Scan> {
     let unit = |i: u16| {
         let range = range(head.first_angle + f64::from(i) * head.step);
@@ -147,7 +148,7 @@ impl Drive {
         drive
     }
 
-    /// Returns scans as [`through_a_room`](Self::through_a_room), with this number of `people` around the robot.
+    /// Returns scans like [`through_a_room`](Self::through_a_room), with this number of `people` around the robot.
     pub(crate) fn among_people(seed: u64, beams: usize, count: usize, people: usize) -> Drive {
         let mut drive = Drive::new_room(seed, beams, 0.01);
         for _ in 0..people {
@@ -157,8 +158,8 @@ impl Drive {
         drive
     }
 
-    /// Returns scans of a robot that drives by `speed` meters per scan, or stands if it is 0, among this number of
-    /// `people` who walk.
+    /// Returns scans of a robot among this number of walking `people`. The robot drives by `speed` meters per scan, or
+    /// does not move if `speed` is 0.
     pub(crate) fn with_walkers(seed: u64, beams: usize, count: usize, people: usize, speed: f64) -> Drive {
         let mut drive = Drive::new_room(seed, beams, 0.01);
         for _ in 0..people {
@@ -172,9 +173,8 @@ impl Drive {
         drive
     }
 
-    /// Returns scans of an LMS at half degrees, on a robot that drives by `speed` meters per scan through a furnished
-    /// room among `people`: tables and chairs with thin legs, cupboards, and pillars. The robot moves while a scan is
-    /// measured.
+    /// Returns scans of an LMS at half degrees on a robot that drives by `speed` meters per scan among `people`. The
+    /// room has tables and chairs with thin legs, cupboards, and pillars. The robot moves while a scan is measured.
     pub(crate) fn through_furniture(seed: u64, count: usize, people: usize, speed: f64) -> Drive {
         let mut drive = Drive::new_room(seed, 361, 0.01);
         drive.furnish();
@@ -185,8 +185,8 @@ impl Drive {
         drive
     }
 
-    /// Returns scans of an LMS at half degrees, on a robot that turns on the spot in a room, by `deg_per_s` from the
-    /// first scan on. At the end, it stands for 20 scans.
+    /// Returns scans of an LMS at half degrees on a robot that turns on the spot in a room, by `deg_per_s` from the
+    /// first scan on. At the end, the robot does not move for 20 scans.
     pub(crate) fn on_the_spot(seed: u64, count: usize, deg_per_s: f64) -> Drive {
         let mut drive = Drive::turning(seed, count + 1, deg_per_s);
         drive.stand_still(19);
@@ -319,7 +319,7 @@ impl Drive {
         self.scan_between(self.poses.last().copied().unwrap_or(pose), pose);
     }
 
-    /// Adds a scan, during which the robot moves from `before` to `pose`.
+    /// Adds a scan. During the scan, the robot moves from `before` to `pose`.
     fn scan_between(&mut self, before: Pose2, pose: Pose2) {
         let Drive { walls, legs, walkers, head, noise_m, random, .. } = self;
         let times = Scan::of(*head, &[]);

@@ -91,7 +91,8 @@ impl RandomSurroundings {
     }
 }
 
-/// Returns the reading of beam `i`: a range in mm, infinity if nothing is in range, or `None` without a reading.
+/// Returns the reading of beam `i`: a range in mm, infinity if nothing is in range, or `None` if the beam has no
+/// reading.
 pub(crate) fn reading_mm(scan: &Scan, i: usize, no_return_is_far: bool) -> Option<f64> {
     let max = f64::from(scan.no_return);
     let value = f64::from(scan.ranges()[i]);
@@ -118,7 +119,7 @@ pub(crate) fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Box<Backgro
     model
 }
 
-/// Returns the ranges of `model` in mm: 0 if unknown, infinity if far.
+/// Returns the ranges of `model` in mm. Unknown ranges are 0, and far ranges are infinity.
 pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
     let mm = |&range: &u16| match range {
         Background::FAR => f64::INFINITY,
@@ -127,8 +128,8 @@ pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
     model.ranges().iter().map(mm).collect()
 }
 
-/// Passes `scan` to `model`, and compares the whole result with `classes` and `generation`. The payload is filled with
-/// `dirt` before. A failure prints `description`.
+/// Passes `scan` to `model`, and compares the whole result with `classes` and `generation`. The payload contains `dirt`
+/// before. A failure prints `description`.
 pub(crate) fn check_scan(
     model: &mut BackgroundModel,
     scan: &Scan,
@@ -144,7 +145,7 @@ pub(crate) fn check_scan(
     assert_eq!(out, foreground(scan, classes, generation, dirty()), "{description}");
 }
 
-/// Returns the foreground for `classes`. Its segments stay as they are in `expected`.
+/// Returns the foreground for `classes`. Its segments are the segments in `expected`.
 fn foreground(
     scan: &Scan,
     classes: &[Class],
@@ -173,8 +174,8 @@ pub(crate) fn unit_mm(unit_um: u32) -> f64 {
     f64::from(unit_um) / 1000.0
 }
 
-/// Returns the maximum difference of readings of one surface in mm: the set value, or the default for the unit, and at
-/// least one unit.
+/// Returns the maximum difference between readings of one surface, in mm. It is the set value, or the default for the
+/// unit, and at least one unit.
 pub(crate) fn max_difference_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
     let default_mm = match scan.unit_um {
         1_000 => 30,

@@ -1,5 +1,5 @@
-//! A simulator in a thread, a directory for its files, and a host that opens its port, writes requests, and finds the
-//! telegrams in the received bytes.
+//! A simulator in a thread, a directory for its files, and a host. The host opens the simulator's port, writes
+//! requests, and finds the telegrams in the received bytes.
 
 use std::io::Write;
 use std::os::fd::OwnedFd;
@@ -121,7 +121,7 @@ impl Host {
         tcsetattr(&self.port, OptionalActions::Now, &termios)
     }
 
-    /// Writes `request` at once, as most drivers do. A UART would add the gaps.
+    /// Writes all bytes of `request` at once, like most drivers. A UART would add gaps.
     pub(crate) fn write(&self, request: Request) {
         let encoded = request.encode(0);
         assert_eq!(rustix::io::write(&self.port, encoded.bytes()), Ok(encoded.bytes().len()));
@@ -140,7 +140,8 @@ impl Host {
             let timeout = Timespec { tv_sec: left.as_secs() as _, tv_nsec: left.subsec_nanos() as _ };
             let mut fds = [PollFd::new(&self.port, PollFlags::IN)];
             if poll(&mut fds, Some(&timeout)).unwrap() == 0 {
-                // The framer holds back a frame whose end looks like the start of a telegram, until nothing follows.
+                // If the end of a frame looks like the start of a telegram, the framer holds the frame until the line
+                // is silent.
                 self.framer.release(lms::framer::VETO_HOLD_TIME);
                 if let Some(FramerEvent::Telegram(framed)) = self.framer.poll() {
                     return Some(framed.telegram.bytes().to_vec());

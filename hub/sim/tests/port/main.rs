@@ -1,5 +1,5 @@
-//! Tests of the verb `simulate` on real ptys: a host opens the port, sends requests, reads, and compares the received
-//! bytes with the truth. Every wait ends with an event, and has a limit far longer than the event needs.
+//! Tests of the verb `simulate` on real ptys. A host opens the port, sends requests, reads, and compares the received
+//! bytes with the truth. Every wait ends with an event. The timeout of a wait is far longer than the event needs.
 
 #![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
 
@@ -28,7 +28,7 @@ use scanhub_sim::simulate::Record;
 
 use bench::{Host, Simulator, TestFolder};
 
-/// Limit of every wait. It matters only if a test hangs.
+/// Timeout of every wait. It matters only if a test hangs.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(180);
 
 fn options(port: PathBuf) -> SimulateOptions {
@@ -130,7 +130,7 @@ fn wrong_rate_garbles_both_directions() {
     let mut host = Host::open(&port, 500_000);
     host.ask(Request::Stream);
     host.set_rate(250_000);
-    // The record of the reply to the previous request precedes that of the first garbled scan.
+    // The record of the reply to the previous request comes before the record of the first garbled scan.
     while simulator.record().fault != Some(Fault::Baud) {}
     host.write(Request::Status);
     let mut garbled = 1;
@@ -203,7 +203,7 @@ fn replay_is_sent_once_in_order_then_line_is_silent() {
         let telegram = host.telegram(WAIT_TIMEOUT).expect("a scan");
         assert!(&telegram == scan, "not scan {number}; sent: {:?}", simulator.faults());
     }
-    // The scanner still replies. The count below proves that it sent nothing else.
+    // The scanner still replies. The count below proves that the scanner sent nothing else.
     host.ask(Request::Status);
     let (summaries, records) = simulator.end();
     assert_eq!(records.iter().filter(|record| is_data(record)).count(), 100);
@@ -294,7 +294,7 @@ fn unplugged_port_disappears_and_returns_by_name() {
             plugged.as_mut().is_some_and(|host| host.telegram(WAIT_TIMEOUT).is_some())
         });
         let host = plugged.expect("the port of the scan");
-        // A host of a pty reads the end of file once the other side is closed.
+        // The host of a pty reads the end of file when the other side is closed.
         let mut buffer = [0; 4096];
         wait_until("it is unplugged", || rustix::io::read(&host.port, &mut buffer) == Ok(0));
         assert!(rustix::termios::tcgetattr(&host.port).is_err(), "the port is there");

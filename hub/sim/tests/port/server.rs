@@ -1,5 +1,5 @@
-//! Tests of the verb `simulate` with TCP servers: a host that connects as to a serial server in raw mode receives the
-//! bytes of every family as they were sent, one host at a time.
+//! Tests of the verb `simulate` with TCP servers. A host connects as to a serial server in raw mode, and receives the
+//! bytes of every family as they were sent. Only one host can be connected at a time.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -78,7 +78,7 @@ fn one_host_at_a_time_and_the_next_when_it_has_left() {
     let mut third = loop {
         let mut host = connect(&simulator);
         host.set_read_timeout(Some(Duration::from_millis(50))).expect("set");
-        // The server closes the connection as long as it has not detected that the first host has left.
+        // The server closes a new connection until it has detected that the first host has left.
         let is_away = matches!(host.read(&mut [0; 1]), Ok(0));
         if !is_away {
             break host;
@@ -104,7 +104,7 @@ fn unplugged_server_returns_at_the_same_address() {
     let simulator = Simulator::start(SimulateOptions { faults, ..options(scanner) });
     let mut host = connect(&simulator);
     let mut rest = Vec::new();
-    // The connection may end with a reset if bytes were on their way.
+    // The connection may end with a reset if bytes were in transit.
     let _ = host.read_to_end(&mut rest);
     let end = Instant::now() + WAIT_TIMEOUT;
     let address = simulator.ready[0].port.to_str().expect("a name").replace("tcp:", "");

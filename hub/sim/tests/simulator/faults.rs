@@ -1,8 +1,8 @@
 //! Tests of every fault of the table with a real session, in virtual time. The session delivers intact telegrams once,
-//! in order and bit for bit. It marks telegrams that the scanner did not send. Bytes are conserved, and no request
+//! in order and bit for bit. It marks telegrams that the scanner did not send. Every byte is counted, and no request
 //! writes the EEPROM. At the end, the session streams.
 //!
-//! A failure prints the flags with which `simulate` is the same scanner on a pty.
+//! A failure prints the flags for `simulate` that create the same scanner on a pty.
 
 use std::collections::HashMap;
 
@@ -74,8 +74,8 @@ fn no_scene_is_about_nothing() {
     }
 }
 
-/// Returns whether the session delivered only telegrams that the scanner sent. Changed and foreign bytes are an
-/// exception: the scanner's checksum accepts 1.19e-3 of all pairs of flipped bits, and such telegrams need no mark.
+/// Returns whether the session delivered only telegrams that the scanner sent. Faults that change or insert bytes are
+/// an exception. The checksum is valid for 1.19e-3 of all pairs of flipped bits, and such telegrams need no mark.
 fn is_sound(all: &SceneResult, faults: &str) -> bool {
     let flips = faults.starts_with("flip");
     let changes = ["flip=", "insert=", "double=", "length=", "flood=", "wall="];
@@ -120,7 +120,7 @@ scenes! {
     nobody_answers: "mute=1", 300, |all| all.effects.unacknowledged >= 100 && all.recovery_ms > 100;
 }
 
-/// Faults and their duration.
+/// Faults and their duration, for one run.
 struct FaultScene {
     faults: Faults,
     span_ms: u64,
@@ -131,15 +131,16 @@ struct FaultScene {
 /// Result of a run.
 #[derive(Debug, Default)]
 struct SceneResult {
-    /// Number of telegrams that arrived as sent while the session streamed. All of them were delivered.
+    /// Number of telegrams that arrived as sent while the session streamed. The session delivered all of them.
     intact: usize,
     /// Number of telegrams that did not arrive as sent.
     faulty: usize,
-    /// Number of delivered telegrams that the scanner did not send, and number of those without a suspect mark.
+    /// Number of delivered telegrams that the scanner did not send; and number of these telegrams without a suspect
+    /// mark.
     wrong: usize,
     unmarked: usize,
     resyncs: u64,
-    /// Longest time from the end of the faults to a stream.
+    /// Longest time from the end of the faults until the session streams.
     recovery_ms: u64,
     effects: Effects,
 }
@@ -157,7 +158,7 @@ impl SceneResult {
 }
 
 impl FaultScene {
-    /// Creates a scene. Protocol quirks affect replies to requests, so a scanner that has them is idle.
+    /// Creates a scene. Protocol quirks affect replies to requests, so a scanner with quirks is idle.
     fn new(faults: Faults, span_ms: u64) -> FaultScene {
         FaultScene { faults, span_ms, is_idle: faults.quirks() != ProtocolQuirks::default() }
     }
@@ -178,8 +179,8 @@ impl FaultScene {
         let healed = bench.now;
         let streams = |bench: &Bench| bench.is_streaming() && !bench.received_scans(healed).is_empty();
         let back = bench.run_until(&self.name(seed), SEARCH_TIMEOUT, streams);
-        // Telegrams that were held back after damage are released after some intact ones, and the last one after a
-        // pause.
+        // The session releases telegrams that were held back after damage when some intact ones have followed. It
+        // releases the last one after a pause.
         bench.run(80 * MILLIS);
         bench.to_host = Box::new(|_, _| Vec::new());
         bench.run(40 * MILLIS);
@@ -227,7 +228,7 @@ fn world(seed: u64) -> &'static str {
     WORLDS[seed as usize % WORLDS.len()]
 }
 
-/// Time within which a session that must search for its scanner finds it.
+/// Maximum time until a session that must search for its scanner finds it.
 const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
 
 /// Number of occurrences of each effect.
@@ -236,14 +237,14 @@ struct Effects {
     /// Requests that reached the scanner and were not acknowledged.
     unacknowledged: usize,
     naks: usize,
-    /// Replies beyond the first one for each ACK.
+    /// Number of replies to an ACK in addition to the first one.
     extra_replies: usize,
     /// Replies 92h.
     refused: usize,
     /// Acknowledgements and replies that are later than usual.
     late_acknowledgements: usize,
     late_replies: usize,
-    /// Scans whose time of arrival does not fit the mirror.
+    /// Number of scans whose time of arrival does not match the mirror's revolutions.
     unaligned_scans: usize,
     /// Telegrams that arrived twice.
     copies: usize,
@@ -317,7 +318,7 @@ fn align<'a>(
     is_due: impl Fn(&SentTelegram) -> bool,
 ) -> Unmatched<'a> {
     let same = |s: usize, r: usize| sent[s].telegram == received[r].telegram;
-    // best[s][r] has the numbers of lost and of wrong telegrams among those from `s` and `r` on.
+    // best[s][r] has two numbers for the telegrams from `s` and `r` on: lost telegrams and wrong telegrams.
     let mut best = vec![vec![(0, 0); received.len() + 1]; sent.len() + 1];
     for s in (0..=sent.len()).rev() {
         for r in (0..=received.len()).rev() {

@@ -1,5 +1,5 @@
-//! Tests of LDROBOT scanners in simulated rooms: the session reports the points that they measured. If no model is
-//! configured, the number of beams is the number of points that the scanner measures per revolution, regardless of
+//! Tests of LDROBOT scanners in simulated rooms. The session reports the points that the scanners measured. If no model
+//! is configured, the number of beams is the number of points that the scanner measures per revolution, even after
 //! power failures.
 
 use scanhub_drivers::ld::packet::PACKET_LEN;
@@ -159,9 +159,9 @@ impl Bench {
         }
     }
 
-    /// Compares each revolution with the measurements of the head since `start`. Its points belong to one revolution
-    /// and are in order. Without a mark, none is missing, and each is at most `angle_deg` and `range_mm` off. Returns
-    /// the largest error of a stamp.
+    /// Compares each revolution with the measurements of the head since `start`. The points of a revolution belong to
+    /// one revolution of the head and are in order. Without a mark, no point is missing, and the error of each point is
+    /// at most `angle_deg` and `range_mm`. Returns the largest error of a stamp.
     fn check_revolutions(&mut self, start: Nanos, angle_deg: f64, range_mm: f64) -> Nanos {
         let rate = f64::from(self.settings.model.points_per_second());
         let mut worst = 0;
@@ -270,8 +270,8 @@ fn other_line_faults_cost_no_intact_packet() {
         bench.run(8 * ONE_SECOND);
         bench.check_packets();
         let worst = bench.check_revolutions(0, 0.05, 2.0);
-        // Here, the bytes of a flood arrive at once, which no real line can do. Bytes before them look as early as the
-        // last read.
+        // In this simulation, the bytes of a flood arrive at once, which is impossible on a real line. Bytes before
+        // them seem to have arrived at the time of the last read.
         let early = if faults.contains("every") { 5 * MILLIS } else { 0 };
         assert!(worst < 5 * MILLIS + early, "{faults}: {worst}");
         let stats = bench.session.stats();
@@ -324,7 +324,7 @@ fn every_brown_out_is_a_restart() {
                 bench.run(bench.now + 30 * MILLIS);
             }
             bench.brown_out();
-            // Odd times, so that the clock, which wraps after 30 s, has another value each time.
+            // The times are odd, so that the clock has a different value each time. It wraps after 30 s.
             bench.run(bench.now + 2 * ONE_SECOND + restarts * 417 * MILLIS);
             assert_eq!(bench.session.stats().restarts, restarts, "{model:?}");
             assert_eq!(
@@ -388,7 +388,7 @@ fn points_stay_accurate_when_the_speed_changes() {
     let periods: Vec<_> = revolutions.windows(2).map(|pair| pair[1].first - pair[0].first).collect();
     let (shortest, longest) = (periods.iter().min().unwrap(), periods.iter().max().unwrap());
     assert!(*shortest < 87 * MILLIS && *longest > 155 * MILLIS, "{shortest} {longest}");
-    // The true points are available since the last change of speed.
+    // The true points are only available since the last change of speed.
     let after = revolutions.into_iter().filter(|revolution| revolution.first > 8_100 * MILLIS);
     bench.revolutions = after.collect();
     assert!(bench.revolutions.len() > 18, "{}", bench.revolutions.len());
@@ -438,7 +438,7 @@ fn new_bench(settings: LdSettings, seed: u64) -> Bench {
     bench
 }
 
-/// Returns the numbers of beams of the revolutions in order, without repetitions.
+/// Returns the numbers of beams of the revolutions in order. Consecutive equal numbers occur once.
 fn beam_counts(bench: &Bench) -> Vec<usize> {
     let mut numbers: Vec<usize> = bench.revolutions.iter().map(|revolution| revolution.beams).collect();
     numbers.dedup();

@@ -1,6 +1,6 @@
 //! Tests of the simulated scanners in virtual time. They are one binary with a module for each subject, so that their
-//! common dependencies are linked only once. The tests on ptys are in `tests/port`, because they must not wait for
-//! processors that these tests use.
+//! common dependencies are linked only once. The tests on ptys are in `tests/port`, because they must not compete with
+//! these tests for processors.
 
 mod faults;
 mod head;

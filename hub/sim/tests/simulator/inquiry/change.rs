@@ -1,5 +1,5 @@
-//! Tests of changes of permanent settings with the user's consent: the host writes them once and reads them back, and
-//! the stream resumes. If something fails, the outcome states what is known.
+//! Tests of changes of permanent settings with the user's consent. The host writes the settings once and reads them
+//! back, and the stream resumes. If a step fails, the outcome states what is known.
 
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::command::Password;
@@ -14,7 +14,8 @@ use scanhub_sim::operating::OperatingMode;
 
 use super::{Bench, machine, make_stream, sensor};
 
-/// Requests the scanner's identity. Returns a plan that changes nothing, and the time at which it was complete.
+/// Requests the scanner's identity. Returns a plan that changes nothing, the scanner, and the time at which the plan
+/// was complete.
 pub(crate) fn probe_and_plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {
     let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
@@ -151,8 +152,8 @@ fn a_reply_that_was_lost_costs_no_second_write() {
     let mut received = 0;
     bench.to_host = Box::new(move |bytes| {
         received += bytes.len();
-        // The bytes before are an ACK and F4h of 42 bytes, and an ACK and A0h of 9 bytes. The lost bytes are an ACK and
-        // F7h of 43 bytes.
+        // The bytes before the loss are an ACK and F4h of 42 bytes, and an ACK and A0h of 9 bytes. The lost bytes are
+        // an ACK and F7h of 43 bytes.
         if received > 53 && received <= 53 + 44 { Vec::new() } else { bytes }
     });
     bench.finish(120_000 * MILLIS);
@@ -219,7 +220,7 @@ fn bad_habits_and_lossy_lines_never_lie() {
     assert!(done >= 45, "{done} of 60");
 }
 
-/// Loses the first `count` requests to stop on their way.
+/// Returns a filter that loses the first `count` requests to stop on the line.
 fn losing_stops(mut count: usize) -> Box<dyn FnMut(Vec<u8>) -> Vec<u8>> {
     let mut last = [0; 6];
     Box::new(move |bytes| {
@@ -254,8 +255,8 @@ fn leaves_installation_mode_although_stops_are_lost() {
 
 #[test]
 fn a_stray_nak_is_not_believed_where_it_does_harm() {
-    // The change fails before the first reply, and while the scanner writes: after an ACK and F4h of 42 bytes, and an
-    // ACK and A0h of 9 bytes.
+    // In the first case, the change fails before the first reply. In the second case, it fails while the scanner
+    // writes: after an ACK and F4h of 42 bytes, and an ACK and A0h of 9 bytes.
     for after in [0, 53] {
         let (mut plan, mut machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
         set_other_values(&mut plan);

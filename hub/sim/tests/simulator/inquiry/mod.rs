@@ -1,6 +1,6 @@
-//! Tests of requests for the identity of a simulated scanner, in virtual time. A scanner that replies is found at any
-//! rate and in any mode, and left in the same state. The line may lose bytes, and the scanner may overlook requests or
-//! be missing.
+//! Tests of requests for the identity of a simulated scanner, in virtual time. The inquiry finds a scanner that replies
+//! at any rate and in any mode, and leaves it in the same state. The line may lose bytes. The scanner may overlook
+//! requests or be missing.
 
 mod change;
 mod random;
@@ -70,7 +70,7 @@ pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
 }
 
 impl<C: Protocol> Bench<C> {
-    /// Creates a bench that starts at `now` of the machine's time, at a port with the rate `port`.
+    /// Creates a bench at a port with the rate `port`. The bench starts at the time `now` of the machine's clock.
     pub(crate) fn new(protocol: C, port: Baud, machine: LmsSimulator, now: Nanos) -> Self {
         Bench {
             protocol,
@@ -193,7 +193,7 @@ impl<C: Protocol> Bench<C> {
     }
 }
 
-/// Time from an event to a running host.
+/// Time from an event until the host runs.
 const WAKE_DELAY: Nanos = 50 * MICROS;
 
 /// Returns the request 20h 00h with the factory password.
@@ -362,7 +362,7 @@ fn repeats_an_overlooked_request() {
         let mut machine = sensor(baud);
         let now = make_stream(&mut machine);
         let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
-        // The loss of its first byte makes a request invalid.
+        // A request without its first byte is invalid.
         let mut random = fastrand::Rng::with_seed(seed);
         bench.to_scanner =
             Box::new(move |bytes| if bytes[0] == 0x02 && random.f64() < 0.3 { Vec::new() } else { bytes });

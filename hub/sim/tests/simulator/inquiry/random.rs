@@ -1,5 +1,6 @@
-//! Tests of inquiries and changes with random bytes, random sequences of events and the fault table. They do not panic,
-//! they end, and their results are true. A change writes no more often than permitted, and reports every write.
+//! Tests of inquiries and changes with random bytes, random sequences of events and the fault table. Inquiries and
+//! changes do not panic, they end, and their results are true. A change writes no more often than permitted, and
+//! reports every write.
 
 use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::Inquiry;
@@ -149,7 +150,8 @@ fn writes_the_plan_and_leaves_installation_mode() {
     assert!((1..=3).contains(&maximum), "{maximum} writes");
 }
 
-/// Faults, each with the minimum numbers of 8 inquiries and of 8 changes that must succeed despite them.
+/// Faults. Each has the minimum number of 8 inquiries and the minimum number of 8 changes that must succeed despite the
+/// fault.
 const SCENES: &[(&str, [usize; 2])] = &[
     ("loss=0.001,burst=3", [7, 7]),
     ("flip=0.001", [7, 7]),
@@ -172,7 +174,7 @@ const SCENES: &[(&str, [usize; 2])] = &[
     ("overlook=0.2,nak=0.1", [7, 7]),
 ];
 
-/// Returns a scanner for `seed`, idle or streaming, with its rate and the time.
+/// Returns a scanner for `seed`, idle or streaming, together with its rate and the time.
 fn any_scanner(seed: u64) -> (Baud, LmsSimulator, u64, bool) {
     let baud = Baud::ALL[seed as usize % 4];
     let mut machine = sensor(baud);
@@ -257,5 +259,5 @@ fn change_outcome_is_right_despite_faults() {
     }
 }
 
-/// Number of seeds: each rate, idle and streaming.
+/// Number of seeds. There is one for each rate, idle and streaming.
 const SEED_COUNT: u64 = 8;

@@ -216,7 +216,7 @@ fn request_aborts_the_scan_then_a_full_one_is_sent() {
 fn request_between_bursts_also_aborts_the_scan() {
     let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
-    // 508 bytes have been sent, and the others wait for the mirror.
+    // The line has transmitted 508 bytes. The other bytes wait for the mirror.
     let next = bench.sent().last().unwrap().0 + 2 * MIRROR_PERIOD - 17_800 * MICROS;
     bench.run_until(next + 11 * MILLIS);
     let sent_before = bench.sent().len();
@@ -311,8 +311,8 @@ fn recording_is_sent_once_despite_host_requests() {
 }
 
 proptest! {
-    /// Without faults, everything that the scanner sends is intact, byte for byte, with any settings and however late
-    /// it is polled.
+    /// Without faults, everything that the scanner sends is intact, byte for byte. This is true for any settings, even
+    /// if the scanner is polled late.
     #[test]
     fn everything_sent_is_intact(
         seed in any::<u64>(),
@@ -357,7 +357,7 @@ proptest! {
     }
 }
 
-/// A telegram with the bytes that arrived for it, and its fault.
+/// A telegram, the bytes that arrived for it, and its fault.
 struct TransmittedTelegram {
     telegram: Vec<u8>,
     arrived: Vec<u8>,

@@ -1,5 +1,5 @@
-//! Tests of the states of a simulated LMS: operating modes that a previous host selected, power cycles and resets, and
-//! quirks.
+//! Tests of the states of a simulated LMS. The states are operating modes that a previous host selected, power cycles
+//! and resets, and quirks.
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Password;
@@ -30,7 +30,7 @@ fn streamed_telegrams(operating: OperatingMode, settings: Settings) -> Vec<(Nano
     sent.into_iter().map(|(at, sent)| (at, sent.telegram)).collect()
 }
 
-/// Checks that all `telegrams` have this length, this command, and this interval in mirror revolutions.
+/// Checks that all `telegrams` have this length, this command, and this interval in revolutions of the mirror.
 fn assert_stream(telegrams: &[(Nanos, Vec<u8>)], command: u8, len: usize, mirror_turns: u64) {
     assert!(telegrams.len() > 3, "{}", telegrams.len());
     for pair in telegrams.windows(2) {
@@ -264,7 +264,7 @@ fn bench_with_quirks(quirks: ProtocolQuirks) -> Bench {
     Bench::new(Settings { quirks, ..fast_settings() })
 }
 
-/// Returns the number of 200 type requests whose reply starts with this byte.
+/// Returns the number of type requests, out of 200, whose reply starts with the byte `first`.
 fn replies_of_200(quirks: ProtocolQuirks, first: Option<u8>) -> usize {
     let mut bench = bench_with_quirks(quirks);
     let request = Request::Type.encode(0);
@@ -381,7 +381,8 @@ fn installation_mode_blocks_measuring_if_strict() {
     }
 }
 
-/// Returns the number of 100 requests that get a reply, each written at once or with 55 us between its bytes.
+/// Returns the number of requests, out of 100, that get a reply. Each request is written at once or with 55 us between
+/// its bytes.
 fn unspaced_replies_of_100(bench: &mut Bench) -> usize {
     let request = Request::Stop.encode(0);
     let mut count = 0;
