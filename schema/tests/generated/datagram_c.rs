@@ -135,7 +135,7 @@ fn arrays<'a>(description: &'a Description, layout: &'a Layout) -> Vec<Array<'a>
     fields.chain(tail).collect()
 }
 
-/// Returns the name of a field with a number of elements. It must differ from the name of the array.
+/// Returns the name of a field that contains a number of elements. The name must differ from the array's name.
 fn count_name(layout: &Layout, name: &str) -> String {
     let is_count = rules::counts(layout).iter().any(|(count, _)| *count == name);
     if is_count && name != "count" {

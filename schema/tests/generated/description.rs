@@ -90,7 +90,7 @@ const NUMBER_TYPES: [(&str, usize); 10] = [
 const VALUES_MARK: char = '\u{1}';
 
 impl Field {
-    /// Returns the comment, with `values` as the text for the values that the field can have.
+    /// Returns the comment. `values` replaces the mark for the values that the field can have.
     pub(crate) fn doc(&self, values: &str) -> String {
         self.doc.replace(VALUES_MARK, values)
     }
@@ -432,7 +432,7 @@ fn doc_of(attrs: &[Attribute]) -> String {
     lines.join(" ")
 }
 
-/// Returns the number that an expression is, if it is simple.
+/// Returns the value of an expression if the expression is a simple number.
 fn number(value: &Expr) -> Option<u64> {
     match value {
         Expr::Lit(literal) => match &literal.lit {

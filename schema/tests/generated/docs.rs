@@ -9,8 +9,7 @@ use scanhub_schema::{PublisherKind, Topic};
 use super::description::{Description, Field, Kind, Layout, Value, first_sentence, lower_first};
 use super::rules::{self, ArrayRule};
 
-/// Maximum number of values that are listed with their meanings. If a field has more values, only their names are
-/// listed.
+/// Maximum number of listed values. If a field has more values, only their names are listed.
 const MAX_VALUES: usize = 10;
 const TABLE_HEAD: &str = "| offset | type | field |\n|---|---|---|\n";
 

@@ -52,7 +52,7 @@ const COORDINATE_NAMES: [(&str, &str); 3] = [
     ("z_m", "meters above the floor"),
 ];
 
-/// Values that are computed from other values and replace flags: layout, name and comment.
+/// Values that readers calculate from other values instead of flags: layout, name and comment.
 pub(crate) const COMPUTED_FIELDS: [(&str, &str, &str); 1] =
     [("Motion", "valid", "Whether the summed pose is known, and none of its steps was degenerate.")];
 
@@ -218,13 +218,13 @@ pub(crate) fn names_of(set: &str) -> String {
 /// generated.
 pub(crate) const VARIABLE_PAYLOADS: [&str; 2] = ["Scan", "Foreground"];
 
-/// Returns another field and its value with which the given field is unknown.
+/// Returns a field and one of its values. If this field has this value, `field` is unknown.
 pub(crate) fn unknown_if(layout: &Layout, field: &Field) -> Option<(&'static str, u64)> {
     let is_nearest = layout.name == "Zones" && field.name.starts_with("nearest_");
     is_nearest.then_some(("nearest_beam", 0xFFFF))
 }
 
-/// Returns another field and its value without which the given text is empty.
+/// Returns a field and one of its values. If this field has another value, the text `field` is empty.
 pub(crate) fn text_only_if(layout: &Layout, field: &Field) -> Option<(&'static str, u64)> {
     let is_door =
         layout.name == "Event" && ["door_text", "from_text", "to_text"].contains(&field.name.as_str());

@@ -1,7 +1,7 @@
 //! Tests of the search. It finds scanners of all models and states in time, and sends no byte that a scanner should not
-//! get. It finds a remembered scanner nearly as soon as a session of its family does, and a scanner that gets power
-//! late soon after it can reply. Bytes that no scanner sent never end a search, and no scanner accepts a request at
-//! another rate.
+//! receive. It finds a saved scanner nearly as soon as a session of the scanner's family. If a scanner gets power late,
+//! the search finds it soon after the scanner can reply. Bytes that no scanner sent never end a search. No scanner
+//! accepts a request at another rate.
 
 use scanhub_drivers::line::{Action, KnownRate, Protocol as _, ScannerSession as _};
 use scanhub_drivers::lms::variant::{Baud, Variant};
@@ -46,7 +46,7 @@ pub(super) fn scanners() -> Vec<(String, FoundScanner, CreateScanner)> {
     all
 }
 
-/// Finds each scanner with 20 seeds, and returns the times.
+/// Finds each scanner with 20 seeds, and returns the times until it was found.
 fn find_all(faults: &str, port: PortKind) -> Vec<Nanos> {
     let mut times = Vec::new();
     for (name, expected, create) in scanners() {
@@ -192,7 +192,7 @@ fn restricted_search_sends_only_its_familys_requests() {
     }
 }
 
-/// Compares the search with a session of the family, and returns by how much the search is slower in the worst case.
+/// Compares the search with a session of the family. Returns the maximum time by which the search is slower.
 fn max_extra_time(
     name: &str,
     memory: Memory,
@@ -314,8 +314,8 @@ fn finds_another_scanner_than_the_remembered_one() {
 
 const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
-/// Returns the longest time from when scanners can reply until they are found. `create` creates the scanners. They get
-/// power `after` this time from the open, and then boot for `boot`.
+/// Returns the longest time from when scanners can reply until the search finds them. `create` creates the scanners.
+/// They get power `after` the port was opened, and then boot for `boot`.
 fn worst_find_time(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -> Box<dyn Device>) -> Nanos {
     let times = (0..10).map(|seed| {
         let after = after + seed * 317 * MILLIS;
@@ -449,8 +449,8 @@ fn receivers() -> Vec<(String, bool, Box<dyn Device>)> {
     all
 }
 
-/// Returns the bytes that a scanner at `rate` receives of a request. The host sends the request at `sent_at`, `drift`
-/// percent off, with `gap` between its bytes.
+/// Returns the bytes of `request` that a scanner at `rate` receives. The host sends the request at `sent_at`, with an
+/// error of `drift` percent and with `gap` between the bytes.
 fn received_bytes(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f64) -> Vec<u8> {
     let rate_of_host = (f64::from(sent_at) * (1.0 + drift / 100.0)) as u32;
     let mut receiver = UartReceiver::new(rate_of_host, rate);

@@ -21,7 +21,7 @@ use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
 use scanhub_sim::{Arrival, machine};
 
-/// Host at the end of the line: a search, or a session to compare it with.
+/// Host at the end of the line: a search, or a session that the search is compared with.
 pub(crate) trait Host {
     type Result;
 
@@ -78,7 +78,7 @@ impl Host for Search {
     }
 }
 
-/// A session of a named family, until something of the scanner arrives.
+/// A session of a named family. It ends when anything from the scanner arrives.
 pub(crate) struct NamedFamily<S>(pub(crate) S);
 
 impl<S: line::ScannerSession> Host for NamedFamily<S> {
@@ -114,12 +114,12 @@ pub(crate) struct Bench<H = Search> {
     last_sent_at: Nanos,
     is_flushed: bool,
     inbox: VecDeque<u8>,
-    /// Random bytes that arrive in addition: the time of the next one, and the mean time between them.
+    /// Additional random bytes: the time of the next one, and the mean time between them.
     noise: Option<(Nanos, Nanos)>,
     random: fastrand::Rng,
     /// Bytes that the search has sent, with their times and rates.
     pub(crate) written: Vec<(Nanos, u32, u8)>,
-    /// Bytes that the host has read at the present rate, with their times.
+    /// Bytes that the host has read at the current rate, with their times.
     pub(crate) read: Vec<(Nanos, Vec<u8>)>,
     /// Rates that the search has set, with their times.
     pub(crate) rates: Vec<(Nanos, u32)>,
@@ -244,7 +244,7 @@ impl<H: Host> Bench<H> {
         }
     }
 
-    /// Switches the scanner on `after` this time from the open.
+    /// Switches the scanner on when this time has passed since the port was opened.
     pub(crate) fn powered_after(mut self, after: Nanos) -> Self {
         (self.power_at, self.is_powered) = (self.now + after, false);
         self

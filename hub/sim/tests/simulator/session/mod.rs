@@ -24,12 +24,12 @@ use scanhub_sim::operating::ScanSource;
 use scanhub_sim::room::Room;
 use scanhub_sim::{Arrival, machine};
 
-/// Change of a chunk from scanner to host that has left the line at this time.
+/// Changes a chunk from scanner to host that has left the line at the given time.
 pub(crate) type HostFilter = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
-/// Change of the byte with this number from host to scanner. `None` loses it.
+/// Changes the byte with the given index from host to scanner. If it returns `None`, the byte is lost.
 pub(crate) type SensorFilter = Box<dyn FnMut(usize, u8) -> Option<u8>>;
 
-/// Both ends, the line, and everything that went over it.
+/// Both ends, the line, and everything that the line transmitted.
 pub(crate) struct Bench {
     pub(crate) session: LmsSession,
     pub(crate) machine: LmsSimulator,

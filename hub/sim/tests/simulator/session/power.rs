@@ -19,7 +19,7 @@ use super::{Bench, SESSION_SETTINGS, make_stream, sensor, sensor_with};
 /// Time after the boot message within which a session must stream.
 const STREAM_TIMEOUT: Nanos = 5_000 * MILLIS;
 
-/// Limit if the session first waits for a change of mode that the restarted scanner has forgotten, and then
+/// Maximum time if the session first waits for a change of mode that the restarted scanner has dropped, and then
 /// searches for the rate.
 const SEARCH_TIMEOUT: Nanos = 6_000 * MILLIS;
 

@@ -136,8 +136,8 @@ fn last_rate_is_tried_first_but_not_assumed() {
     }
 }
 
-/// The scanner does not reply to a request for its type, where others refuse it. The session therefore requests the
-/// status at every rate, too.
+/// The scanner does not reply to a request for its type, although other scanners refuse this request. The session
+/// therefore also requests the status at every rate.
 #[test]
 fn finds_scanner_by_status_if_type_is_unanswered() {
     for baud in Baud::ALL {
@@ -155,8 +155,8 @@ fn finds_scanner_by_status_if_type_is_unanswered() {
     }
 }
 
-/// The scanner does not accept a change of rate in its present mode, which the session has not requested yet. The
-/// session stops it first.
+/// The scanner does not accept a change of rate in its current mode, which the session has not requested yet. The
+/// session stops the scanner first.
 #[test]
 fn scanner_that_refuses_a_rate_is_stopped_first() {
     for baud in [Baud::B9600, Baud::B19200, Baud::B38400] {
