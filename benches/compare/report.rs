@@ -191,7 +191,7 @@ impl TargetCheck {
     }
 }
 
-/// Compares the wait of a topic with the bare futex, for messages that are no longer than those of the hub.
+/// Compares the wait of a topic with the futex baseline, for messages that are no longer than the hub's messages.
 fn check_waits(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     let maximum = match cell.case.mechanism {
         Mechanism::Doorbell => 1.2,

@@ -149,7 +149,7 @@ fn element_name(element: &Layout) -> String {
     if element.name == "CloudPoint" { "point".to_owned() } else { snake(&element.name) }
 }
 
-/// Returns the fields of the head that the struct has, including the fields of structs in the head.
+/// Returns the head's fields that the struct has. They include the fields of structs in the head.
 fn shown_layouts<'a>(
     description: &'a Description,
     layout: &'a Layout,

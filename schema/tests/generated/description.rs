@@ -13,7 +13,7 @@ use syn::{Attribute, Expr, ImplItem, Item, Lit, Type};
 
 use super::rules;
 
-/// All layouts. The layout of a field or an element is before the layouts that contain it.
+/// All layouts. A layout of a field or an element comes before the layout that contains it.
 pub(crate) struct Description {
     pub(crate) layouts: Vec<Layout>,
     /// Layouts of the header of a datagram, and of an announcement with its topics.

@@ -74,7 +74,7 @@ fn arrays_of_numbers(description: &Description, layout: &Layout) -> Vec<&'static
     rules::packed_arrays_of(&layout.name).iter().filter(|_| !by_hand).filter(is_number).collect()
 }
 
-/// Returns the fields before the first array, including the fields of structs among them.
+/// Returns the fields before the first array. They include the fields of structs among them.
 fn shown_fields<'a>(description: &'a Description, layout: &'a Layout) -> Vec<ShownField<'a>> {
     let mut all = Vec::new();
     let counts = rules::counts(layout);
@@ -91,7 +91,7 @@ fn shown_fields<'a>(description: &'a Description, layout: &'a Layout) -> Vec<Sho
     all
 }
 
-/// Returns the part of a field's name that follows the name of the topic.
+/// Returns the part of a field's name after the topic's name.
 fn name<'a>(shown: &'a ShownField) -> &'a str {
     match shown.name.as_str() {
         "from_room" => "from",

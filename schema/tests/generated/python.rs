@@ -10,7 +10,7 @@ use super::{rules, topics_by_number, wrap};
 
 const MAX_LINE_WIDTH: usize = 120;
 
-/// Order of fields in the dataclasses, where it differs from the order in memory. Other fields follow.
+/// Order of fields in the dataclasses that have another order than the memory. Other fields follow.
 const PARAMETER_ORDER: [(&str, &[&str]); 6] = [
     (
         "Scan",

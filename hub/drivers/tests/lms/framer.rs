@@ -119,7 +119,7 @@ fn frame_ending_in_stx_waits_for_the_next_byte() {
 
 #[test]
 fn a_frame_with_a_header_inside_waits_for_it_to_fail() {
-    // The values of this scan look like a header, as those of a real room might.
+    // The values of this scan look like a header. A scan of a real room may have these values, too.
     let spelled = scan(|i| match i {
         200 => 0x8002,
         201 => 0x02D6,

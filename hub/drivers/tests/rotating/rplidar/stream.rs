@@ -467,7 +467,7 @@ const REPLY_DESCRIPTORS: [[u8; 7]; 12] = [
     [0xA5, 0x5A, 0xFF, 0xFF, 0xFF, 0xFF, 0x83],
 ];
 
-/// Returns a packet with random content and a right checksum. Its angle may continue that of the previous packet.
+/// Returns a packet with random content and a right checksum. Its angle may continue from the previous packet.
 fn random_packet(random: &mut fastrand::Rng, kind: PacketFormat, angle: &mut u16, jumps: u16) -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..kind.byte_len()).map(|_| random.u8(..)).collect();
     *angle = if random.u16(..jumps) == 0 { random.u16(..) } else { (*angle % 23_040 + 1_152) % 23_040 };

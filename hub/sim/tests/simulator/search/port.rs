@@ -59,7 +59,7 @@ impl Host for AutoHost {
 }
 
 impl AutoHost {
-    /// Checks that every byte that was read is in the counters, including those of the status.
+    /// Checks that the counters, including the counters of the status, contain every byte that was read.
     fn check_counters(&self) {
         let stats = self.session.stats();
         let SessionStats { read, in_telegrams, acknowledge, discarded, buffered, .. } = stats;

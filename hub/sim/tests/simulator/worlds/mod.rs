@@ -238,7 +238,7 @@ fn the_page_shows_a_world_with_every_key() {
     let example =
         page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
     world(example);
-    // Shapes and paths that exclude those of the example are in comments.
+    // Shapes and paths that exclude the shapes and paths of the example are in comments.
     let shown = |key: &str| example.lines().any(|line| line.trim_start_matches("# ").starts_with(key));
     let failure = World::of_toml("w.toml", "[[thing]]\nx = 1").unwrap_err();
     let persons = World::of_toml("w.toml", "[[person]]\nx = 1").unwrap_err();
@@ -379,7 +379,7 @@ fn a_door_is_a_box_while_it_turns_and_since_it_rests() {
         since
     };
     assert!(since(10 * ONE_SECOND).is_empty());
-    // While the box moves, its time is that of the revolution of the mirror.
+    // While the box moves, its time is the time of the mirror's revolution.
     assert_eq!(since(14 * ONE_SECOND + ONE_SECOND / 2), [14 * ONE_SECOND + ONE_SECOND / 2 - 13_320_000]);
     assert_eq!(since(20 * ONE_SECOND), [15 * ONE_SECOND + ONE_SECOND / 2]);
     assert_eq!(since(50 * ONE_SECOND), [35 * ONE_SECOND + ONE_SECOND / 2]);
