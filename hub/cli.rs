@@ -10,6 +10,7 @@ mod simulate;
 
 use std::path::PathBuf;
 
+use clap::builder::StyledStr;
 use clap::error::ErrorKind;
 use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
@@ -39,7 +40,9 @@ pub(crate) struct Cli {
 impl Cli {
     /// Parses the command line of this process.
     pub(crate) fn of_process() -> Result<Cli, clap::Error> {
-        let mut command = Cli::command();
+        let command = Cli::command();
+        let template = help_template(&command);
+        let mut command = command.help_template(template);
         let matches = command.try_get_matches_from_mut(std::env::args_os()).map_err(with_new_name)?;
         refuse_hub(&mut command, &matches)?;
         refuse_json(&mut command, &matches)?;
@@ -93,24 +96,27 @@ pub(crate) struct GlobalOptions {
     pub(crate) json: bool,
 }
 
-/// Defines the enum of all verbs from the table below. A verb is run by its function `run`, which takes the
-/// [`Context`], or by the expression after the arrow.
+/// Defines the enum of all verbs, and the groups of the help, from the table below. A verb is run by its function `run`,
+/// which takes the [`Context`], or by the expression after the arrow.
 macro_rules! verbs {
-    ($($verb:ident($args:ty) $(=> |$name:ident, $context:ident| $run:expr)?,)*) => {
+    ($($group:literal { $($verb:ident($args:ty) $(=> |$name:ident, $context:ident| $run:expr)?,)* })*) => {
         /// Verb with its arguments.
         #[derive(Debug, Subcommand)]
         pub(crate) enum Verb {
-            $($verb($args),)*
+            $($($verb($args),)*)*
         }
 
         impl Verb {
             /// Runs the verb.
             pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
                 match self {
-                    $(Verb::$verb(args) => verbs!(@run args, context $(, $name, $context, $run)?),)*
+                    $($(Verb::$verb(args) => verbs!(@run args, context $(, $name, $context, $run)?),)*)*
                 }
             }
         }
+
+        /// Groups of the help in their order, each with the names of its variants of [`Verb`].
+        const GROUPS: &[(&str, &[&str])] = &[$(($group, &[$(stringify!($verb)),*])),*];
     };
     (@run $args:ident, $process:ident) => {
         $args.run($process)
@@ -121,44 +127,87 @@ macro_rules! verbs {
     }};
 }
 
-// The order is that of the help. Tools are run by expressions, because their crate does not depend on the crate of
-// `Context`.
+// The groups and their order are those of the help and of docs/verbs.md. Tools are run by expressions, because their
+// crate does not depend on the crate of `Context`.
 verbs! {
-    Run(run::Run),
-    Replay(replay::Replay),
-    Demo(demo::Demo),
-    Simulate(Box<simulate::Simulate>),
-    Probe(probe::ProbeArgs) => |probe, it|
-        probe.run(it.json, || it.domain.locations(), &mut it.out, &*it.signals.stop()?),
-    Configure(configure::ConfigureArgs) => |configure, it|
-        configure.run(it.json, &it.domain.locations()?, &mut it.out, &*it.signals.any_stop()?),
-    Config(config::Config),
-    Doctor(run::Doctor),
-    List(list::ListArgs),
-    Info(info::InfoArgs),
-    Echo(echo::EchoArgs),
-    Hz(hz::HzArgs),
-    Latency(latency::LatencyArgs),
-    Watch(viewer::WatchArgs),
-    Web(viewer::WebArgs) => |web, it| replay::page::run(web, it),
-    Record(record::RecordArgs),
-    Telegram(telegram::TelegramArgs) => |telegram, it| telegram.run(it.json, &mut it.out),
-    Control(control::ControlArgs),
-    Background(background::BackgroundArgs),
-    Zones(zones::ZonesArgs),
-    Track(perception::TrackArgs),
-    Tilt(perception::TiltArgs),
-    Site(perception::SiteArgs),
-    Leds(leds::LedsArgs),
-    Gateway(gateway::Gateway),
-    Listen(network::ListenArgs),
-    Bridge(bridge::Bridge),
-    Key(network::KeyArgs),
-    Convert(convert::Convert),
-    Completions(generated::Completions),
-    Complete(generated::Complete),
-    Man(generated::Man),
+    "Run" {
+        Run(run::Run),
+        Demo(demo::Demo),
+        Simulate(Box<simulate::Simulate>),
+        Control(control::ControlArgs),
+    }
+    "Look" {
+        List(list::ListArgs),
+        Info(info::InfoArgs),
+        Watch(viewer::WatchArgs),
+        Web(viewer::WebArgs) => |web, it| replay::page::run(web, it),
+        Echo(echo::EchoArgs),
+        Hz(hz::HzArgs),
+        Latency(latency::LatencyArgs),
+        Leds(leds::LedsArgs),
+        Track(perception::TrackArgs),
+        Tilt(perception::TiltArgs),
+    }
+    "Record and replay" {
+        Record(record::RecordArgs),
+        Replay(replay::Replay),
+        Convert(convert::Convert),
+        Telegram(telegram::TelegramArgs) => |telegram, it| telegram.run(it.json, &mut it.out),
+    }
+    "Share" {
+        Gateway(gateway::Gateway),
+        Listen(network::ListenArgs),
+        Bridge(bridge::Bridge),
+        Key(network::KeyArgs),
+    }
+    "Set up" {
+        Probe(probe::ProbeArgs) => |probe, it|
+            probe.run(it.json, || it.domain.locations(), &mut it.out, &*it.signals.stop()?),
+        Doctor(run::Doctor),
+        Configure(configure::ConfigureArgs) => |configure, it|
+            configure.run(it.json, &it.domain.locations()?, &mut it.out, &*it.signals.any_stop()?),
+        Config(config::Config),
+        Zones(zones::ZonesArgs),
+        Background(background::BackgroundArgs),
+        Site(perception::SiteArgs),
+        Completions(generated::Completions),
+        Complete(generated::Complete),
+        Man(generated::Man),
+    }
 }
+
+/// Returns the template of the program's help. clap has no headings for verbs, so the template contains their rows.
+fn help_template(command: &Command) -> StyledStr {
+    let styles = command.get_styles();
+    let (header, literal) = (styles.get_header(), styles.get_literal());
+    let mut rows = String::new();
+    for (group, verbs) in GROUPS {
+        rows += &format!("{header}{group}:{header:#}\n");
+        for verb in verbs.iter().filter_map(|variant| command.find_subcommand(variant.to_lowercase())) {
+            if verb.is_hide_set() {
+                continue;
+            }
+            let (name, about) = (verb.get_name(), verb.get_about().cloned().unwrap_or_default());
+            rows += &format!("  {literal}{name:11}{literal:#}  {}\n", about.ansi());
+        }
+    }
+    let start = START.map(|(line, meaning)| format!("  {literal}{line:37}{literal:#}  {meaning}\n")).concat();
+    StyledStr::from(format!(
+        "{{about-with-newline}}\n\
+         {header}Start here:{header:#}\n{start}\n\
+         {{usage-heading}} {{usage}}\n\n\
+         {header}Commands:{header:#}\n{rows}\n\
+         {header}Options:{header:#}\n{{options}}\n\n\
+         `scanhub COMMAND --help` shows the options of a command and examples.\n"
+    ))
+}
+
+/// First commands of a new user, each with its effect.
+const START: [(&str, &str); 3] = [
+    ("scanhub demo", "Show simulated scanners in this terminal; no hardware is needed"),
+    ("scanhub probe /dev/ttyUSB0", "Identify the scanner at a port"),
+    ("scanhub run --link front=/dev/ttyUSB0", "Run the hub for it. In another terminal: scanhub watch"),
+];
 
 /// Parses the name of a family.
 pub(crate) fn family(text: &str) -> Result<Family, String> {
@@ -220,6 +269,51 @@ mod tests {
             }
         }
         command.debug_assert();
+    }
+
+    #[test]
+    fn every_verb_is_in_one_group_of_help_and_page() {
+        let command = Cli::command();
+        let visible: Vec<_> = command.get_subcommands().filter(|verb| !verb.is_hide_set()).collect();
+        let help = command.clone().help_template(help_template(&command)).render_help().to_string();
+        let page = include_str!("../docs/verbs.md");
+        let mut groups = Vec::new();
+        let rows =
+            help.lines().skip_while(|row| *row != "Commands:").skip(1).take_while(|row| !row.is_empty());
+        for row in rows {
+            match row.strip_prefix("  ") {
+                Some(verb) => {
+                    let (_, verbs): &mut (&str, Vec<&str>) = groups.last_mut().expect("a group");
+                    verbs.extend(verb.split_whitespace().next());
+                }
+                None => groups.push((row.trim_end_matches(':'), Vec::new())),
+            }
+        }
+        assert_eq!(groups.iter().map(|(group, _)| *group).collect::<Vec<_>>(), GROUP_TITLES);
+        for verb in visible {
+            let is_in = |(_, verbs): &&(&str, Vec<&str>)| verbs.contains(&verb.get_name());
+            assert_eq!(groups.iter().filter(is_in).count(), 1, "{}", verb.get_name());
+        }
+        assert_eq!(groups_of_page(page), groups, "docs/verbs.md");
+    }
+
+    const GROUP_TITLES: [&str; 5] = ["Run", "Look", "Record and replay", "Share", "Set up"];
+
+    /// Returns the groups of `page` with their verbs, in the order of their rows.
+    fn groups_of_page(page: &str) -> Vec<(&str, Vec<&str>)> {
+        let sections =
+            page.split("\n## ").skip(1).map(|section| section.split_once('\n').unwrap_or_default());
+        sections
+            .filter(|(title, _)| GROUP_TITLES.contains(title))
+            .map(|(title, rows)| {
+                let cells = rows.lines().filter_map(|row| row.strip_prefix("| `")?.split(" |").next());
+                let names =
+                    cells.flat_map(|cell| cell.split(", `")).filter_map(|cell| cell.split(['`', ' ']).next());
+                let mut names: Vec<_> = names.collect();
+                names.dedup();
+                (title, names)
+            })
+            .collect()
     }
 
     #[test]
