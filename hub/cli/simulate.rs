@@ -4,7 +4,7 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use clap::Args;
+use clap::{Arg, ArgAction, Args};
 use scanhub_schema::Failure;
 use scanhub_sim::fault::Faults;
 use scanhub_sim::options::{self, SimulateOptions};
@@ -16,107 +16,108 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use crate::mounts::SimulatedMounts;
 use crate::{no_handler, print_status, to_json_line};
 
-/// Simulate sensors at the other end of ptys, or behind TCP
+/// Simulate scanners on virtual serial ports (ptys) or TCP ports
 #[derive(Args, Debug)]
 #[command(group = clap::ArgGroup::new("place").args(["port", "tcp"]).required(true).multiple(true))]
-#[command(after_help = after_help())]
+#[command(disable_help_flag = true, arg = help_flag(), arg = help_faults_flag())]
+#[command(after_help = EXAMPLES, after_long_help = after_long_help())]
 pub(crate) struct Simulate {
-    /// Where to create each sensor's pty, as a symlink
+    /// Create a pty for a scanner, and a symlink to it at this path. Can be repeated
     #[arg(long, value_name = "PATH")]
     port: Vec<PathBuf>,
     /// Offer the scanner on this TCP address, like a serial server. Port 0: any free port, shown in the line `ready`. The hub
-    /// opens it as tcp:HOST:PORT. These scanners come after those of --port
+    /// opens it as tcp:HOST:PORT. Scanners of --tcp are numbered after those of --port
     #[arg(long, value_name = "HOST:PORT")]
     tcp: Vec<String>,
-    /// Rate of the line: 9600, 19200, 38400 or 500000 [default: the permanent rate]
-    #[arg(long, value_name = "RATE")]
+    /// Baud rate of the line at the start: 9600, 19200, 38400 or 500000 [default: the permanent rate]
+    #[arg(long, hide_short_help = true, value_name = "RATE")]
     baud: Option<String>,
-    /// Rate at power-on, stored in the sensor by an earlier owner [default: 9600]
-    #[arg(long, value_name = "RATE")]
+    /// Baud rate after power-on, as stored in the EEPROM [default: 9600]
+    #[arg(long, hide_short_help = true, value_name = "RATE")]
     permanent_baud: Option<String>,
-    /// State in which an earlier host left the sensors: idle, streaming, partial, means, range, mean-range, fields,
-    /// reflectivity, installation; or starting, if power comes on now
-    #[arg(long, default_value = "idle", value_name = "STATE")]
+    /// State of the scanners at the start: idle, streaming, partial, means, range, mean-range, fields, reflectivity or
+    /// installation, as an earlier host left them; or starting, for a power-on
+    #[arg(long, hide_short_help = true, default_value = "idle", value_name = "STATE")]
     state: String,
     /// Time from power-on to the boot message
-    #[arg(long, default_value = "2s", value_name = "DURATION", value_parser = duration::parse)]
+    #[arg(long, hide_short_help = true, default_value = "2s", value_name = "DURATION", value_parser = duration::parse)]
     boot: Duration,
-    /// The sensors' own address, 0 to 127; they answer to 0 too
-    #[arg(long, default_value_t = 0, value_name = "NUMBER")]
+    /// Address of the scanners, 0 to 127. They also reply to requests to address 0
+    #[arg(long, hide_short_help = true, default_value_t = 0, value_name = "NUMBER")]
     address: u8,
-    /// What the sensors see: room, bare, fig8, standing, approach, door, corridor, glass, faint, sun, chair, strips,
-    /// crowd, demo, house, tilt, empty, wall640 or random; or a TOML file, see docs/worlds.md
+    /// Simulated surroundings: room, bare, fig8, standing, approach, door, corridor, glass, faint, sun, chair, strips,
+    /// crowd, demo, house, tilt, empty, wall640 or random; or a TOML file (docs/worlds.md)
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
-    /// Publish what the encoder of a sensor's mount says as NAME/tilt, in the domain of --domain: one name for each port, in
-    /// their order. Worlds with a mount are told in docs/worlds.md
+    /// Publish the angles of a tilting mount as NAME/tilt in the domain of --domain. Give one name for each port, in the same
+    /// order. docs/worlds.md lists the worlds with a mount
     #[arg(long, value_name = "NAME", conflicts_with = "replay")]
     pub(crate) angles: Vec<String>,
-    /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped. Family ld:
+    /// Send a recording instead of a simulated world: MCAP file, telegram stream or CARMEN log, plain or gzipped. Family ld:
     /// an MCAP file or raw bytes. Not available for rplidar
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
-    /// Sensor of the recording, if it has several: one for all ports, or one for each in their order
+    /// Sensor of the recording, if it has several: one for all ports, or one for each port, in the same order
     #[arg(long, value_name = "NAME")]
     sensor: Vec<String>,
-    /// Start the recording again at its end
+    /// Restart the recording at its end
     #[arg(long = "loop")]
     looped: bool,
-    /// How many times faster than the clock everything runs, the bit time too
+    /// Speed relative to real time. It also applies to the time of a bit on the line
     #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
     speed: f64,
     /// Seed of worlds, delays and faults
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Faults to inject, for example loss=0.00135,burst=1.89; see below
+    /// Inject faults, for example loss=0.00135,burst=1.89. --help-faults lists them
     #[arg(long, default_value = "", hide_default_value = true, value_name = "KEY=VALUE,..")]
     fault: String,
-    /// Write one JSON line with its hash to this file for each telegram that was sent. `-` is stdout
-    #[arg(long, value_name = "FILE")]
+    /// Write a JSON line for each sent telegram, with its hash, to this file. `-` is stdout
+    #[arg(long, hide_short_help = true, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Replace an existing file of --truth
-    #[arg(long, requires = "truth")]
+    /// Overwrite an existing file of --truth
+    #[arg(long, hide_short_help = true, requires = "truth")]
     force: bool,
-    /// Family of the sensors: lms (SICK LMS 2xx), ld (LDROBOT) or rplidar (Slamtec)
+    /// Family of the scanners: lms (SICK LMS 2xx), ld (LDROBOT) or rplidar (Slamtec)
     #[arg(long, default_value = options::DEFAULT_FAMILY, value_name = "FAMILY")]
     family: String,
-    /// Model, of family ld: ld06, ld19, stl19p, stl27l or ld14p [default: ld19]; of family rplidar: a1, a2m8, a2m12, a3, s1,
-    /// s2, s3 or c1 [default: a1]
+    /// Model. Family ld: ld06, ld19, stl19p, stl27l or ld14p [default: ld19]. Family rplidar: a1, a2m8, a2m12, a3, s1, s2, s3
+    /// or c1 [default: a1]
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
-    /// Type of the sensors of family lms, which also limits what they support: lms200, lms211, lms221 or lms291
+    /// Type of the scanners, for family lms. It limits what they support: lms200, lms211, lms221 or lms291
     #[arg(long = "type", default_value = options::DEFAULT_TYPE, value_name = "TYPE")]
     scanner_type: String,
-    /// Angle and resolution [default: the recording's, else 180/0.5, or 100/0.5 of an lms211]
+    /// Angle and resolution, for family lms [default: that of the recording, or 180/0.5; lms211: 100/0.5]
     #[arg(long, value_name = "DEGREES/STEP")]
     variant: Option<String>,
-    /// Unit: mm, cm or dm [default: the recording's, else mm of an lms200, cm of others]
+    /// Unit, for family lms: mm, cm or dm [default: that of the recording, or cm; lms200: mm]
     #[arg(long)]
     unit: Option<String>,
-    /// Measuring mode, of family lms a byte [default: the recording's, else 0x01]; of family rplidar the name of the mode that
-    /// it recommends, such as Boost [default: the model's]
+    /// Measuring mode. Family lms: a byte [default: that of the recording, or 0x01]. Family rplidar: name of the scan mode that
+    /// the scanner recommends, such as Boost [default: that of the model]
     #[arg(long, value_name = "MODE")]
     mode: Option<String>,
-    /// End measured values with scan and telegram index
-    #[arg(long)]
+    /// Add the scan index and the telegram index after the measured values
+    #[arg(long, hide_short_help = true)]
     indices: bool,
     /// Report a configuration of 32 bytes, as older firmware does
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     short_configuration: bool,
-    /// Status byte that ends each reply: 0x10 healthy, 0x11 news, 0x12 warning, 0x13 error
-    #[arg(long, default_value = "0x10", value_name = "BYTE")]
+    /// Status byte at the end of each reply: 0x10 healthy, 0x11 info, 0x12 warning, 0x13 error
+    #[arg(long, hide_short_help = true, default_value = "0x10", value_name = "BYTE")]
     status: String,
-    /// An error that the sensors report, such as 3:18, or 0x84:22 for a past one
-    #[arg(long, value_name = "TYPE:NUMBER")]
+    /// Error that the scanners report, such as 3:18, or 0x84:22 for a past error. Can be repeated
+    #[arg(long, hide_short_help = true, value_name = "TYPE:NUMBER")]
     error: Vec<String>,
-    /// Transparency of the front window in percent: a warning below 75, an error below 30
-    #[arg(long, default_value_t = 100, value_name = "PERCENT")]
+    /// Transparency of the front window in percent. The scanner reports a warning below 75, an error below 30
+    #[arg(long, hide_short_help = true, default_value_t = 100, value_name = "PERCENT")]
     pollution: u16,
-    /// Size of the pieces in which bytes arrive: uart (16 bytes) or usb (62)
-    #[arg(long, default_value = "uart", value_name = "KIND")]
+    /// Size of the pieces in which bytes arrive: uart (16 bytes) or usb (62 bytes)
+    #[arg(long, hide_short_help = true, default_value = "uart", value_name = "KIND")]
     chunk: String,
-    /// Let the sensors wait while the hub does not read. On a real line, bytes are lost then. For tests on a busy machine
-    #[arg(long)]
+    /// Lose no bytes while the hub does not read: the scanners wait. A real line loses them. For tests on a busy machine
+    #[arg(long, hide_short_help = true)]
     lossless: bool,
 }
 
@@ -201,9 +202,21 @@ Examples:
   scanhub simulate --port /tmp/front --replay robot.mcap --sensor front
   scanhub simulate --family rplidar --model a1 --tcp 127.0.0.1:0";
 
-/// Returns the examples and the table of faults, for the end of the help.
-fn after_help() -> String {
-    let rows = Faults::keys().map(|(key, meaning)| format!("  {key:13} {meaning}"));
+/// Returns the flag for the help without rare flags and faults.
+fn help_flag() -> Arg {
+    let flag = Arg::new("help").short('h').long("help").action(ArgAction::HelpShort);
+    flag.help("Print help").display_order(1000)
+}
+
+/// Returns the flag for the complete help. clap's long help has the flags that its short help hides.
+fn help_faults_flag() -> Arg {
+    let flag = Arg::new("help_faults").long("help-faults").action(ArgAction::HelpLong);
+    flag.help("Print help with rare flags and all faults").display_order(1001)
+}
+
+/// Returns the examples and the table of faults, for the end of the complete help.
+fn after_long_help() -> String {
+    let rows = Faults::keys().map(|(key, meaning)| format!("  {key:14} {meaning}"));
     format!("{EXAMPLES}\n\nFaults:\n{}", rows.collect::<Vec<_>>().join("\n"))
 }
 
@@ -220,5 +233,22 @@ mod tests {
         for name in scanhub_sim::world::World::names() {
             assert!(words.contains(&name), "{name} is not in: {help}");
         }
+    }
+    #[test]
+    fn rare_flags_and_faults_are_in_help_faults_only() {
+        let help = |flag| {
+            let command = Simulate::augment_args(clap::Command::new("simulate"));
+            let shown = command.try_get_matches_from(["simulate", flag]).expect_err("the help");
+            assert_eq!(shown.kind(), clap::error::ErrorKind::DisplayHelp, "{flag}");
+            shown.to_string()
+        };
+        let (usual, all) = (help("--help"), help("--help-faults"));
+        for rare in ["--permanent-baud", "--short-configuration", "--lossless", "brownout_every"] {
+            assert!(!usual.contains(rare) && all.contains(rare), "{rare}");
+        }
+        for flag in ["--port <", "--world <", "--fault <", "--help-faults"] {
+            assert!(usual.contains(flag) && all.contains(flag), "{flag}");
+        }
+        assert_eq!(help("-h"), usual);
     }
 }
