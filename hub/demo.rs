@@ -27,24 +27,24 @@ use delivery_stats::{DeliveryStats, Sensor, counted};
 use environment::{ChildEvent, DemoEnvironment};
 use participants::{Families, World};
 
-/// Run simulated sensors, the hub and a subscriber for each sensor in one terminal
+/// Run simulated scanners, a hub and subscribers in one terminal, with the live picture
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Demo {
-    /// Run without the live view: print a summary line per sensor at the end; exit 5 if a telegram was lost
+    /// Show no picture. At the end, print a line for each sensor, and exit with 5 if a telegram was lost
     #[arg(long)]
     headless: bool,
     /// Stop after this time, for example 10s [default: at Ctrl-C]
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
     run_for: Option<Duration>,
-    /// demo: two sensors on a robot. house: four sensors in two rooms, and people who are followed from room to room. tilt: a
+    /// Simulated surroundings. demo: two sensors on a robot. house: four sensors that track people through two rooms. tilt: a
     /// tilting scanner that finds obstacles in 3D
     #[arg(long, default_value = "demo", value_name = "WORLD", value_parser = worlds())]
     world: World,
     /// Seed of rooms and people
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Family of the sensors; mixed: one sensor of each family
+    /// Family of the scanners. mixed: one of each family
     #[arg(long, default_value = Family::ALL[0].name(), value_name = "FAMILY", value_parser = families())]
     family: Families,
 }

@@ -29,34 +29,34 @@ use crate::cli::run::{self, ConfigOptions};
 use crate::mounts::RecordedMounts;
 use progress_line::ProgressLine;
 
-/// Run a hub that plays a recording instead of sensors, with the keys of a player
+/// Run a hub that plays a recording instead of reading scanners
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct Replay {
-    /// Recording to play: MCAP file, telegram stream or CARMEN log, plain or gzipped
+    /// Recording to play: MCAP file, stream file or CARMEN log, plain or gzipped
     file: PathBuf,
-    /// Speed relative to the recording, 0.015625 to 64, or max: as fast as it can be read
+    /// Speed relative to the recording, 0.015625 to 64. max: as fast as possible
     #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = parse_rate)]
     rate: PlaybackRate,
-    /// Start again at the end, until Ctrl-C. Each pass discards what the hub has learned
+    /// Restart at the end, until Ctrl-C. Each restart discards what was learned
     #[arg(long = "loop", conflicts_with = "hold")]
     is_looped: bool,
-    /// Start publishing here, for example 90s. The hub only learns from the part before it
+    /// Start publishing at this time, for example 90s. The part before it is only used for learning
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     start: Option<Duration>,
-    /// Stop publishing here
+    /// Stop publishing at this time
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     end: Option<Duration>,
-    /// Wait before the first telegram, until a key or `scanhub control SENSOR resume`
+    /// Pause before the first telegram, until a key or `scanhub control SENSOR resume`
     #[arg(long)]
     paused: bool,
-    /// Stay at the end, without publishing, until Ctrl-C
+    /// Keep running at the end, without publishing, until Ctrl-C
     #[arg(long)]
     hold: bool,
-    /// Play only this sensor, and no mounts; for a stream or a log, the name that it gets [default: front]
+    /// Play only this sensor, and no mounts. For a stream file or a log: name of the sensor [default: front]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
-    /// Family of a telegram stream: lms, ld or rplidar [default: recognized by its bytes]
+    /// Family of the scanner in a stream file: lms, ld or rplidar [default: recognized by its bytes]
     #[arg(long, value_name = "NAME", value_parser = cli::family)]
     family: Option<Family>,
     #[command(flatten)]

@@ -10,12 +10,12 @@ use scanhub_schema::{Failure, Kind};
 use scanhub_tools::bridge_program::{PROGRAM, find, search_directories};
 use scanhub_verbs::context::Context;
 
-/// Carry topics to other machines and back over Zenoh, through a router or as one (program scanhub-bridge)
+/// Send and receive topics over Zenoh, through a router or as one (program scanhub-bridge)
 #[derive(Args, Debug)]
 #[command(disable_help_flag = true)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Bridge {
-    /// Arguments of scanhub-bridge, among them --help
+    /// Arguments of scanhub-bridge, such as --help
     #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGS")]
     arguments: Vec<OsString>,
 }

@@ -12,7 +12,7 @@ use super::gateway::Gateway;
 use super::run::Run;
 use crate::{print, to_json_line};
 
-/// Print a default configuration, check one, or show the values in effect and their origin
+/// Print a default configuration, check one, or show all values in effect
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Config {
@@ -28,10 +28,10 @@ Examples:
 
 #[derive(Debug, Subcommand)]
 enum ConfigCommand {
-    /// Print a configuration to start from, with all default values
+    /// Print a configuration with all default values, to start from
     #[command(after_help = "Example:\n  scanhub config default > scanhub.toml")]
     Default,
-    /// Check the configuration; if it has an error, show its position and exit with 78
+    /// Check the configuration. If it has an error, show where, and exit with 78
     #[command(after_help = "Example:\n  scanhub config check scanhub.toml")]
     Check {
         /// Check only this file
@@ -39,7 +39,7 @@ enum ConfigCommand {
         #[command(flatten)]
         run: Run,
     },
-    /// Show every value in effect and its origin
+    /// Show all values in effect, each with its origin
     #[command(after_help = SHOW_EXAMPLES)]
     Show {
         #[command(flatten)]

@@ -18,23 +18,23 @@ use crate::{print, print_error, to_json_line};
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct Convert {
-    /// Recording to read, damaged or not: MCAP file, telegram stream or CARMEN log, plain or gzipped
+    /// Recording to read, even a damaged one: MCAP file, stream file or CARMEN log, plain or gzipped
     #[arg(value_name = "IN")]
     input: PathBuf,
-    /// Output file; its ending selects the format: .mcap, .bin (telegram stream), .log (CARMEN) or .csv (a row per scan, or
-    /// per mark), the last three also with .gz; - is a telegram stream on stdout
+    /// Output file. Its ending selects the format: .mcap, .bin (stream file), .log (CARMEN) or .csv (a row per scan or mark).
+    /// All but .mcap can end with .gz. - is a stream on stdout
     #[arg(value_name = "OUT")]
     output: PathBuf,
-    /// Convert only this sensor; for a stream or a log, the name that it gets [default: front]
+    /// Convert only this sensor. For a stream file or a log: name of the sensor [default: front]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
-    /// Family of a telegram stream: lms, ld or rplidar [default: recognized by its bytes]
+    /// Family of the scanner in a stream file: lms, ld or rplidar [default: recognized by its bytes]
     #[arg(long, value_name = "NAME", value_parser = super::family)]
     family: Option<Family>,
     /// Write an MCAP file of ROS 2 messages only: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
     #[arg(long)]
     ros2: bool,
-    /// With --ros2: each scan also as sensor_msgs/msg/PointCloud2, for viewers that show no LaserScan (rerun)
+    /// With --ros2: also write each scan as sensor_msgs/msg/PointCloud2, for viewers without LaserScan (rerun)
     #[arg(long)]
     points: bool,
     /// With --ros2 or .csv: measuring mode of a recording that does not contain it, such as 0x01
@@ -43,10 +43,10 @@ pub(crate) struct Convert {
     /// With .csv: topic to write, SENSOR/scan or SENSOR/marks [default: the scans]
     #[arg(long, value_name = "SENSOR/TOPIC")]
     topic: Option<String>,
-    /// With .csv: ranges in meters
+    /// With .csv: write ranges in meters
     #[arg(long)]
     meters: bool,
-    /// With .csv: columns intensity_0 .. after the ranges
+    /// With .csv: add the columns intensity_0 .. after the ranges
     #[arg(long)]
     intensities: bool,
     /// Compression of an MCAP file: zstd, lz4 or none [default: zstd]
@@ -224,5 +224,5 @@ Examples:
   scanhub convert robot.mcap front.csv --sensor front --meters
   scanhub convert robot.mcap marks.csv --topic front/marks
 
-MCAP to MCAP copies everything and writes a new index: a cut or damaged file becomes a complete file with all
-messages that can be read. Damage is reported but is not a failure: the exit code is 0 if the output is complete.";
+MCAP to MCAP copies everything and writes a new index. A cut or damaged file becomes a complete file with all
+messages that can be read. The exit code is 0 even if the input was damaged, as long as the output is complete.";

@@ -9,7 +9,7 @@ use scanhub_verbs::duration;
 
 use super::run::ConfigOptions;
 
-/// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
+/// Send topics to other machines as UDP datagrams, to multicast groups or single hosts
 #[derive(Args, Debug, Default)]
 pub(crate) struct Gateway {
     #[command(flatten)]

@@ -18,8 +18,8 @@ use crate::{print_status, to_json_line};
 pub(crate) struct Run {
     #[command(flatten)]
     configured: ConfigOptions,
-    /// Add a link with default settings; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max], and keys of the link may follow
-    /// it, as in front=/dev/ttyUSB0,family=ld
+    /// Add a link with default settings. PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max]. Keys of the link can follow,
+    /// for example front=/dev/ttyUSB0,family=ld
     #[arg(long, value_name = "NAME=PORT[,KEY=VALUE]")]
     link: Vec<String>,
 }
@@ -47,7 +47,7 @@ impl Run {
 /// Options that name the sources of a configuration, apart from links.
 #[derive(Args, Debug, Default)]
 pub(crate) struct ConfigOptions {
-    /// Read this TOML file after those in /etc/scanhub
+    /// Read this TOML file, after those in /etc/scanhub
     #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
     config: Option<PathBuf>,
     /// Do not read /etc/scanhub

@@ -32,7 +32,7 @@ use interface_monitor::InterfaceMonitor;
 use network::{Groups, Network};
 use udp_destination::{DestinationEvent, UdpDestination};
 
-/// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
+/// Send topics to other machines as UDP datagrams, to multicast groups or single hosts
 #[derive(Args, Clone, Debug, Default)]
 #[command(after_help = after_help())]
 pub struct GatewayArgs {

@@ -17,7 +17,7 @@ use serde_json::json;
 use crate::lan::Key;
 use scanhub_verbs::context::Context;
 
-/// Make the key that gateways and listeners share
+/// Create the key that gateways and listeners share
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  scanhub key new lan.key")]
 pub struct KeyArgs {

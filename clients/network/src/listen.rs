@@ -32,7 +32,7 @@ use self::multicast_receiver::{MAX_DATAGRAM_LEN, MulticastReceiver};
 use crate::key_file;
 use crate::remote_receiver::{ClassNames, Origin, ReceiverConfig, RemoteReceiver};
 
-/// Receive what gateways of other machines send, and show what was lost
+/// Receive topics from gateways of other machines, and show what was lost
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct ListenArgs {

@@ -27,7 +27,7 @@ use crate::output::{ExitReason, Output, table, verb_result};
 use crate::receive_stats::ReceiveStats;
 use crate::{duration, json, text};
 
-/// Measure the age of samples on arrival, split into line, hub and wake-up: percentiles
+/// Measure the age of samples on arrival, as percentiles of line, hub and wake-up
 #[derive(Args, Clone, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct LatencyArgs {

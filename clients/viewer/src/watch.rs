@@ -27,7 +27,7 @@ use crate::scene::Scene;
 use terminal::{Input, Key, Terminal};
 use view::{View, ViewCommand};
 
-/// Show the live picture in the terminal: what the sensors see, marks, zones and the verdict
+/// Show the live picture in the terminal: scans, marks, zones and the verdict
 #[derive(Args, Clone, Debug, Default)]
 #[command(after_help = AFTER_HELP)]
 pub struct WatchArgs {

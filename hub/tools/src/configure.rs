@@ -30,7 +30,7 @@ use crate::driver::{Procedure, run_protocol};
 use crate::probe::{check_unused, describe_mode, hex, open, request_report, source};
 use crate::terminal::{Progress, print};
 
-/// Change a sensor's EEPROM settings: shows the difference and asks first
+/// Change the EEPROM settings of a scanner. Shows the difference and asks first
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct ConfigureArgs {

@@ -27,7 +27,7 @@ use description::link_settings;
 use description::{Description, FoundDescription, RotatingDescription};
 pub(crate) use description::{describe_mode, hex};
 
-/// Show the sensor at a port; without a port, list the ports
+/// List the ports, or identify the scanner at one port
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct ProbeArgs {
