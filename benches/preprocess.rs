@@ -54,9 +54,9 @@ fn bench_zones(c: &mut Criterion) {
     let scans = scans("fig8", SCAN_COUNT);
     let eight = [2000, 1800, 1600, 1400, 1200, 1000, 800, 600];
     let cases: [(&str, Pose, &[u16]); 3] = [
-        ("zones, 2 circles, at the centre", Pose::default(), &[1000, 600]),
-        ("zones, 2 circles, off the centre", SENSOR_POSE, &[1000, 600]),
-        ("zones, 8 circles, off the centre", SENSOR_POSE, &eight),
+        ("zones, 2 circles, at the center", Pose::default(), &[1000, 600]),
+        ("zones, 2 circles, off the center", SENSOR_POSE, &[1000, 600]),
+        ("zones, 8 circles, off the center", SENSOR_POSE, &eight),
     ];
     for (name, pose, radii_mm) in cases {
         let settings = zones::Settings { radii_mm: radii_mm.to_vec(), ..zones::Settings::default() };

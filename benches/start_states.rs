@@ -155,7 +155,7 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
         target: Target::Max(maximum),
     };
     Ok([
-        figure("power cycle: banner to telegram", "ms", back, 5_000.0),
+        figure("power cycle: boot message to telegram", "ms", back, 5_000.0),
         figure("power cycle: lost of the other", "1", lost, 0.0),
         figure("EEPROM writes", "1", writes, 0.0),
     ])

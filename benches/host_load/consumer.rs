@@ -95,7 +95,7 @@ fn run_for_both(follow: impl Fn(usize, &mut Progress) -> Outcome<()> + Sync) -> 
     let follow_or_end = |number: usize| {
         let mut progress = Progress { sensor: SENSORS[number], count: 0 };
         if let Err(error) = follow(number, &mut progress) {
-            eprintln!("consumer of {}: {error}", SENSORS[number]);
+            eprintln!("subscriber of {}: {error}", SENSORS[number]);
             std::process::exit(1);
         }
     };

@@ -1,6 +1,6 @@
 /*
- * Reader for the datagrams of `scanhub gateway` in C: checks a datagram and decodes its payload. The program receives
- * the datagrams and counts lost ones. C99, one header, no heap. docs/datagram.md describes the bytes.
+ * The datagrams of `scanhub gateway` for programs in C: functions that check and decode them. It opens no sockets
+ * and counts no losses. C99, one header, no heap; docs/datagram.md has the bytes.
  *
  *     struct scanhub_datagram datagram;
  *     struct scanhub_scan scan;
@@ -8,8 +8,8 @@
  *         for (unsigned i = 0; i < scan.count; i++)
  *             use(scanhub_scan_m(&scan, i), scanhub_scan_angle(&scan, i));
  *
- * Results point into the datagram and are valid as long as its bytes are. The bytes may be hostile: after SCANHUB_OK,
- * no function reads outside of them if each index is below the count in the same result.
+ * Results point into the datagram and are valid as long as its bytes. They are hostile input: nothing that a function
+ * here answers with SCANHUB_OK leads outside of them, as long as an index is below the count that came with it.
  */
 #ifndef SCANHUB_H
 #define SCANHUB_H
@@ -296,7 +296,7 @@ static inline void scanhub_text(char *out, const uint8_t *field, size_t len)
     out[len] = 0;
 }
 
-/* An announcement, sent once a second: name and type of a sensor, and its topics. */
+/* Announcement of a sensor's name and topics, sent every second. */
 struct scanhub_announce {
     uint64_t boot;       /* ID of the hub's run */
     char sensor[33];     /* name of the sensor: 1 to 24 of a-z, 0-9, _ and - */
@@ -347,8 +347,7 @@ static inline struct scanhub_announced scanhub_announced(const struct scanhub_an
     return out;
 }
 
-/* Bytes that a scanner sent: from an LMS a telegram, STX to CRC; from other families complete packets that arrived
- * together. */
+/* Bytes of a sensor: for an LMS a telegram, STX to CRC; for other families complete packets that arrived together. */
 struct scanhub_telegram {
     const uint8_t *bytes;
     uint16_t len;

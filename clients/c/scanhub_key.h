@@ -1,7 +1,7 @@
 /*
- * Authentication of datagrams in C: checks that the sender has the key, and that the datagram is not a replay. The
- * program reads the key file. C99, no heap, no library; SHA-256 is included. docs/datagram.md describes what a listener
- * with a key accepts.
+ * The MACs of datagrams for programs in C: functions that check that a sender with the key sent a datagram, and that
+ * it is not a replay. It opens no sockets and no files. C99, no heap, no library: it contains SHA-256. docs/datagram.md
+ * explains which datagrams a listener with a key accepts.
  *
  *     static struct scanhub_guard guard;
  *     struct scanhub_key key;
@@ -231,7 +231,7 @@ static inline struct scanhub_stream *scanhub_guard_begin(struct scanhub_guard *g
     return stream;
 }
 
-/* Checks a sequence number, and stores it as received if `is_taken`. */
+/* Returns whether a sequence number is new, stale or a duplicate; if `is_taken`, it counts as received from now on. */
 static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *stream, uint32_t number, int is_taken)
 {
     uint8_t bit = (uint8_t)(1u << number % 8), *byte = stream->seen + number / 8 % 128;
@@ -242,7 +242,7 @@ static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *str
     if (is_behind && *byte & bit)
         return SCANHUB_DUPLICATE;
     if (!is_behind && is_taken) {
-        /* The numbers between were not received. */
+        /* The numbers in between did not arrive. */
         uint32_t leave = stream->any && number - stream->highest < 1024 ? number - stream->highest : 1024;
         for (i = 0; i < leave; i++)
             stream->seen[(number - i) / 8 % 128] &= (uint8_t) ~(1u << (number - i) % 8);

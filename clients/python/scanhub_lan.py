@@ -854,7 +854,7 @@ class Parts:
         if datagram.parts == 1:
             return datagram
         head = replace(datagram, part=0, parts=1, payload=b"")
-        # Removed and inserted again, so that the sample that has waited longest is first.
+        # The sample whose last part arrived longest ago is first.
         parts = self._unfinished.pop((head, datagram.parts), {})
         parts[datagram.part] = datagram.payload
         if len(parts) == datagram.parts:

@@ -30,7 +30,7 @@ if [ -z "$root" ] && [ "$(id -u)" != 0 ]; then
     exit 1
 fi
 
-# Destination, mode and source of each file. The source is last, because it may contain blanks.
+# Target and mode of each file; the source is last, because it may contain spaces.
 files="
 usr/local/bin/scanhub 755 $program
 etc/systemd/system/scanhub.service 644 $here/scanhub.service
@@ -56,7 +56,7 @@ put() {
 take() {
     [ ! -e "$2" ] || { rm "$2"; echo "removed $2"; }
 }
-# Manual pages and completions, which the program prints. A program for another processor does not run here.
+# Files that the program itself prints. A program for another processor cannot run here.
 man=usr/local/share/man/man1
 completions="
 bash usr/local/share/bash-completion/completions/scanhub

@@ -39,7 +39,7 @@ const BROKEN_SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
         "correct the type",
     ),
     ("a mode without reflector bits", &["--mode=0x00"], "marks", "warning", "mode=0x01"),
-    ("nobody answers", &["--fault=mute=1"], "sensor", "failed", "power, cable, jumper 7-8"),
+    ("no scanner answers", &["--fault=mute=1"], "sensor", "failed", "power, cable, jumper 7-8"),
     (
         "a wire is broken: the scanner streams and receives nothing",
         &["--state=streaming", "--baud=38400", "--fault=overlook=1"],

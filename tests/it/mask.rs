@@ -10,7 +10,7 @@ fn world(env: &TestEnv, thing: &str) -> String {
     format!("--world={}", env.file("world.toml", format!("{room}\n{thing}")))
 }
 
-/// Parts of the warnings about a mask that a user should check. On a busy machine, stderr also reports missed scans.
+/// Warnings that are printed next to a mask. On a busy machine, there is also one about missed scans.
 const WARNINGS: [&str; 3] = ["nothing of the robot", "something moved", "are hidden"];
 
 const POST_WORLD: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";

@@ -10,8 +10,9 @@ mod keys;
 mod pages;
 mod sources;
 mod topics;
-mod tree;
+pub(crate) mod tree;
 mod verbs;
+mod words;
 
 use tree::{Rule, SourceTree};
 

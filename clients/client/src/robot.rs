@@ -413,6 +413,6 @@ mod tests {
             assert_eq!(source.origin, SensorOrigin::All(Some(DomainHolder::Hub)));
         }
         let mut named = RobotSource::new(&["robot1.front"]);
-        assert!(!named.switch_to_hub(Some(DomainHolder::Hub)), "whoever names a sensor means it");
+        assert!(!named.switch_to_hub(Some(DomainHolder::Hub)), "a named sensor is kept");
     }
 }

@@ -1,5 +1,5 @@
-//! Tests of pollable subscribers: the descriptor is readable while there is a sample, and not after the program has
-//! taken it, even over restarts of the hub.
+//! Subscriptions in a poll set: readable when there is something to take, not readable after it was taken, over runs
+//! of the hub.
 
 mod fake;
 
@@ -49,7 +49,7 @@ fn same_descriptor_is_readable_over_hub_restarts() {
     let number = scans.as_raw_fd();
     for boot in 1..4 {
         let mut hub = FakeHub::new(&test_domain.domain, &["front"], boot);
-        wait_until("the consumer", || {
+        wait_until("the subscriber", || {
             assert!(is_readable(&scans, WAIT_TIMEOUT), "it looks for a hub by itself");
             assert!(scans.try_next().unwrap().is_none());
             hub.front_sensor().scan.subscribers() == 1
@@ -70,7 +70,7 @@ fn idle_hub_rarely_wakes_the_subscriber() {
     let test_domain = TestDomain::new();
     let scans = scans(&test_domain);
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
-    wait_until("the consumer", || {
+    wait_until("the subscriber", || {
         assert!(scans.try_next().unwrap().is_none());
         hub.front_sensor().scan.subscribers() == 1
     });
@@ -110,7 +110,7 @@ fn a_verdict_that_gets_too_old_makes_it_readable() {
             return (update.zones.verdict(), update.stale);
         }
     };
-    wait_until("the consumer", || {
+    wait_until("the subscriber", || {
         let _ = zones.try_next().unwrap();
         hub.front_sensor().zones.subscribers() == 1
     });

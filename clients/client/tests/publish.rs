@@ -103,7 +103,7 @@ fn another_life_begins_again() {
     assert_eq!(next_sample(&mut subscriber), (0, false, 0, 1));
     drop(near);
     let mut near = open();
-    // The subscriber must find the publisher first.
+    // Its subscriber has to find it first.
     wait_until("the consumer", || {
         let _ = subscriber.try_next().unwrap();
         near.subscribers() == 1

@@ -177,7 +177,12 @@ fn vector_list() -> String {
     );
     other("a number changed", &changed_datagram(&zone(45), false, |bytes| bytes[20] ^= 1), "wrong", "mac");
     other("a part changed", &changed_datagram(&part(8, 1), false, |bytes| bytes[33] = 2), "wrong", "mac");
-    other("a scan of nobody", &changed_datagram(&part(8, 1), false, |bytes| bytes[8] ^= 1), "wrong", "mac");
+    other(
+        "a scan of an unknown hub",
+        &changed_datagram(&part(8, 1), false, |bytes| bytes[8] ^= 1),
+        "wrong",
+        "mac",
+    );
     let mut right = |name: &str, after_s, bytes: &[u8], outcome: &str| {
         list.add(name, after_s, bytes, "right", outcome);
     };

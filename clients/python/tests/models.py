@@ -17,7 +17,7 @@ def ask(*order: str) -> scanhub.Shown:
 def until(what) -> None:
     give_up_at = time.monotonic() + 20
     while not what():
-        assert time.monotonic() < give_up_at, "waited in vain"
+        assert time.monotonic() < give_up_at, "timed out"
         time.sleep(0.05)
 
 

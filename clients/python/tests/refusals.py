@@ -52,7 +52,7 @@ def no_hub() -> None:
 
 def somebody_elses_domain() -> None:
     if os.geteuid() != 0:
-        print("skipped: only root can be somebody else", flush=True)
+        print("skipped: only root can become another user", flush=True)
         return
     os.makedirs(place, mode=0o700)
     os.chmod(place, 0o700)

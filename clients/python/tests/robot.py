@@ -29,7 +29,7 @@ domain, root, *sensors = sys.argv[1:]
 refused(lambda: scanhub.robot("front", "Front"))
 refused(lambda: scanhub.robot("robot"))
 with scanhub.robot(domain=domain, root=root) as asked:
-    assert asked.now() == scanhub.Robot() and asked.now().verdict == "unknown", "nobody was heard yet"
+    assert asked.now() == scanhub.Robot() and asked.now().verdict == "unknown", "no verdict was received yet"
 assert asked.now() == scanhub.Robot() and list(asked) == [], "it was closed"
 
 if sensors == ["--asked"]:

@@ -73,7 +73,7 @@ def a_view_keeps_its_sample(scans: scanhub.Subscriber) -> None:
     kept, before = scan.ranges[100:200], scan.ranges[100:200].copy()
     seq = scan.topic_seq
     del scan
-    # The hub has far fewer slots, so they must be reused. The slot of the kept sample must not be.
+    # Far more than the hub has slots for, if slots were not reused: the sample's own slot is not among them.
     for scan in scans:
         assert scan.ranges.ctypes.data + 200 != kept.ctypes.data
         if scan.topic_seq > seq + 60:

@@ -43,7 +43,7 @@ Examples:
   scanhub watch
   scanhub watch front
 
-Keys: q quits, ? lists the other keys. NO_COLOR=1 shows signs instead of colours. From another machine: ssh -t robot scanhub watch.";
+Keys: q quits, ? lists the other keys. NO_COLOR=1 shows signs instead of colors. From another machine: ssh -t robot scanhub watch.";
 
 /// Minimum interval between frames, so that a scan is on the screen within 50 ms.
 const FRAME_INTERVAL: Duration = Duration::from_millis(45);

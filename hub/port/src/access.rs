@@ -236,7 +236,7 @@ mod tests {
             (port(0, 20, 0o640), "udev rule"),
             (port(1000, 20, 0o440), "chmod u+rw /dev/ttyUSB0"),
             (port(1000, 20, 0o660), "getfacl"),
-            (PortPermissions { port: None, ..robot.clone() }, "directory above it"),
+            (PortPermissions { port: None, ..robot.clone() }, "ls -ld"),
         ] {
             let (what, remedy) = rights.explain(Path::new("/dev/ttyUSB0"));
             assert!(remedy.contains(says), "{rights:?}: {remedy}");

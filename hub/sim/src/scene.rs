@@ -547,7 +547,7 @@ mod tests {
 
     fn body(person: &Person, time_s: f64) -> Point {
         let [a, b] =
-            person.legs(time_s).expect("somebody is there").map(|leg| leg.transformed(|p| p).front_of_post());
+            person.legs(time_s).expect("a person is there").map(|leg| leg.transformed(|p| p).front_of_post());
         ((a.0 + b.0) / 2.0, (a.1 + b.1) / 2.0)
     }
 

@@ -264,7 +264,7 @@ mod tests {
         let mut message = Vec::new();
         people_markers(&mut message, "house", &header(), &tracks);
         let decoded = read(&MARKER_ARRAY, &message).unwrap();
-        assert_eq!(decoded.sequence("markers").map(<[Value]>::len), Some(4), "nobody who is tentative");
+        assert_eq!(decoded.sequence("markers").map(<[Value]>::len), Some(4), "no tentative person");
         for (place, id, kind, text) in
             [(0, 5.0, 3.0, ""), (1, 5.0, 9.0, "5"), (2, 7.0, 3.0, ""), (3, 7.0, 9.0, "7")]
         {
@@ -285,7 +285,7 @@ mod tests {
         let mut message = Vec::new();
         people_poses(&mut message, "house", &header(), &tracks);
         let decoded = read(&POSE_ARRAY, &message).unwrap();
-        assert_eq!(decoded.sequence("poses").map(<[Value]>::len), Some(2), "nobody who is tentative");
+        assert_eq!(decoded.sequence("poses").map(<[Value]>::len), Some(2), "no tentative person");
         assert_eq!(decoded.text("header.frame_id"), Some("house"));
         assert_eq!(
             (decoded.number("poses.0.position.x"), decoded.number("poses.0.position.y")),

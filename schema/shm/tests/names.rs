@@ -44,7 +44,7 @@ fn one_ring_wakes_all_sleepers_of_a_doorbell() {
     front.wake(WakeEvent::Telegram).unwrap();
     rear.wake(WakeEvent::Telegram).unwrap();
     assert!(sleepers.into_iter().all(|sleeper| sleeper.join().unwrap() == ring_count + 1));
-    assert!(ns_after_seconds(0) < end, "somebody slept to the end");
+    assert!(ns_after_seconds(0) < end, "a wait lasted to the end");
     assert_eq!(
         (doorbell("front").ring_count(DoorbellWord::First), doorbell("rear").is_closed()),
         (ring_count + 1, false)
@@ -62,7 +62,7 @@ fn equal_domains_below_two_roots_have_own_doorbells() {
     let mine = WakeSender::new(&here, "front").unwrap();
     let doorbell = Doorbell::open(&here, "front").unwrap().expect("the hub hung it");
     let rung = doorbell.ring_count(DoorbellWord::First);
-    assert!(Doorbell::open(&there, "front").unwrap().is_none(), "nobody hung one there");
+    assert!(Doorbell::open(&there, "front").unwrap().is_none(), "no process created one there");
     let theirs = WakeSender::new(&there, "front").unwrap();
     theirs.wake(WakeEvent::Telegram).unwrap();
     drop(theirs);
@@ -99,7 +99,7 @@ fn unusable_doorbell_file_is_reported() {
     let prefix = std::fs::read_to_string(test_domain.domain.root().join("prefix")).unwrap();
     let path = PathBuf::from("/dev/shm").join(format!("{}front.bell", prefix.trim_end()));
     rustix::fs::mknodat(rustix::fs::CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
-    let failure = WakeSender::new(&hub, "front").err().expect("nobody waits for who writes");
+    let failure = WakeSender::new(&hub, "front").err().expect("no subscriber waits for the writer");
     assert!(failure.message.contains("is no file"), "{failure}");
     assert_eq!(Doorbell::open(&hub, "front").err(), Some(failure));
     std::fs::remove_file(&path).unwrap();
@@ -130,7 +130,7 @@ fn the_last_one_out_takes_the_names_along() {
     let client = scanhub_shm::client_node(&test_domain.domain).unwrap();
     assert_eq!(scanhub_shm::is_member(&client, root), Ok(true));
     drop((hub, lock));
-    assert_eq!(prefix().as_ref(), Some(&first), "a consumer waits for the next hub");
+    assert_eq!(prefix().as_ref(), Some(&first), "a subscriber waits for the next hub");
     let lock = HubLock::acquire(root).unwrap();
     drop(client);
     assert_eq!(files().len(), 1, "the library's counter: {:?}", files());

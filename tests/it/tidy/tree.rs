@@ -22,6 +22,11 @@ impl SourceTree {
         tree
     }
 
+    /// Returns a tree with only the file at `path`.
+    pub(crate) fn of_file(path: &str, text: &str) -> SourceTree {
+        SourceTree { files: BTreeMap::from([(path.to_owned(), text.to_owned())]) }
+    }
+
     /// Returns a copy with the file at `path` added or replaced.
     pub(crate) fn with(&self, path: &str, text: &str) -> SourceTree {
         let mut tree = self.clone();

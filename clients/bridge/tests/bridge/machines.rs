@@ -271,7 +271,7 @@ fn only_the_topics_that_are_named_are_received() {
 fn invalid_arguments_are_refused_at_startup() {
     let env = TestEnv::new();
     let code = |flags: &[&str]| env.run(&[&["bridge", "--json"], flags].concat()).exit_code;
-    assert_eq!(code(&[]), Some(78), "nobody is named");
+    assert_eq!(code(&[]), Some(78), "no router is named");
     assert_eq!(code(&["--connect=nonsense"]), Some(78));
     assert_eq!(code(&["--connect=tcp/127.0.0.1:1", "--topic=front/scam"]), Some(2));
     assert_eq!(code(&["--connect=tcp/127.0.0.1:1", "--publish", "--hub=robot1"]), Some(78));

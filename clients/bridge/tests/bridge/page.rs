@@ -38,7 +38,7 @@ fn the_commands_of_the_page_run() {
             let place = TestEnv::new();
             running.push((bridge(&place, &words.split(' ').collect::<Vec<_>>()).0, place));
         } else {
-            panic!("nobody runs {line}");
+            panic!("no test runs {line}");
         }
         count += 1;
     }

@@ -42,7 +42,7 @@ fn losses_of_a_restarted_router_are_all_counted() {
     }
     local.await_line("a scan", |line| line["class"] == "scan");
     let local = local.end(INT);
-    assert_eq!(local.of_class("summary")[0]["missed"], 0, "the hub's own consumers: {local}");
+    assert_eq!(local.of_class("summary")[0]["missed"], 0, "subscribers on the hub's machine: {local}");
     let sent = there.end(INT);
     // The last announcement passes through two routers.
     let announced = announcement_count(&sent);

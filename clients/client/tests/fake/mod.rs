@@ -317,7 +317,7 @@ impl OutputFile {
 pub(crate) fn wait_until(description: &str, mut is_done: impl FnMut() -> bool) {
     let give_up_at = Instant::now() + Duration::from_secs(180);
     while !is_done() {
-        assert!(Instant::now() < give_up_at, "waited in vain for {description}");
+        assert!(Instant::now() < give_up_at, "timed out waiting for {description}");
         std::thread::sleep(Duration::from_millis(2));
     }
 }

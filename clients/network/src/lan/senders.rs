@@ -63,7 +63,7 @@ impl Senders {
         is_shared: false,
     };
 
-    /// Returns whom a datagram of sender `from` belongs to. `boot` is the run of the hub if the datagram is an
+    /// Returns the owner of a datagram of sender `from`. `boot` is the run of the hub if the datagram is an
     /// announcement. A sender that has not announced itself does not count as the same gateway.
     pub(super) fn match_sender(&self, from: u64, boot: Option<u64>, now_ns: u64) -> SenderMatch {
         let known = &self.all[..self.count];

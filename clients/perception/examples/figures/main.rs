@@ -178,7 +178,7 @@ fn measure_people(world: &World) {
     println!("sweeps until it is background: {poles:?}; the box: {boxes:?}");
     let [persons, things] = [all.persons, all.things].map(|(points, found)| share(found, points));
     println!(
-        "recall {:.3} [least {:.3}]: persons {persons:.3}, pole and box {things:.3}",
+        "recall {:.3} [least {:.3}]: people {persons:.3}, pole and box {things:.3}",
         all.recall(),
         minimum(&recalls)
     );

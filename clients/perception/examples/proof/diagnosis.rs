@@ -109,10 +109,10 @@ impl Diagnosis {
                 let sits = CHAIRS.iter().any(|(chair, _)| distance(*chair, truth[person]) < 0.5);
                 let class = match (track.sensors.count_ones(), near < 0.9) {
                     _ if sits => "on a chair",
-                    (0 | 1, true) => "one sensor, somebody near",
-                    (0 | 1, false) => "one sensor, nobody near",
-                    (_, true) => "two sensors, somebody near",
-                    (_, false) => "two sensors, nobody near",
+                    (0 | 1, true) => "one sensor, a person near",
+                    (0 | 1, false) => "one sensor, no person near",
+                    (_, true) => "two sensors, a person near",
+                    (_, false) => "two sensors, no person near",
                 };
                 let sum = self.errors.entry(class).or_default();
                 *sum = (sum.0 + off * off, sum.1 + 1);
@@ -125,13 +125,13 @@ impl Diagnosis {
         for track in &free {
             let near = |place: &Point| distance(*place, track.position) < 1.0;
             let cause = if CHAIRS.iter().any(|(chair, _)| distance(*chair, track.position) < 0.6) {
-                "(frames of a track that is nobody, at a chair)"
+                "(frames of a track without a person, at a chair)"
             } else if [0.0, 17.0].iter().any(|x| distance([*x, 2.5], track.position) < 1.0) {
-                "(frames of a track that is nobody, at a door to the street)"
+                "(frames of a track without a person, at a door to the street)"
             } else if truth.iter().any(near) {
-                "(frames of a track that is nobody, near somebody)"
+                "(frames of a track without a person, near a person)"
             } else {
-                "(frames of a track that is nobody, elsewhere)"
+                "(frames of a track without a person, elsewhere)"
             };
             *self.causes.entry(cause).or_default() += usize::from(is_scored(track.position));
             if self.is_reported && is_scored(track.position) {
@@ -178,17 +178,17 @@ impl Diagnosis {
             };
         }
         match old_now {
-            None if unseen => "room: gone for a second, then born anew",
-            None => "room: gone and at once born anew",
+            None if unseen => "room: gone for a second, then created again",
+            None => "room: gone and at once created again",
             Some(track) if track.state == TrackState::BetweenRooms => {
-                "room: away though in the room, born anew"
+                "room: away though in the room, created again"
             }
             Some(track) => {
                 let near = |other: &Point| distance(*other, track.position) < MATCH_M;
                 if truth.iter().enumerate().any(|(other, place)| other != person && near(place)) {
-                    "room: drifted to another one, born anew"
+                    "room: drifted to another one, created again"
                 } else if track.state == TrackState::Hidden {
-                    "room: hidden elsewhere, born anew"
+                    "room: hidden elsewhere, created again"
                 } else {
                     "room: born twice"
                 }

@@ -141,7 +141,7 @@ mod tests {
 
     #[test]
     fn only_a_clearly_misplaced_sensor_is_detected() {
-        let misplaced = detect_misplaced([0.4, -0.3]).expect("half a metre");
+        let misplaced = detect_misplaced([0.4, -0.3]).expect("half a meter");
         assert_eq!((misplaced.sensor, misplaced.other), (2, 0));
         assert!(
             (misplaced.offset[0] - 0.4).abs() < 0.03 && (misplaced.offset[1] + 0.3).abs() < 0.03,

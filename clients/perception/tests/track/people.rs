@@ -232,6 +232,6 @@ fn tracks_rarely_remain_on_chairs_of_departed_people() {
             wrong += usize::from(sample.tracks.iter().any(|track| is_false_track(&track)));
         }
     }
-    assert!(sat > frames / 4, "somebody sat in {sat} of {frames} pictures");
-    assert!(50 * wrong < frames, "{wrong} of {frames} pictures have a track of nobody");
+    assert!(sat > frames / 4, "a person sat in {sat} of {frames} pictures");
+    assert!(50 * wrong < frames, "{wrong} of {frames} pictures have a track without a person");
 }

@@ -82,7 +82,7 @@ fn a_limit_is_kept_or_is_a_failed_check() {
     };
     assert_eq!(with("60s").0, Ok(()));
     let (end, out, _) = with("0.001us");
-    let failure = end.expect_err("nobody is that fast");
+    let failure = end.expect_err("no machine is that fast");
     assert_eq!(failure.kind, Kind::Check);
     assert!(failure.message.starts_with("front/zones: p99 of the age on arrival is "), "{failure}");
     assert!(failure.message.ends_with("more than 1ns"), "{failure}");

@@ -110,7 +110,7 @@ fn subscriber_continues_after_a_clean_hub_exit() {
     let mut scans = Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).open().unwrap();
     for boot in 1..4 {
         let mut hub = FakeHub::new(&test_domain.domain, &["front"], boot);
-        wait_until("the consumer", || {
+        wait_until("the subscriber", || {
             assert!(scans.try_next().unwrap().is_none());
             hub.front_sensor().scan.subscribers() == 1
         });

@@ -553,7 +553,7 @@ fn every_byte_is_counted_once() {
                     Action::SetRate(_) => assert!(!settings.fixed_rate && !settings.listen_only),
                     Action::SetDtr(_) => assert!(!settings.listen_only),
                     Action::Transmit { .. } => {
-                        assert!(!settings.listen_only, "nobody is there");
+                        assert!(!settings.listen_only, "no scanner is there");
                         session.handle_transmitted(now);
                     }
                     Action::SleepUntil(until) => {

@@ -257,7 +257,7 @@ fn accepts_requests_only_after_the_boot_message() {
     // The scanner is booting.
     assert!(bench.ask(&[0xA5, 0x50]).is_empty());
     bench.run_for(ONE_SECOND);
-    let boot_message = bench.sent.last().expect("a banner").clone();
+    let boot_message = bench.sent.last().expect("a boot message").clone();
     assert!(boot_message.is_reply && boot_message.bytes.len() == 64 && boot_message.bytes.is_ascii());
     let text = String::from_utf8(boot_message.bytes).expect("ascii");
     assert!(text.starts_with("RP LIDAR System.\r\nFirmware Ver 1.29, HW Ver 5\r\n"), "{text}");
@@ -330,7 +330,7 @@ fn a_stall_delays_and_loses_nothing() {
 fn brown_out_sends_boot_message_during_a_stream() {
     let mut bench = streaming(Model::A1, 3, "brownout_at=1");
     bench.run(4 * ONE_SECOND);
-    let boot_message = bench.sent.iter().position(|sent| sent.is_reply).expect("a banner");
+    let boot_message = bench.sent.iter().position(|sent| sent.is_reply).expect("a boot message");
     assert!(
         boot_message > 50 && boot_message + 1 == bench.sent.len(),
         "the scanner sends nothing after that"
