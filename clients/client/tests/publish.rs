@@ -104,7 +104,7 @@ fn another_life_begins_again() {
     drop(near);
     let mut near = open();
     // Its subscriber has to find it first.
-    wait_until("the consumer", || {
+    wait_until("the subscriber", || {
         let _ = subscriber.try_next().unwrap();
         near.subscribers() == 1
     });
