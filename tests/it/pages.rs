@@ -7,6 +7,7 @@ mod data_blocks;
 mod lines;
 mod names;
 mod program;
+mod reference;
 mod shell;
 
 use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, is_class, run_concurrently, wait_until};

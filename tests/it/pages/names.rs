@@ -29,7 +29,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("pictures", &[]),
     ("trouble", &[]),
     // Telegrams and datagrams that did not arrive.
-    ("lost", &["summary demo", "lan listen", "lan_evicted listen", "bridge bridge"]),
+    ("lost", &["summary demo", "lan listen", "lan_evicted listen", "bridge bridge", "bridge_evicted bridge"]),
     ("lan_given_up", &[]),
     ("bridge_given_up", &[]),
     ("lives", &[]),
@@ -51,7 +51,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
 ];
 
 /// Place in which a name is used, and the name.
-type Used = (String, String);
+pub(super) type Used = (String, String);
 
 /// Returns the names among `used` that are forbidden where they are used.
 fn forbidden(used: &[Used]) -> Vec<String> {
@@ -80,7 +80,7 @@ fn of_output(page: &str) -> Vec<Used> {
 }
 
 /// Returns the keys of the configuration.
-fn of_configuration() -> Vec<Used> {
+pub(super) fn of_configuration() -> Vec<Used> {
     let keys = scanhub_config::keys().into_iter();
     keys.flat_map(|(section, keys)| {
         keys.into_iter().map(move |(key, _)| (section.to_owned(), key.name.to_owned()))
@@ -89,25 +89,36 @@ fn of_configuration() -> Vec<Used> {
 }
 
 /// Returns the flags in the help of all verbs.
-fn of_help(env: &TestEnv) -> Vec<Used> {
+pub(super) fn of_help(env: &TestEnv) -> Vec<Used> {
     let help = |arguments: &[&str]| {
         let outcome = env.run(arguments);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         String::from_utf8(outcome.stdout).expect("text")
     };
     let all = help(&["--help"]);
-    let rows = all.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|row| !row.is_empty());
-    let verbs: BTreeSet<_> = rows.filter_map(|row| row.split_whitespace().next()).collect();
     // The bridge is another program. Its own test checks its flags.
-    let verbs = verbs.into_iter().filter(|verb| !["help", "bridge"].contains(verb));
+    let verbs = verbs_in(&all).into_iter().filter(|verb| !["help", "bridge"].contains(verb));
     let mut used = Vec::new();
     for verb in verbs {
-        let text = help(&[verb, "--help"]);
-        let words = text.split(|c: char| c.is_whitespace() || "[]=,;".contains(c));
+        let mut text = help(&[verb, "--help"]);
+        for below in verbs_in(&text.clone()) {
+            if below != "help" {
+                text += &help(&[verb, below, "--help"]);
+            }
+        }
+        let words = text.split(|c: char| c.is_whitespace() || "[]()=,.;:`".contains(c));
         let flags = words.filter_map(|word| word.strip_prefix("--")).filter(|flag| !flag.is_empty());
         used.extend(flags.map(|flag| (verb.to_owned(), flag.replace('-', "_"))));
     }
     used
+}
+
+/// Returns the verbs in the lists of `help`. Each row has two spaces, a verb and more spaces.
+fn verbs_in(help: &str) -> BTreeSet<&str> {
+    let is_verb = |word: &str| word.chars().all(|c| c.is_ascii_lowercase());
+    let rows = help.lines().take_while(|line| *line != "Options:");
+    let rows = rows.filter_map(|line| line.strip_prefix("  ")?.split_once("  "));
+    rows.map(|(verb, _)| verb).filter(|verb| !verb.is_empty() && is_verb(verb)).collect()
 }
 
 #[test]
