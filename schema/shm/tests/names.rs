@@ -100,7 +100,7 @@ fn unusable_doorbell_file_is_reported() {
     let path = PathBuf::from("/dev/shm").join(format!("{}front.bell", prefix.trim_end()));
     rustix::fs::mknodat(rustix::fs::CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
     let failure = WakeSender::new(&hub, "front").err().expect("no subscriber waits for the writer");
-    assert!(failure.message.contains("is no file"), "{failure}");
+    assert!(failure.message.contains("is not a regular file"), "{failure}");
     assert_eq!(Doorbell::open(&hub, "front").err(), Some(failure));
     std::fs::remove_file(&path).unwrap();
     std::os::unix::fs::symlink("/dev/null", &path).unwrap();
