@@ -297,9 +297,9 @@ fn wrong_words(piece: &Piece) -> impl Iterator<Item = (usize, String)> {
                 wrong.push((*line, format!("{phrase:?}: {advice}")));
             }
         }
-        let ends_with_s = |stem: &&str| word.strip_prefix(*stem).is_some_and(|end| S_ENDINGS.contains(&end));
+        let ends_with_s = |stem: &str| word.strip_prefix(stem).is_some_and(|end| S_ENDINGS.contains(&end));
         if BRITISH_STEMS.iter().any(|stem| word.contains(stem))
-            || S_STEMS.iter().any(|stem| ends_with_s(&stem))
+            || S_STEMS.iter().any(|stem| ends_with_s(stem))
         {
             wrong.push((*line, format!("{word:?}: use American spelling")));
         }
@@ -439,9 +439,9 @@ fn prose_of_source(text: &str, language: Language, found: &mut Vec<(usize, Kind,
 fn string(text: &str, before: Option<char>, language: Language) -> Option<(&str, usize)> {
     let is_name = before.is_some_and(|c| c.is_alphanumeric() || c == '_');
     if language == Language::Rust {
-        if text.starts_with('\'') {
+        if let Some(rest) = text.strip_prefix('\'') {
             // A character or a lifetime.
-            let after = text[1..].chars().next()?;
+            let after = rest.chars().next()?;
             let close = match after {
                 '\\' => {
                     2 + text[2..]

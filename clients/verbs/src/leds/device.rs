@@ -204,11 +204,11 @@ mod tests {
                 root.plug(plugged, "");
             }
             let nowhere = Device::open(&root.0.path().join("nowhere"), "red").err().unwrap();
-            assert!(nowhere.message.ends_with("/nowhere is no directory"), "{nowhere}");
+            assert!(nowhere.message.ends_with("/nowhere is not a directory"), "{nowhere}");
             for name in ["blue", "", "..", "red/../red"] {
                 let failure = Device::open(root.0.path(), name).err().unwrap();
                 assert_eq!(failure.kind, Kind::Configuration, "{name}");
-                assert!(failure.message.contains(&format!("no light {name:?}")), "{failure}");
+                assert!(failure.message.contains(&format!("has no LED {name:?}")), "{failure}");
                 assert!(failure.hint.starts_with(hint), "{failure}");
             }
         }
