@@ -118,7 +118,7 @@ impl<S: TopicStore> Republisher<S> {
         made
     }
 
-    /// Publishes `sample`, or counts it in [``](Self::). Creates its topics as
+    /// Publishes `sample`, or counts it in [`dropped`](Self::dropped). Creates its topics as
     /// [`on_announcement`](Self::on_announcement) does if its gateway is known to deliver since this sample. If there
     /// is no room for its sensor, another one may be evicted.
     ///
