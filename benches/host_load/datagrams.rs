@@ -11,7 +11,7 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{MIRROR_PERIOD, Unit, Variant};
 use scanhub_sim::room::Room;
 
-use crate::consumer::MODE;
+use crate::subscriber::MODE;
 use crate::support::{Outcome, clock};
 
 /// Prints `ready`, and then sends forever: to `port` for the first sensor, and to the next port for the second sensor.

@@ -26,13 +26,13 @@
 //! Figures are shares of one processor. A rate below 37.5 Hz means that the setup fell behind. Its load is then the
 //! load of an overloaded machine.
 
-mod consumer;
 mod cpu_time;
 mod datagrams;
 #[path = "../../hub/drivers/tests/lms/line.rs"]
 #[allow(dead_code)] // Only the simplest parser is used.
 mod line;
-mod set_up;
+mod setup;
+mod subscriber;
 #[path = "../support/mod.rs"]
 mod support;
 
@@ -40,7 +40,7 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use set_up::{Host, Load, PART_NAME, Setup};
+use setup::{Host, Load, PART_NAME, Setup};
 use support::figures::{self, Cell, Figure, Target};
 use support::{Options, Outcome};
 
@@ -50,10 +50,10 @@ fn main() -> ExitCode {
 
 fn run_part(words: &[&str]) -> Outcome<()> {
     match *words {
-        [PART_NAME, "bytes", most, front, rear] => consumer::read_bytes([front, rear], most.parse()?),
-        [PART_NAME, "datagrams", port] => consumer::receive_datagrams(port.parse()?),
-        [PART_NAME, "scans", domain] => consumer::receive_scans(domain),
-        [PART_NAME, "results", domain] => consumer::receive_results(domain),
+        [PART_NAME, "bytes", most, front, rear] => subscriber::read_bytes([front, rear], most.parse()?),
+        [PART_NAME, "datagrams", port] => subscriber::receive_datagrams(port.parse()?),
+        [PART_NAME, "scans", domain] => subscriber::receive_scans(domain),
+        [PART_NAME, "results", domain] => subscriber::receive_results(domain),
         [PART_NAME, "unit", port] => datagrams::send(port.parse()?),
         _ => support::run_part(words),
     }
@@ -73,15 +73,15 @@ fn measure(options: &Options) -> Outcome<()> {
         // CPU time of the sender when there are no receivers.
         let deaf = Setup::Datagrams.start(0)?.measure(span)?.drivers;
         for (round, &count) in counts.iter().enumerate() {
-            let mut set_ups = Setup::ALL;
-            set_ups.rotate_left((pair + round) % Setup::ALL.len());
-            for setup in set_ups {
+            let mut setups = Setup::ALL;
+            setups.rotate_left((pair + round) % Setup::ALL.len());
+            for setup in setups {
                 if std::io::stderr().is_terminal() {
                     eprintln!("{} of {pairs}: {count} subscribers, {}", pair + 1, setup.name());
                 }
                 let load = setup.start(count)?.measure(span)?;
                 runs.push(MeasuredLoad {
-                    set_up: setup,
+                    setup,
                     count,
                     host: load.of_host((setup == Setup::Datagrams).then_some(deaf)),
                     load,
@@ -95,7 +95,7 @@ fn measure(options: &Options) -> Outcome<()> {
 
 /// One run of a setup.
 struct MeasuredLoad {
-    set_up: Setup,
+    setup: Setup,
     count: usize,
     host: Host,
     load: Load,
@@ -151,10 +151,10 @@ impl<'a> Tables<'a> {
     }
 
     fn table(&self, table: String, unit: &'static str, rows: &[Setup], value: Value, cells: &mut Vec<Cell>) {
-        for &set_up in rows {
+        for &setup in rows {
             for &count in self.counts {
-                let (row, column) = (set_up.name().into(), subscriber_label(count));
-                let values = self.series(set_up, count, value);
+                let (row, column) = (setup.name().into(), subscriber_label(count));
+                let values = self.series(setup, count, value);
                 cells.push(Cell { table: table.clone(), row, column, unit, values });
             }
         }
@@ -165,7 +165,7 @@ impl<'a> Tables<'a> {
     fn figures(&self) -> Vec<Figure> {
         let of = |name, value: Value, target| {
             let [hub, baseline] =
-                [Setup::Results, Setup::Bytes].map(|set_up| self.series(set_up, MAX_SUBSCRIBERS, value));
+                [Setup::Results, Setup::Bytes].map(|setup| self.series(setup, MAX_SUBSCRIBERS, value));
             Figure { name, unit: "%", hub, baseline, target }
         };
         vec![
@@ -176,12 +176,12 @@ impl<'a> Tables<'a> {
         ]
     }
 
-    fn series(&self, set_up: Setup, count: usize, value: Value) -> Vec<f64> {
-        self.chosen(set_up, count).map(value).collect()
+    fn series(&self, setup: Setup, count: usize, value: Value) -> Vec<f64> {
+        self.chosen(setup, count).map(value).collect()
     }
 
-    fn chosen(&self, set_up: Setup, count: usize) -> impl Iterator<Item = &MeasuredLoad> {
-        self.runs.iter().filter(move |run| run.set_up == set_up && run.count == count)
+    fn chosen(&self, setup: Setup, count: usize) -> impl Iterator<Item = &MeasuredLoad> {
+        self.runs.iter().filter(move |run| run.setup == setup && run.count == count)
     }
 }
 
