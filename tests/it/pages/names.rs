@@ -43,7 +43,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("came", &[]),
     ("clients", &[]),
     // Allowed for a topic that the receiver does not support.
-    ("skipped", &["lan_refused listen"]),
+    ("skipped", &["lan_refused listen", "bridge_refused bridge"]),
     ("well", &[]),
     // Allowed for people who returned through a door.
     ("back", &["count track --count DOOR"]),
