@@ -238,7 +238,7 @@ fn rejects_impossible_settings_with_a_hint() {
         refused(&[], 78, "no interface is named", "lo (127.0.0.1, this machine only)");
         refused(&["--interface=eth7"], 78, "eth7", "lo");
         refused(&["--interface=lo", "--to=127.0.0.1"], 78, "127.0.0.1", "HOST:PORT");
-        refused(&["--interface=lo", "--to=239.255.76.80:22200"], 78, "not a single host", "hosts");
+        refused(&["--interface=lo", "--to=239.255.76.80:22200"], 78, "not a host", "single hosts");
         refused(&["--interface=lo", "--to=no-such-host.invalid:22200"], 78, "no-such-host", "HOST:PORT");
         let twice = ["--interface=lo", "--to=127.0.0.1:22200", "--to=localhost:22200"];
         refused(&twice, 78, "localhost:22200: it is named twice", "127.0.0.1:22200");

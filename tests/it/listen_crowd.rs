@@ -77,9 +77,9 @@ fn receives_real_gateway_at_once_after_64_invented() {
                 line["hub"] == hub && line["class"] == "zones"
             });
             // The report may be printed before or after the line of the genuine sensor.
-            let is_trouble = |line: &Value| line["kind"] == "problem";
-            if !program.has_printed(is_trouble) {
-                program.await_line("report of the shortage", is_trouble);
+            let is_problem = |line: &Value| line["kind"] == "problem";
+            if !program.has_printed(is_problem) {
+                program.await_line("report of the shortage", is_problem);
             }
             // The first announcement evicts no sensor that has just delivered. The next one is accepted.
             deliver_samples(&mut sender);

@@ -244,7 +244,7 @@ fn refuses_recordings_of_another_family() {
     );
     let outcome = env.run(&["convert", &recording, &env.path_argument("x.log")]);
     assert_eq!(
-        (outcome.exit_code, outcome.stderr.contains("cannot contain its scans")),
+        (outcome.exit_code, outcome.stderr.contains("a CARMEN log cannot hold")),
         (Some(66), true),
         "{outcome}"
     );

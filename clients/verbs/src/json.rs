@@ -116,7 +116,7 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
 /// Returns the line of class `scan`.
 pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct TelegramJson<'a> {
+    struct ScanJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         family: &'static str,
@@ -140,7 +140,7 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         #[serde(flatten)]
         flags: FlagNames,
     }
-    TelegramJson {
+    ScanJson {
         stamp: SampleKeys::new("scan", sensor, header),
         family: Family::of_number(scan.family).map_or("unknown", Family::name),
         unit_um: scan.unit_um,
@@ -178,7 +178,7 @@ struct MarksAvailability {
 /// Returns the line of class `status`. Unknown values are null.
 pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct TelegramJson<'a> {
+    struct StatusJson<'a> {
         class: &'static str,
         sensor: &'a str,
         state: &'static str,
@@ -208,7 +208,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         Number(u8),
         Name(&'a str),
     }
-    TelegramJson {
+    StatusJson {
         class: "status",
         sensor,
         state: status.state().map_or("unknown", |state| state.name()),
@@ -259,7 +259,7 @@ pub(crate) fn notices(
     notice: &Notice,
 ) -> Result<(), ExitReason> {
     #[derive(Serialize)]
-    struct TelegramJson<'a> {
+    struct NoticesJson<'a> {
         class: &'static str,
         kind: &'static str,
         sensor: Option<&'a str>,
@@ -276,18 +276,18 @@ pub(crate) fn notices(
         Notice::HubBack => ("hub_back", 0, None),
     };
     if names.is_empty() {
-        return output.json(&TelegramJson { class: "notice", kind, sensor: None, topic: None, missed, hint });
+        return output.json(&NoticesJson { class: "notice", kind, sensor: None, topic: None, missed, hint });
     }
     names.iter().try_for_each(|name| {
         let (sensor, topic) = (Some(name.sensor.as_str()), Some(name.topic.name()));
-        output.json(&TelegramJson { class: "notice", kind, sensor, topic, missed, hint })
+        output.json(&NoticesJson { class: "notice", kind, sensor, topic, missed, hint })
     })
 }
 
 /// Returns the line of class `summary`.
 pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct TelegramJson<'a> {
+    struct SummaryJson<'a> {
         class: &'static str,
         sensor: &'a str,
         topic: &'static str,
@@ -298,7 +298,7 @@ pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Ser
         damaged: Option<f64>,
         lost_on_line: Option<u64>,
     }
-    TelegramJson {
+    SummaryJson {
         class: "summary",
         sensor: &name.sensor,
         topic: name.topic.name(),
@@ -314,25 +314,25 @@ pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Ser
 /// Returns the line of class `control`.
 pub(crate) fn control<'a>(sensor: &'a str, verb: Verb) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct TelegramJson<'a> {
+    struct ControlJson<'a> {
         class: &'static str,
         sensor: &'a str,
         verb: &'static str,
         outcome: &'static str,
     }
-    TelegramJson { class: "control", sensor, verb: verb.name(), outcome: "taken" }
+    ControlJson { class: "control", sensor, verb: verb.name(), outcome: "taken" }
 }
 
 /// Returns the line of class `error`, without a line feed. A program writes it when a verb has failed.
 pub fn error(failure: &Failure) -> String {
     #[derive(Serialize)]
-    struct TelegramJson<'a> {
+    struct ErrorJson<'a> {
         class: &'a str,
         kind: &'a str,
         message: &'a str,
         hint: &'a str,
     }
-    let line = TelegramJson {
+    let line = ErrorJson {
         class: "error",
         kind: failure.kind.name(),
         message: &failure.message,

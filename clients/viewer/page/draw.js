@@ -52,7 +52,7 @@ function stroke(...points) {
   pen.stroke();
 }
 
-/** Clears another canvas, and calls `act` to draw on it. */
+/** Clears another canvas, and calls `paint` to draw on it. */
 function drawOn(canvas, paint, width = size.width, height = size.height) {
   [canvas.width, canvas.height] = [width * size.ratio, height * size.ratio];
   const before = pen;
@@ -171,7 +171,7 @@ function drawField(sensor) {
 // Distance between two points in pixels. If it is smaller, the previous point hides the next one.
 const MIN_DOT_DISTANCE = 0.8;
 
-/** Draws squares of `width` pixels at `points` of a sensor at `pose`, with the canvas method `how`. Returns the number of points
+/** Draws squares of `width` pixels at `points` of a sensor at `pose`, with the canvas method `method`. Returns the number of points
  * that are not NaN. */
 function dots(points, width, pose, method = "fillRect") {
   if (!points || !pose) return 0;

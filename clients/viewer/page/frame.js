@@ -53,7 +53,7 @@ function draw(now) {
 
 let isDrawRequested = false;
 // Whether data has arrived, or the view has changed.
-let isFitDue = false; // new data arrived, or the view has changed
+let isFitDue = false;
 
 function requestDraw() {
   if (isDrawRequested) return;

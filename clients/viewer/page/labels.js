@@ -72,7 +72,7 @@ function expireData(now) {
   for (const one of allSensors()) if (one.scan && now - one.scan.at > max(STALE_AFTER_MS, 3000 * one.scan.period)) replaceData(one, emptySensor());
   for (const one of allSweeps()) {
     // The page subscribes to points only in the side view.
-    if (!isSideView()) one.points = null; // Clouds have no subscription in this view.
+    if (!isSideView()) one.points = null;
     if (one.sweep && now > one.until) replaceData(one, emptySweep());
   }
   for (const one of people.values()) if (one.tracks.length && now - one.at > STALE_AFTER_MS) replaceData(one, { tracks: [] });

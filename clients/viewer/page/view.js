@@ -8,19 +8,19 @@ const LAYERS = {
 };
 const layers = Object.fromEntries(Object.keys(LAYERS).map((name) => [name, name !== "lines"]));
 // Restore the layers chosen earlier in this window. Browsers may refuse access to the storage.
-try { // Layers chosen before in this window. A browser may refuse to store them.
+try {
   Object.assign(layers, JSON.parse(sessionStorage.getItem("layers")));
 } catch { /* The choice is valid while the page is open. */ }
 const views = ["above", "aside"].map(() => ({ x: 1, y: 0, scale: 60, turn: 0, fits: true, isFitted: false, goal: null }));
 let view = views[0];
 const isSideView = () => view === views[1];
 // The only sensor that is shown; null for all.
-let shownSpace = null; // the one sensor that is shown
+let shownSpace = null;
 const isMotionReduced = matchMedia("(prefers-reduced-motion: reduce)");
 // Position of the pointer over the picture, in pixels.
-let pointer = null; // over the picture, in pixels
+let pointer = null;
 // Measured distance: { from, to } in meters.
-let tape = null; // { from, to } in meters
+let tape = null;
 let isTape = false;
 let size = { width: 1, height: 1, ratio: 1 };
 

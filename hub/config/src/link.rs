@@ -180,7 +180,7 @@ section! {
         /// baud rate of the stream: 500000, 38400, 19200 or 9600
         ///
         /// Baud rate at which an LMS streams: 500000, 38400, 19200 or 9600. Default: 500000, or 38400 on RS-232
-        /// ([scanners.md](scanners.md)).
+        /// ([scanner-lms.md](scanner-lms.md)).
         baud: Option<i64> = None, example "500000";
         /// in the robot's frame: meters, radians
         pose: PoseKeys = PoseKeys::default();

@@ -62,8 +62,8 @@ macro_rules! families {
         impl fmt::Display for Problem {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 match self {
-                    $(Problem::$Family(trouble) => trouble.fmt(f),)*
-                    Problem::Search(trouble) => trouble.fmt(f),
+                    $(Problem::$Family(problem) => problem.fmt(f),)*
+                    Problem::Search(problem) => problem.fmt(f),
                 }
             }
         }

@@ -148,7 +148,7 @@ pub(crate) fn detect(
         dtr: None,
     };
     let driven = run_protocol(port, &mut session, &mut detection, stop);
-    let mut problem = session.problem().map(|trouble| trouble.to_string());
+    let mut problem = session.problem().map(|problem| problem.to_string());
     let Detection { packets, period, points_per_second, introduction, .. } = detection;
     let is_error = |introduction: &DeviceInfo| introduction.condition == HealthStatus::Error;
     if packets == 0 && introduction.as_ref().is_some_and(|introduction| !is_error(introduction)) {

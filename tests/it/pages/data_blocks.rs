@@ -14,9 +14,9 @@ use crate::testkit::{TERM, TestEnv, output};
 const TEXT_BLOCKS: [(&str, &str, &str); 8] = [
     ("README.md", " LMS 291 ──RS-422", "a drawing"),
     ("docs/datagram.md", " 0  53485542", "schema/tests/datagram.rs compares it with the golden datagram"),
-    ("docs/ros2.md", "cargo install", "clients/bridge/tests/bridge/ros2.rs runs the second line"),
+    ("docs/ros2.md", "cargo install", "clients/bridge/tests/ros2.rs runs the second line"),
     ("docs/ros2.md", "sudo apt-get install ros-", "ROS is not installed where tests run"),
-    ("docs/ros2.md", "scanhub bridge --connect", "clients/bridge/tests/bridge/ros2.rs runs it"),
+    ("docs/ros2.md", "scanhub bridge --connect", "clients/bridge/tests/ros2.rs runs it"),
     ("docs/tracks.md", "1 appeared in hall", "tests/it/track_page.rs reads it"),
     ("docs/measured.md", "empty rooms: ", "figures, which the example `proof` prints"),
     ("docs/worlds.md", "w.toml:2:1: unknown key", "a_wrong_world_is_refused_as_the_page_says"),

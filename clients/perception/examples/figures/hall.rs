@@ -1,5 +1,5 @@
 //! A simulated hall with a scanner on a mount, played from start to end: scans and angles in the order of their
-//! arrival, with the truth about each point. `judge.rs` scores the results.
+//! arrival, with the truth about each point. `score.rs` scores the results.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};

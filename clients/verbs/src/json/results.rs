@@ -35,7 +35,7 @@ pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> i
 /// Returns the line of class `lines`.
 pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct LinesJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         readings: u16,
@@ -49,7 +49,7 @@ pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> i
         #[serde(flatten)]
         flags: FlagNames,
     }
-    MarksJson {
+    LinesJson {
         stamp: SampleKeys::new("lines", sensor, header),
         readings: lines.readings,
         points: lines.on_lines,
@@ -64,7 +64,7 @@ pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> i
 /// Returns the line of class `motion`. Unknown values are null.
 pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct MotionJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         dx_m: Option<f64>,
@@ -85,7 +85,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
     }
     let of_step = |value: f32| motion.has_step().then(|| millionths(value));
     let of_pose = |value: f64| motion.has_pose().then(|| millionths(value));
-    MarksJson {
+    MotionJson {
         stamp: SampleKeys::new("motion", sensor, header),
         dx_m: of_step(motion.dx_m),
         dy_m: of_step(motion.dy_m),
@@ -107,7 +107,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
 /// Returns the line of class `early`.
 pub(crate) fn early<'a>(sensor: &'a str, header: &Header, early: &Early) -> impl Serialize + use<'a> {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct EarlyJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         verdict: &'static str,
@@ -120,7 +120,7 @@ pub(crate) fn early<'a>(sensor: &'a str, header: &Header, early: &Early) -> impl
         #[serde(flatten)]
         flags: FlagNames,
     }
-    MarksJson {
+    EarlyJson {
         stamp: SampleKeys::new("early", sensor, header),
         verdict: early.verdict().name(),
         beam: early.beam,
@@ -135,7 +135,7 @@ pub(crate) fn early<'a>(sensor: &'a str, header: &Header, early: &Early) -> impl
 /// Returns the line of class `zones`. A line about a silence has neither sequence numbers nor stamps.
 pub(crate) fn zones<'a>(sensor: &'a str, update: &'a ZonesUpdate) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct ZonesJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         verdict: &'static str,
@@ -157,7 +157,7 @@ pub(crate) fn zones<'a>(sensor: &'a str, update: &'a ZonesUpdate) -> impl Serial
         Some(header) => SampleKeys::new("zones", sensor, header),
         None => SampleKeys::for_silence("zones", sensor),
     };
-    MarksJson {
+    ZonesJson {
         stamp,
         verdict: zones.verdict().name(),
         nearest_mm,
@@ -174,7 +174,7 @@ pub(crate) fn zones<'a>(sensor: &'a str, update: &'a ZonesUpdate) -> impl Serial
 /// zones of one sensor of the robot.
 pub(crate) fn robot<'a>(robot: &'a Robot, update: &ZonesUpdate) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct RobotJson<'a> {
         class: &'static str,
         sensor: &'static str,
         stamp_ns: Option<u64>,
@@ -188,7 +188,7 @@ pub(crate) fn robot<'a>(robot: &'a Robot, update: &ZonesUpdate) -> impl Serializ
         stale: bool,
     }
     let (nearest_mm, nearest_sensor) = robot.nearest().unzip();
-    MarksJson {
+    RobotJson {
         class: "zones",
         sensor: ROBOT,
         stamp_ns: update.header.map(|header| header.stamp_first_ns),
@@ -208,7 +208,7 @@ pub(crate) fn foreground<'a>(
     foreground: &'a Foreground,
 ) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct ForegroundJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         generation: u32,
@@ -223,7 +223,7 @@ pub(crate) fn foreground<'a>(
         #[serde(flatten)]
         flags: FlagNames,
     }
-    MarksJson {
+    ForegroundJson {
         stamp: SampleKeys::new("foreground", sensor, header),
         generation: foreground.generation,
         unit_mm: foreground.unit_um,
@@ -363,7 +363,7 @@ fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok,
 /// Returns the line of class `tracks`.
 pub fn tracks<'a>(sensor: &'a str, header: &Header, tracks: &'a Tracks) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct TracksJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         #[serde(serialize_with = "track_list")]
@@ -371,13 +371,13 @@ pub fn tracks<'a>(sensor: &'a str, header: &Header, tracks: &'a Tracks) -> impl 
         #[serde(flatten)]
         flags: FlagNames,
     }
-    MarksJson { stamp: SampleKeys::new("tracks", sensor, header), tracks, flags: FlagNames::of(header) }
+    TracksJson { stamp: SampleKeys::new("tracks", sensor, header), tracks, flags: FlagNames::of(header) }
 }
 
 /// Returns the line of class `event`.
 pub fn event<'a>(sensor: &'a str, header: &Header, event: &'a Event) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct EventJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         kind: Option<&'static str>,
@@ -393,7 +393,7 @@ pub fn event<'a>(sensor: &'a str, header: &Header, event: &'a Event) -> impl Ser
         flags: FlagNames,
     }
     let passage = event.door();
-    MarksJson {
+    EventJson {
         stamp: SampleKeys::new("event", sensor, header),
         kind: event.kind().map(|kind| kind.name()),
         id: event.id,
@@ -443,7 +443,7 @@ fn thousandths(value: f32) -> f64 {
 /// Returns the line of class `tilt`.
 pub(crate) fn tilt<'a>(sensor: &'a str, header: &Header, tilt: &Tilt) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct TiltJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         angle_deg: f64,
@@ -451,7 +451,7 @@ pub(crate) fn tilt<'a>(sensor: &'a str, header: &Header, tilt: &Tilt) -> impl Se
         #[serde(flatten)]
         flags: FlagNames,
     }
-    MarksJson {
+    TiltJson {
         stamp: SampleKeys::new("tilt", sensor, header),
         angle_deg: degrees(tilt.angle_rad),
         rate_deg_s: tilt.rate_rad_s().map(degrees),
@@ -462,7 +462,7 @@ pub(crate) fn tilt<'a>(sensor: &'a str, header: &Header, tilt: &Tilt) -> impl Se
 /// Returns the line of class `cloud`.
 pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct CloudJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         sweep: u32,
@@ -480,7 +480,7 @@ pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> i
         #[serde(flatten)]
         flags: FlagNames,
     }
-    MarksJson {
+    CloudJson {
         stamp: SampleKeys::new("cloud", sensor, header),
         sweep: cloud.sweep,
         generation: cloud.generation,
@@ -498,7 +498,7 @@ pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> i
 /// Returns the line of class `obstacles`.
 pub fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> impl Serialize + 'a {
     #[derive(Serialize)]
-    struct MarksJson<'a> {
+    struct ObstaclesJson<'a> {
         #[serde(flatten)]
         stamp: SampleKeys<'a>,
         sweep: u32,
@@ -511,7 +511,7 @@ pub fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> 
         #[serde(flatten)]
         flags: FlagNames,
     }
-    MarksJson {
+    ObstaclesJson {
         stamp: SampleKeys::new("obstacles", sensor, header),
         sweep: found.sweep,
         generation: found.generation,

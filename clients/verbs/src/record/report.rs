@@ -282,7 +282,7 @@ impl<'a> Report<'a> {
     fn status(&self, written: &RecordStats, dropped: u64) -> Vec<(u8, String)> {
         let seconds = self.started.elapsed().as_secs();
         let rate = written.bytes.saturating_sub(self.bytes) / REPORT_INTERVAL.as_secs();
-        let problem = self.is_write_failing.then(|| (4, "disk trouble".to_owned()));
+        let problem = self.is_write_failing.then(|| (4, "write failed".to_owned()));
         let parts = [
             (3, format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)),
             (1, size(written.bytes)),

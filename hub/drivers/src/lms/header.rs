@@ -207,7 +207,7 @@ pub(crate) const MAX_HEADER_LEN: usize = 7;
 /// not a valid address, but it may be a start byte.
 pub(crate) const MIN_HEADER_DISTANCE: usize = 3;
 
-const _: () = assert!(MAX_LENGTH < 0x0400, "HEADER_DISTANCE rests on it");
+const _: () = assert!(MAX_LENGTH < 0x0400, "MIN_HEADER_DISTANCE depends on it");
 
 #[cfg(test)]
 mod tests {

@@ -360,7 +360,7 @@ impl ProtocolState {
                 self.rate.note_found();
                 let is_idle = matches!(reply, Some(Reply::Status(_))) && !self.sensor.streams;
                 self.restarts.note_found(self.rate.baud, is_idle);
-                self.problem.take_if(|trouble| matches!(trouble, Problem::NoReply { .. } | Problem::Silence));
+                self.problem.take_if(|problem| matches!(problem, Problem::NoReply { .. } | Problem::Silence));
                 if request == Request::Type {
                     // The line was silent before the request, so the scanner does not stream. The session requests the
                     // status at the target rate.
@@ -621,7 +621,7 @@ impl ProtocolState {
             NextQuestion::Later => {}
             NextQuestion::Done => {
                 self.sensor.accept_unconfirmed();
-                self.problem.take_if(|trouble| *trouble == Problem::ModeUnknown);
+                self.problem.take_if(|problem| *problem == Problem::ModeUnknown);
             }
             NextQuestion::ModeUnknown => self.problem = Some(Problem::ModeUnknown),
         }
