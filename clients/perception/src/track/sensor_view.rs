@@ -1,4 +1,4 @@
-//! What one sensor sees in its last scan: the range in each direction, the legs, and whether a position is occupied,
+//! View of one sensor in its last scan: the range in each direction, the legs, and whether a position is occupied,
 //! free or occluded.
 
 use std::f64::consts::{FRAC_PI_4, TAU};
