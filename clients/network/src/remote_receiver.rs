@@ -416,7 +416,7 @@ mod tests {
             let gateways = n.min(60_000) + n.saturating_sub(120_000);
             let so_far = Evictions { gateways, ..Evictions::default() };
             if let Some(line) = capacity.check(so_far, start + Duration::from_millis(n)) {
-                assert!(line.contains(" gateways were given") && !line.contains("samples"), "{line}");
+                assert!(line.contains(" gateways were evicted") && !line.contains("samples"), "{line}");
                 reported.push(n);
             }
         }
