@@ -309,7 +309,7 @@ mod tests {
         let decoded = object(status(scene.sensor("front")));
         assert_eq!((&decoded["state"], &decoded["hz"]), (&"no status".into(), &serde_json::Value::Null));
         assert_eq!(decoded["pose"], serde_json::Value::Null, "its pose is unknown");
-        assert_eq!(decoded["problem"]["what"], "nothing was heard of it yet");
+        assert_eq!(decoded["problem"]["what"], "no data from it yet");
     }
 
     #[test]
