@@ -112,7 +112,7 @@ mod tests {
         for (words, finding, remedy) in [
             ("Unable to connect to tls/r:1! invalid peer certificate: Expired", "has expired", "renew"),
             ("Unable to connect to tls/r:1! invalid peer certificate: NotValidYet", "not valid yet", "clock"),
-            ("Unable to connect to tls/r:1! received fatal alert: UnknownCA", "do not fit", "--connect"),
+            ("Unable to connect to tls/r:1! received fatal alert: UnknownCA", "do not match", "--connect"),
             (
                 "Received a close message (reason GENERIC) in response to an OpenSyn on: TransportLinkUnicast",
                 "the router refused the user or the password",
