@@ -120,7 +120,7 @@ mod tests {
             ),
             (
                 "Received a close message (reason 0) in response to an InitSyn on: tcp/127.0.0.1:1",
-                "wants a user",
+                "requires a user",
                 "usrpwd/user",
             ),
             ("UsrPwd extension - Recv OpenSyn. Invalid password.", "a client was refused", "dictionary_file"),
