@@ -89,8 +89,8 @@ pub trait Signals {
     fn report(&self) -> Result<Arc<AtomicBool>, Failure>;
 }
 
-/// The same flag for all signals that end a process. Used by a program that runs a verb in a thread. A report is never
-/// requested.
+/// One flag for all signals that end a process, for a program that runs a verb in a thread. It never requests a
+/// report.
 impl Signals for Arc<AtomicBool> {
     fn stop(&self) -> Result<Arc<AtomicBool>, Failure> {
         Ok(self.clone())

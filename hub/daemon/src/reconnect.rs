@@ -60,8 +60,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     /// # Errors
     ///
     /// Returns an error of kind [`PortNotTty`](scanhub_schema::Kind::PortNotTty) if the port is not a serial line at
-    /// all, an error of kind [`Short`](scanhub_schema::Kind::ResourceExhausted) if descriptors or memory run out, and
-    /// those of [`Platform::transport`]. The link waits for a port that is missing, in use or forbidden, or that cannot
+    /// all, an error of kind [`ResourceExhausted`](scanhub_schema::Kind::ResourceExhausted) if descriptors or memory
+    /// run out, and those of [`Platform::transport`]. The link waits for a port that is missing, in use or forbidden, or that cannot
     /// have the rate, and for a name that another process has.
     pub fn new(
         link: &'a scanhub_config::Link,

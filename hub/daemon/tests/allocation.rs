@@ -282,8 +282,8 @@ fn a_scan_takes_nothing_from_the_heap() {
         ('b', true, &["background.publish=every-scan"][..], 5),
     ] {
         for AllocationWindow { scans, seconds, allocations, held_bytes } in windows(letter, follow_all, set) {
-            // Each topic takes a loan for a scan. There are more for a silence, and for a status each second and when
-            // the state changes. If the scanner has sent a scan twice, the hub may have missed the first one.
+            // A scan takes one loan in each topic. A silence, a change of state and the status of each second take
+            // more. If the scanner has sent a scan twice, the hub may have missed the first one.
             let loans =
                 topics * (scans - MAX_MISSED_SCANS)..=topics * scans + MAX_OTHER_ALLOCATIONS + 4 * seconds;
             assert!(

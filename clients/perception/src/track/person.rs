@@ -204,7 +204,7 @@ impl Side {
 }
 
 impl Filter {
-    /// Creates the filter of a person of whom one leg was seen.
+    /// Creates the filter of a person with one detected leg, at `at`.
     pub(crate) fn of_leg(at: Point, sigma_m: f64) -> Filter {
         let mut covariance = Matrix4::zeros();
         let half = INITIAL_HALF_M * INITIAL_HALF_M;

@@ -17,7 +17,7 @@ const MAX_LEG_WIDTH_M: f64 = 0.26;
 /// Minimum width of a leg with its trousers, in meters. The legs of chairs and tables are thinner.
 const MIN_LEG_WIDTH_M: f64 = 0.09;
 /// Diameter of a beam's light spot at the scanner in meters, and its growth with the range. The values are those of an
-/// LMS 2xx. Of all supported scanners, it has the widest spot.
+/// LMS 2xx, which has the widest spot of all supported scanners.
 const SPOT_M: f64 = 0.01;
 const SPOT_RAD: f64 = 0.0045;
 /// Minimum width of a surface, such as the leaf of a door, in meters. A narrower straight object may be legs.

@@ -233,12 +233,11 @@ impl LdSession {
                 self.listen(State::Silent);
             }
             Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(self.now) => {
-                self.problem = match self.counters.damaged_percent(self.framer.buffer.byte_counters()) {
-                    0 | 1 => Some(Problem::HeadBlocked),
-                    2..=50 => Some(Problem::DamagedRevolutions),
-                    // The hub itself reports a line that damages more bytes.
-                    _ => None,
-                };
+                self.problem = self.counters.overdue_problem(
+                    self.framer.buffer.byte_counters(),
+                    Problem::HeadBlocked,
+                    Problem::DamagedRevolutions,
+                );
             }
             _ => {}
         }

@@ -217,11 +217,17 @@ impl StreamCounters {
         self.revolution_start = (self.damaged, tally.in_packets);
     }
 
-    /// Returns the share of the bytes since the last revolution that were damaged, in percent.
-    pub fn damaged_percent(&self, tally: &ByteCounters) -> u64 {
-        let (damaged, in_packets) = self.revolution_start;
-        let (damaged, intact) = (self.damaged - damaged, tally.in_packets - in_packets);
-        100 * damaged / (damaged + intact).max(1)
+    /// Returns the problem of a stream whose next revolution is overdue: `blocked` if at most 1 % of the bytes since
+    /// the last revolution were damaged, `damaged` if at most 50 % were, and `None` if more were. The hub itself
+    /// reports a line that damages most bytes.
+    pub fn overdue_problem<P>(&self, tally: &ByteCounters, blocked: P, damaged: P) -> Option<P> {
+        let (damaged_start, intact_start) = self.revolution_start;
+        let (damaged_bytes, intact_bytes) = (self.damaged - damaged_start, tally.in_packets - intact_start);
+        match 100 * damaged_bytes / (damaged_bytes + intact_bytes).max(1) {
+            0 | 1 => Some(blocked),
+            2..=50 => Some(damaged),
+            _ => None,
+        }
     }
 
     /// Counts a restart of the session.
