@@ -116,7 +116,7 @@ fn run_subscriber(node: &Node, wait_method: WaitMethod, threads: &SubscriberThre
     };
     threads.ready.fetch_add(1, Ordering::Release);
     while !threads.should_end.load(Ordering::Acquire) {
-        let rung = doorbell.ring_count(DoorbellWord::First);
+        let ring_count = doorbell.ring_count(DoorbellWord::First);
         if let Some(listener) = &listener {
             scanhub_shm::take_wakeups(&[listener])?;
         }
@@ -126,7 +126,7 @@ fn run_subscriber(node: &Node, wait_method: WaitMethod, threads: &SubscriberThre
         match &listener {
             Some(listener) => scanhub_shm::sleep(&[listener], END_POLL_INTERVAL)?,
             None => scanhub_shm::wait_on_doorbells(
-                &[(&doorbell, DoorbellWord::First, rung)],
+                &[(&doorbell, DoorbellWord::First, ring_count)],
                 clock::now() + END_POLL_INTERVAL.as_nanos() as u64,
             )
             .map_err(|_| "no doorbells on this system")?,

@@ -80,15 +80,15 @@ impl FutexReader {
 impl MessageReceiver for FutexReader {
     fn next(&mut self) -> Outcome<Label> {
         while !self.matcher.is_waiting() {
-            let rung = self.doorbell.ring_count(DoorbellWord::First);
-            if rung != self.last_count {
-                self.matcher.add(u64::from(rung.wrapping_sub(self.last_count)));
-                self.last_count = rung;
+            let ring_count = self.doorbell.ring_count(DoorbellWord::First);
+            if ring_count != self.last_count {
+                self.matcher.add(u64::from(ring_count.wrapping_sub(self.last_count)));
+                self.last_count = ring_count;
             } else if self.is_spinning {
                 std::hint::spin_loop();
             } else {
                 let until = clock::now() + STEP_TIMEOUT_NS;
-                scanhub_shm::wait_on_doorbells(&[(&self.doorbell, DoorbellWord::First, rung)], until)
+                scanhub_shm::wait_on_doorbells(&[(&self.doorbell, DoorbellWord::First, ring_count)], until)
                     .map_err(|error| format!("{error:?}"))?;
             }
         }

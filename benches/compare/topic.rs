@@ -125,8 +125,8 @@ impl BytesReceiver {
             WaitMethod::Event(Box::new(scanhub_shm::listener(&node, &event)?), false)
         } else {
             let doorbell = Doorbell::open(&node, SENSOR)?.ok_or("no doorbell")?;
-            let rung = doorbell.ring_count(DoorbellWord::First);
-            WaitMethod::Doorbell(doorbell, rung, task.mechanism == Mechanism::Doorbell)
+            let ring_count = doorbell.ring_count(DoorbellWord::First);
+            WaitMethod::Doorbell(doorbell, ring_count, task.mechanism == Mechanism::Doorbell)
         };
         let service = node
             .service_builder(&ServiceName::new(SERVICE_NAME)?)
@@ -153,16 +153,16 @@ impl WaitMethod {
     /// received.
     fn wait(&mut self) -> Outcome<()> {
         match self {
-            WaitMethod::Doorbell(doorbell, rung, sleeps) => {
-                if doorbell.ring_count(DoorbellWord::First) == *rung && *sleeps {
+            WaitMethod::Doorbell(doorbell, ring_count, sleeps) => {
+                if doorbell.ring_count(DoorbellWord::First) == *ring_count && *sleeps {
                     let until = clock::now() + STEP_TIMEOUT_NS;
-                    scanhub_shm::wait_on_doorbells(&[(doorbell, DoorbellWord::First, *rung)], until)
+                    scanhub_shm::wait_on_doorbells(&[(doorbell, DoorbellWord::First, *ring_count)], until)
                         .map_err(|error| format!("{error:?}"))?;
                 }
-                while doorbell.ring_count(DoorbellWord::First) == *rung && !*sleeps {
+                while doorbell.ring_count(DoorbellWord::First) == *ring_count && !*sleeps {
                     std::hint::spin_loop();
                 }
-                *rung = doorbell.ring_count(DoorbellWord::First);
+                *ring_count = doorbell.ring_count(DoorbellWord::First);
                 Ok(())
             }
             WaitMethod::Event(listener, taken) => {

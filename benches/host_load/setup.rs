@@ -80,13 +80,13 @@ impl Setup {
                 subscriber.wait_for_line(&format!("had {sensor}"), STEP_TIMEOUT)?;
             }
         }
-        Ok(SetupProcesses { consumers: subscribers, hub, drivers, _stage: environment })
+        Ok(SetupProcesses { subscribers, hub, drivers, _stage: environment })
     }
 }
 
 /// All processes of a setup. Dropping the setup ends them in this order.
 pub(crate) struct SetupProcesses {
-    pub(crate) consumers: Vec<Child>,
+    pub(crate) subscribers: Vec<Child>,
     pub(crate) hub: Option<Child>,
     /// Processes that simulate hardware.
     pub(crate) drivers: Vec<Child>,
@@ -106,7 +106,7 @@ impl SetupProcesses {
     /// Returns the scans per second of the slowest combination of subscriber and sensor, or 0 without subscribers.
     fn hz(&self, from_ns: u64, to_ns: u64) -> Outcome<f64> {
         let mut minimum: Option<f64> = None;
-        for subscriber in &self.consumers {
+        for subscriber in &self.subscribers {
             let lines = subscriber.lines_so_far();
             for sensor in SENSORS {
                 let mut counts = Vec::new();
@@ -171,7 +171,7 @@ impl Load {
         let hub = span.of(&pids(&children.hub))?;
         Ok(Load {
             machine: span.machine(),
-            processes: span.of(&pids(&children.consumers))?.add(hub),
+            processes: span.of(&pids(&children.subscribers))?.add(hub),
             hub,
             kernel: span.kernel(),
             drivers: span.of(&pids(&children.drivers))?,

@@ -235,7 +235,7 @@ fn measure_link_down() -> Outcome<Vec<Figure>> {
     thread::sleep(DOWN_TIME);
     pulled.run_command("ip link set eth0 up");
     let plugged_ns = clock::now();
-    let heard_ns = there.wait_for_class_after(plugged_ns, "scan")?;
+    let received_ns = there.wait_for_class_after(plugged_ns, "scan")?;
     let sent = gateway.end()?;
     let output_lines = elsewhere.end()?;
     drop(there.end()?);
@@ -244,7 +244,7 @@ fn measure_link_down() -> Outcome<Vec<Figure>> {
         last.filter(|(_, line)| line["class"] == "lan").map(|(_, line)| wire::number(line, "missed"));
     let figure =
         |name, unit, value, target| Figure { name, unit, hub: vec![value], baseline: vec![], target };
-    let again_ms = (heard_ns - plugged_ns) as f64 / 1e6;
+    let again_ms = (received_ns - plugged_ns) as f64 / 1e6;
     Ok(vec![
         figure("down for 10 s: until received again", "ms", again_ms, Target::Max(1000.0)),
         figure("the same: received by another machine", "1", sum(&output_lines, "received"), Target::None),

@@ -241,7 +241,7 @@ impl LmsHost {
                     return Ok(true);
                 }
             }
-            let end = self.framer.hold().map_or(until, |hold| until.min(clock::now() + hold));
+            let end = self.framer.hold_time().map_or(until, |hold| until.min(clock::now() + hold));
             if clock::readable(&self.line, Some(end))? {
                 let len = self.line.read(self.framer.read_buffer())?;
                 self.framer.commit(len);

@@ -469,13 +469,13 @@ function scanhub.init()
     epochs = {}
     -- By hub and sensor: the sensor's name.
     names = {}
-    -- By frame number: the result of `judge`. Only the first pass fills it, because later passes are not in order.
+    -- By frame number: the result of `check_sequence`. Only the first pass fills it, because later passes are not in order.
     findings = {}
 end
 
 -- Compares a datagram with earlier ones. Returns the field to show and its value, or nil if the datagram is the
 -- expected one.
-local function judge(hub, epoch, sensor, topic, sequence)
+local function check_sequence(hub, epoch, sensor, topic, sequence)
     if epochs[hub] and epoch < epochs[hub] then
         return { "retired", epochs[hub] }
     end
@@ -1202,7 +1202,7 @@ function scanhub.dissector(tvb, pinfo, root)
     end
     -- All parts of a sample have its sequence number, so only the first part counts.
     if not pinfo.visited and part == 0 then
-        findings[pinfo.number] = judge(hub, epoch, sensor, topic, sequence)
+        findings[pinfo.number] = check_sequence(hub, epoch, sensor, topic, sequence)
     end
     local name = names[hub .. "/" .. sensor]
     if name then tree:add(f["sensor_name"], name):set_generated() end

@@ -180,11 +180,11 @@ fn probe_identifies_both_models() {
         assert_eq!((found["model"].as_str(), number(found, "baud")), (Some(model), rate), "{found}");
         let of = |key: &str| found[key].as_f64().unwrap_or_else(|| panic!("no {key}: {found}"));
         assert!((of("points_per_second") / points - 1.0).abs() < 0.02, "{found}");
-        assert!((of("turns_per_second") / 10.0 - 1.0).abs() < 0.05 && of("damaged") == 0.0, "{found}");
+        assert!((of("revolutions_per_second") / 10.0 - 1.0).abs() < 0.05 && of("damaged") == 0.0, "{found}");
         assert!(number(found, "packets") > 20 && found["problem"].is_null(), "{found}");
         assert_eq!(outcome.stderr, "", "no progress without a terminal");
         let text = env.search(&["probe", &env.path_argument(name)]).to_string();
-        for word in ["family", "ld", model, "Bd", "turns"] {
+        for word in ["family", "ld", model, "Bd", "revolutions per second"] {
             assert!(text.contains(word), "{word}: {text}");
         }
         assert_eq!(simulator.end(TERM).exit_code, Some(0));

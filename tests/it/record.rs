@@ -86,7 +86,7 @@ fn records_each_sample_exactly_once() {
     }
     let [facts] = &recording.metadata("scanhub")[..] else { panic!("{:?}", recording.metadata) };
     assert_eq!((facts["part"].as_str(), facts["started"].len()), ("1", 20), "{facts:?}");
-    let [run_note] = &recording.metadata("scanhub.life")[..] else { panic!("{:?}", recording.metadata) };
+    let [run_note] = &recording.metadata("scanhub.run")[..] else { panic!("{:?}", recording.metadata) };
     assert_eq!(run_note["hub_pid"], others[1].pid().to_string());
 }
 
@@ -177,7 +177,7 @@ fn recording_continues_after_a_restart_of_the_hub() {
     let telegrams = recording.of("front/telegram");
     let boots: BTreeSet<_> = telegrams.iter().map(|message| message.boot()).collect();
     let recorded_runs: BTreeSet<_> =
-        recording.metadata("scanhub.life").iter().map(|run_note| run_note["boot"].clone()).collect();
+        recording.metadata("scanhub.run").iter().map(|run_note| run_note["boot"].clone()).collect();
     assert_eq!((boots.len(), recorded_runs.len()), (2, 2));
     assert_eq!(boots.iter().map(|boot| format!("{boot:016x}")).collect::<BTreeSet<_>>(), recorded_runs);
     assert!(!recording.of("back/telegram").is_empty());

@@ -83,7 +83,7 @@ fn splits_a_recording_and_keeps_the_last_files() {
         // Each file begins with the status, so that it can be replayed alone.
         assert_eq!(recording.messages[0].topic, "front/status");
         assert_eq!(recording.metadata("scanhub")[0]["part"], expected(number + 1));
-        assert_eq!(recording.metadata("scanhub.life").len(), 1);
+        assert_eq!(recording.metadata("scanhub.run").len(), 1);
     }
     nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 20);

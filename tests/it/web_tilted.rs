@@ -280,9 +280,9 @@ fn the_picture_of_the_documents_from_the_side() {
                     && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
                     && document.querySelector('#news').innerText === ''";
         // The page shows the text a moment after the sweep.
-        let is_told = format!("{SWEPT_TEXT} === `hall: ${{scanhub.sweeps[0].words}}`");
+        let is_reported = format!("{SWEPT_TEXT} === `hall: ${{scanhub.sweeps[0].words}}`");
         page.await_true(&format!(
-            "{condition} && {is_told} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"
+            "{condition} && {is_reported} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"
         ));
         save_screenshot(&mut page, look, &Path::new(directory).join("web-side.png"));
     }

@@ -149,7 +149,7 @@ macro_rules! topics {
         impl Held {
             fn lend(&self) -> BorrowedSample {
                 match self {
-                    Held::Robot(told) => BorrowedSample::new(None, told.verdict(), size_of_val(told.verdict())),
+                    Held::Robot(update) => BorrowedSample::new(None, update.verdict(), size_of_val(update.verdict())),
                     $(Held::$topic(sample) => sample.lend(),)*
                 }
             }

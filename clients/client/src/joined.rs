@@ -65,15 +65,15 @@ pub type JoinedSubscriber<A, B> = Subscriber<Joined<A, B>>;
 
 /// Source of the pairs.
 pub struct PairSource<A: Payload + ?Sized, B: Payload + ?Sized> {
-    first: Side<A>,
-    second: Side<B>,
+    first: JoinedTopic<A>,
+    second: JoinedTopic<B>,
     discarded: DiscardedTelegrams,
     /// Whether a pair was returned before.
     has_returned_pair: bool,
 }
 
 /// State of one of the two topics.
-struct Side<P: Payload + ?Sized> {
+struct JoinedTopic<P: Payload + ?Sized> {
     reader: TopicReader<P>,
     /// Sample without a partner, and CLOCK_MONOTONIC in ns until which it waits.
     waiting: Option<(Received<P>, u64)>,
@@ -106,7 +106,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> Subscribe for Joined<A, B> {
     type Source = PairSource<A, B>;
 
     fn source(options: &SubscriberBuilder<Joined<A, B>>) -> PairSource<A, B> {
-        let (first, second) = (Side::new(options.sensor()), Side::new(options.sensor()));
+        let (first, second) = (JoinedTopic::new(options.sensor()), JoinedTopic::new(options.sensor()));
         PairSource { first, second, discarded: DiscardedTelegrams::default(), has_returned_pair: false }
     }
 }
@@ -164,9 +164,9 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> PairSource<A, B> {
     }
 }
 
-impl<P: Payload + ?Sized> Side<P> {
-    fn new(sensor: &str) -> Side<P> {
-        Side { reader: TopicReader::new(sensor), waiting: None, missed: 0, restarted: false }
+impl<P: Payload + ?Sized> JoinedTopic<P> {
+    fn new(sensor: &str) -> JoinedTopic<P> {
+        JoinedTopic { reader: TopicReader::new(sensor), waiting: None, missed: 0, restarted: false }
     }
 
     /// Receives a sample, if none waits.

@@ -216,8 +216,8 @@ impl Session {
     /// is unknown. The hub sends samples to late joiners without ringing the doorbell, so each check for the hub
     /// changes the value.
     pub fn sample_mark(&self, sensor: &str, topic: Topic) -> Option<(u32, Instant)> {
-        let rung = self.joined.as_ref()?.wakeups.ring_count(sensor, topic)?;
-        Some((rung, self.finder.checked_at()?))
+        let ring_count = self.joined.as_ref()?.wakeups.ring_count(sensor, topic)?;
+        Some((ring_count, self.finder.checked_at()?))
     }
 
     /// Returns a descriptor that is readable while a sample or a check may be due. The session waits by event from now

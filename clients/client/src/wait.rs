@@ -125,12 +125,12 @@ impl Wakeups {
     /// Returns whether a doorbell was rung since the last call. Samples that were sent before can be received now.
     fn has_rung(&mut self) -> bool {
         let mut any = false;
-        for Sensor { doorbell: bell, ring_counts: rung, .. } in &mut self.sensors {
-            let Some(bell) = bell else { continue };
-            for (ring, last_count) in DoorbellWord::ALL.into_iter().zip(rung) {
+        for Sensor { doorbell, ring_counts, .. } in &mut self.sensors {
+            let Some(doorbell) = doorbell else { continue };
+            for (word, last_count) in DoorbellWord::ALL.into_iter().zip(ring_counts) {
                 let Some(last_count) = last_count else { continue };
-                let rung = bell.ring_count(ring);
-                any |= std::mem::replace(last_count, rung) != rung;
+                let ring_count = doorbell.ring_count(word);
+                any |= std::mem::replace(last_count, ring_count) != ring_count;
             }
         }
         self.has_activity |= any;
@@ -308,7 +308,7 @@ mod tests {
         let hub = scanhub_shm::hub_node(&domain.1).unwrap();
         let node = scanhub_shm::join(&domain.1, Role::Subscriber).unwrap();
         let waker = WakeSender::new(&hub, "front").unwrap();
-        for (topics, told) in SUBSCRIBED_TOPICS.into_iter().zip([
+        for (topics, woken_by) in SUBSCRIBED_TOPICS.into_iter().zip([
             &[DoorbellWord::First][..],
             &[DoorbellWord::Last],
             &[DoorbellWord::First, DoorbellWord::Last],
@@ -322,7 +322,7 @@ mod tests {
                 waker.ring(ring);
                 let after =
                     topics.iter().map(|&topic| wakeups.ring_count("front", topic)).collect::<Vec<_>>();
-                let is_woken = told.contains(&ring);
+                let is_woken = woken_by.contains(&ring);
                 assert_eq!(
                     (wakeups.has_rung(), before != after),
                     (is_woken, is_woken),

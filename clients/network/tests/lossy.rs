@@ -189,9 +189,13 @@ impl Observations {
             if receiving.verdict(position) == Verdict::Unknown {
                 continue;
             }
-            let heard_at = self.arrived_at[position].expect("a verdict needs zones");
-            self.max_interval_ns = self.max_interval_ns.max(now - heard_at);
-            assert!(now - heard_at <= run.max_reaction_ns(), "{position}: for {} ms", (now - heard_at) / MS);
+            let received_at = self.arrived_at[position].expect("a verdict needs zones");
+            self.max_interval_ns = self.max_interval_ns.max(now - received_at);
+            assert!(
+                now - received_at <= run.max_reaction_ns(),
+                "{position}: for {} ms",
+                (now - received_at) / MS
+            );
             let Header { stamp_last_ns, period_us, .. } = self.published[position].expect("published").header;
             let since = now - receiving.since_start(stamp_last_ns);
             assert!(since <= limit_ns(1000 * u64::from(period_us)), "{position}: {} ms", since / MS);

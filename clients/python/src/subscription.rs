@@ -93,7 +93,7 @@ fn closed() -> Error {
 }
 
 /// Implements a subscription with the methods that all subscriptions share. `$convert` converts an item to an object.
-macro_rules! follower {
+macro_rules! subscriber {
     ($class:ident, |$py:ident, $item:ident| $convert:expr; $($own:tt)*) => {
         #[pymethods]
         impl $class {
@@ -168,7 +168,7 @@ pub(crate) struct Subscriber {
     notice: Option<Py<PyAny>>,
 }
 
-follower! {
+subscriber! {
     Subscriber, |py, sample| topics::wrap(py, sample);
 
     #[new]
@@ -202,7 +202,7 @@ pub(crate) struct RobotSubscriber {
     notice: Option<Py<PyAny>>,
 }
 
-follower! {
+subscriber! {
     RobotSubscriber, |py, verdict| robot(py, verdict);
 
     #[new]

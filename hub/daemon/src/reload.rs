@@ -130,9 +130,9 @@ impl Differences {
 fn merged(old: &Processing, new: &Processing) -> Processing {
     let mut settings = new.clone();
     if old.background.is_enabled {
-        let Background { learning, file, model, is_start_set: start_is_said, .. } = &old.background;
+        let Background { learning, file, model, is_start_set, .. } = &old.background;
         settings.background.learning.start = learning.start;
-        settings.background.is_start_set = *start_is_said;
+        settings.background.is_start_set = *is_start_set;
         (settings.background.file, settings.background.model) = (file.clone(), model.clone());
     }
     settings

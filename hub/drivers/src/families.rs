@@ -8,7 +8,7 @@ use crate::line::{
     self, Action, Control, DeviceInfo, Identity, KnownRate, Notice, RawScan, ReceivedTelegram, SessionStats,
     State,
 };
-use crate::lms::Inquiry;
+use crate::lms::IdentityProbe;
 use crate::settings::{Refusal, Settings, SettingsRequest};
 use crate::{ld, lms, rplidar, search};
 use scanhub_schema::{Counters, Family, Nanos, ScanHead, Status};
@@ -104,12 +104,12 @@ pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Setting
     }
 }
 
-/// Creates the inquiry of a scanner of `family`. The port is open at `rate`, in bits per second. `rate` is `None` for a
-/// serial server, on which the user sets the baud rate. Returns `None` for a family [without an
-/// inquiry](Features::has_inquiry).
-pub fn inquiry(family: Family, rate: Option<u32>, now: Nanos) -> Option<Inquiry> {
+/// Creates the probe of a scanner of `family`. The port is open at `rate`, in bits per second. `rate` is `None` for a
+/// serial server, on which the user sets the baud rate. Returns `None` for a family [without a
+/// probe](Features::has_probe).
+pub fn identity_probe(family: Family, rate: Option<u32>, now: Nanos) -> Option<IdentityProbe> {
     match family {
-        Family::Lms => Some(Inquiry::begin(rate, now)),
+        Family::Lms => Some(IdentityProbe::begin(rate, now)),
         Family::Ld | Family::Rplidar => None,
     }
 }
@@ -125,7 +125,7 @@ pub const ANY_FAMILY: Features = {
         can_stop_motor: false,
         streams_unrequested: false,
         has_whole_telegrams: true,
-        has_inquiry: false,
+        has_probe: false,
         array_flags: 0,
         max_telegram: 0,
     };
@@ -196,7 +196,7 @@ impl line::ScannerSession for Session {
         fn end(now: Nanos) -> bool;
         fn restore_identity(identity: Identity);
         fn hint_rate(known: KnownRate);
-        fn begin_at(rate: u32, now: Nanos);
+        fn set_start_rate(rate: u32, now: Nanos);
         fn restore_beams(model: Model, beams: usize);
         fn set_partial_reads(count: u8);
         fn mark_suspect(reasons: u8);

@@ -12,7 +12,7 @@ use scanhub_schema::{ArrayFlags, Family, MILLIS, Nanos};
 
 use crate::ld::packet::{Framer, PACKET_LEN, Packet};
 use crate::ld::sequence::{PacketPosition, PacketSequencer};
-use crate::line::family::{self, Approach, Evidence, Features, ListenStep, named, table};
+use crate::line::family::{self, Evidence, Features, ListenStep, SearchSteps, named, table};
 use crate::line::framing::fill;
 use crate::settings::Settings;
 
@@ -29,7 +29,7 @@ pub const FEATURES: Features = Features {
     can_stop_motor: false,
     streams_unrequested: true,
     has_whole_telegrams: false,
-    has_inquiry: false,
+    has_probe: false,
     array_flags: ArrayFlags::REVOLUTION,
     max_telegram: session::MAX_PACKETS_PER_SAMPLE * PACKET_LEN,
 };
@@ -144,8 +144,8 @@ impl Probe {
 }
 
 impl crate::line::family::Probe for Probe {
-    fn approach(&self) -> &'static Approach {
-        &APPROACH
+    fn search_steps(&self) -> &'static SearchSteps {
+        &SEARCH_STEPS
     }
 
     fn clear(&mut self) {
@@ -160,8 +160,8 @@ impl crate::line::family::Probe for Probe {
         }
     }
 
-    fn hold(&self) -> Option<Nanos> {
-        self.framer.buffer.hold()
+    fn hold_time(&self) -> Option<Nanos> {
+        self.framer.buffer.hold_time()
     }
 
     fn release(&mut self, idle: Nanos) {
@@ -178,7 +178,7 @@ impl crate::line::family::Probe for Probe {
     }
 }
 
-const APPROACH: Approach = Approach {
+const SEARCH_STEPS: SearchSteps = SearchSteps {
     family: Family::Ld,
     listen_steps: &[
         ListenStep { rate: Model::Ld19.baud(), duration: 150 * MILLIS, needs_bytes: false },

@@ -16,8 +16,8 @@ pub mod rplidar;
 pub mod search;
 mod settings;
 
-pub use families::{ANY_FAMILY, Problem, Session, features, inquiry, scan_heads};
+pub use families::{ANY_FAMILY, Problem, Session, features, identity_probe, scan_heads};
 pub use line::family::{Features, Model};
-pub use lms::inquiry::{Inquiry, Report};
+pub use lms::identity_probe::{IdentityProbe, Report};
 pub use port_session::PortSession;
 pub use settings::{AUTO, Key, Refusal, Settings, SettingsRequest, Value, auto_or, family_of};

@@ -9,7 +9,7 @@ pub mod configuration;
 pub mod explain;
 pub mod framer;
 pub mod header;
-pub mod inquiry;
+pub mod identity_probe;
 pub mod lms_model;
 pub mod measured;
 pub mod operating;
@@ -27,7 +27,7 @@ pub mod variant;
 
 use scanhub_schema::{ArrayFlags, Family, MICROS, MILLIS, Nanos, ScanHead};
 
-use crate::line::family::{Approach, Evidence, Features, ListenStep, Model, RequestSteps};
+use crate::line::family::{Evidence, Features, ListenStep, Model, RequestSteps, SearchSteps};
 use crate::lms::framer::{FoundItem, Framer};
 use crate::lms::header::{Reject, State};
 use crate::lms::lms_model::LmsModel as Type;
@@ -37,7 +37,7 @@ use crate::lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
 use crate::settings::{self, Key, Refusal, SettingsRequest, Value, refusal};
 
 pub use arrival_time::WakeLead;
-pub use inquiry::Inquiry;
+pub use identity_probe::IdentityProbe;
 pub use protocol_state::SILENCE_TIMEOUT;
 pub use sensor::{Notice, Problem, Sensor};
 pub use session::{LmsSession, Settings};
@@ -67,8 +67,8 @@ impl Probe {
 }
 
 impl crate::line::family::Probe for Probe {
-    fn approach(&self) -> &'static Approach {
-        &APPROACH
+    fn search_steps(&self) -> &'static SearchSteps {
+        &SEARCH_STEPS
     }
 
     fn clear(&mut self) {
@@ -89,8 +89,8 @@ impl crate::line::family::Probe for Probe {
         }
     }
 
-    fn hold(&self) -> Option<Nanos> {
-        self.framer.hold()
+    fn hold_time(&self) -> Option<Nanos> {
+        self.framer.hold_time()
     }
 
     fn release(&mut self, idle: Nanos) {
@@ -112,7 +112,7 @@ impl crate::line::family::Probe for Probe {
     }
 }
 
-const APPROACH: Approach = Approach {
+const SEARCH_STEPS: SearchSteps = SearchSteps {
     family: Family::Lms,
     // Only at this rate can several telegrams of a stream arrive in one listening step.
     listen_steps: &[ListenStep { rate: 500_000, duration: 120 * MILLIS, needs_bytes: true }],
@@ -151,7 +151,7 @@ pub const FEATURES: Features = Features {
     can_stop_motor: false,
     streams_unrequested: false,
     has_whole_telegrams: true,
-    has_inquiry: true,
+    has_probe: true,
     array_flags: ArrayFlags::UPPER,
     max_telegram: MAX_TELEGRAM,
 };
@@ -255,9 +255,9 @@ mod tests {
 
     #[test]
     fn requests_are_those_for_type_and_status() {
-        let asks = APPROACH.request_steps.unwrap();
-        assert_eq!(asks.requests[0], Request::Type.encode(0).bytes());
-        assert_eq!(asks.requests[1], Request::Status.encode(0).bytes());
-        assert!(asks.rates.iter().all(|&rate| Baud::of_rate(rate).is_some()));
+        let steps = SEARCH_STEPS.request_steps.unwrap();
+        assert_eq!(steps.requests[0], Request::Type.encode(0).bytes());
+        assert_eq!(steps.requests[1], Request::Status.encode(0).bytes());
+        assert!(steps.rates.iter().all(|&rate| Baud::of_rate(rate).is_some()));
     }
 }

@@ -187,7 +187,7 @@ impl PortSession {
             session.restore_identity(identity);
         }
         if let Some(rate) = rate {
-            session.begin_at(rate, begins);
+            session.set_start_rate(rate, begins);
         }
         if let Some((_, model, beams)) = self.last.filter(|(last, ..)| *last == family) {
             session.restore_beams(model, beams);

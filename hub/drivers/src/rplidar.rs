@@ -13,7 +13,7 @@ mod stream;
 
 use scanhub_schema::{ArrayFlags, Family, MILLIS};
 
-use crate::line::family::{self, Approach, Evidence, Features, RequestSteps, StopRequest, named, table};
+use crate::line::family::{self, Evidence, Features, RequestSteps, SearchSteps, StopRequest, named, table};
 use crate::line::framing::fill;
 use crate::rplidar::framer::{ExpectedBytes, Framer, FramerEvent};
 use crate::rplidar::packet::PacketFormat;
@@ -34,7 +34,7 @@ pub const FEATURES: Features = Features {
     can_stop_motor: true,
     streams_unrequested: false,
     has_whole_telegrams: false,
-    has_inquiry: false,
+    has_probe: false,
     array_flags: ArrayFlags::REVOLUTION,
     max_telegram: stream::MAX_SAMPLE_LEN,
 };
@@ -238,8 +238,8 @@ impl Default for Probe {
 }
 
 impl crate::line::family::Probe for Probe {
-    fn approach(&self) -> &'static Approach {
-        &APPROACH
+    fn search_steps(&self) -> &'static SearchSteps {
+        &SEARCH_STEPS
     }
 
     fn clear(&mut self) {
@@ -282,7 +282,7 @@ impl crate::line::family::Probe for Probe {
     }
 }
 
-const APPROACH: Approach = Approach {
+const SEARCH_STEPS: SearchSteps = SearchSteps {
     family: Family::Rplidar,
     listen_steps: &[],
     request_steps: Some(RequestSteps {
@@ -324,8 +324,8 @@ mod tests {
 
     #[test]
     fn requests_are_those_to_stop_and_for_the_identity() {
-        let asks = APPROACH.request_steps.unwrap();
-        assert_eq!(asks.stop.unwrap().request, Request::STOP.bytes());
-        assert_eq!(asks.requests, [Request::INFO.bytes()]);
+        let steps = SEARCH_STEPS.request_steps.unwrap();
+        assert_eq!(steps.stop.unwrap().request, Request::STOP.bytes());
+        assert_eq!(steps.requests, [Request::INFO.bytes()]);
     }
 }

@@ -11,7 +11,7 @@
 //! pauses get longer.
 //!
 //! The search sends only requests that no scanner of another family accepts, at any baud rate, and that do not change
-//! anything. Each family declares them in its [`Approach`]. Resets, motor requests, changes of settings and of the line
+//! anything. Each family declares them in its [`SearchSteps`]. Resets, motor requests, changes of settings and of the line
 //! DTR belong to the sessions. In the first 150 ms after the port was opened, the search sends no byte.
 //!
 //! The search is a [`Protocol`]. It is done when it has [found](Search::found) the scanner. The bytes of its last step
@@ -22,7 +22,7 @@ use core::fmt;
 use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::families::probes;
-use crate::line::family::{Approach, Evidence, Probe, RequestSteps};
+use crate::line::family::{Evidence, Probe, RequestSteps, SearchSteps};
 use crate::line::{Action, Protocol, SessionStats};
 
 /// Result of a successful search.
@@ -202,7 +202,7 @@ impl Search {
     pub fn opening_rate(memory: Option<Memory>) -> u32 {
         let probes = probes();
         let first =
-            probes.iter().find_map(|probe| probe.approach().listen_steps.first().map(|step| step.rate));
+            probes.iter().find_map(|probe| probe.search_steps().listen_steps.first().map(|step| step.rate));
         let memory = memory.and_then(|memory| memory.checked(&probes));
         memory.map(|memory| memory.stream_rate).or(first).unwrap_or(BOOT_RATE)
     }
@@ -249,7 +249,7 @@ impl Search {
 
     /// Restricts a new search to scanners of `family`.
     pub fn restricted_to(mut self, family: Family) -> Search {
-        self.probes.retain(|probe| probe.approach().family == family);
+        self.probes.retain(|probe| probe.search_steps().family == family);
         self.begin_round();
         self
     }
@@ -277,14 +277,13 @@ impl Search {
 
     /// Returns the baud rates at which the search tries to find each family, in the order of [`Family::ALL`].
     pub fn coverage(&self) -> Vec<Coverage> {
-        let approach_of = |family| {
-            self.probes.iter().map(|probe| probe.approach()).find(|approach| approach.family == family)
+        let steps_of = |family| {
+            self.probes.iter().map(|probe| probe.search_steps()).find(|steps| steps.family == family)
         };
-        let approaches = Family::ALL.into_iter().filter_map(approach_of);
-        let coverage = approaches.map(|approach| {
-            let (rejected, rates) =
-                approach.rates().into_iter().partition(|rate| self.rejected.contains(rate));
-            Coverage { family: approach.family, rates, rejected, advice: approach.advice }
+        let all_steps = Family::ALL.into_iter().filter_map(steps_of);
+        let coverage = all_steps.map(|steps| {
+            let (rejected, rates) = steps.rates().into_iter().partition(|rate| self.rejected.contains(rate));
+            Coverage { family: steps.family, rates, rejected, advice: steps.advice }
         });
         coverage.collect()
     }
@@ -313,10 +312,10 @@ impl Search {
     /// Ends the search if a probe has recognized a scanner.
     fn check_evidence(&mut self) {
         for probe in &self.probes {
-            let approach = probe.approach();
+            let steps = probe.search_steps();
             let Evidence::Found(model) = probe.evidence() else { continue };
-            self.found = Some(FoundScanner { family: approach.family, model, rate: self.rate });
-            if approach.request_steps.is_some_and(|asks| asks.stop.is_some())
+            self.found = Some(FoundScanner { family: steps.family, model, rate: self.rate });
+            if steps.request_steps.is_some_and(|requests| requests.stop.is_some())
                 && self.port != PortKind::Recording
             {
                 self.capture.discard(self.reply_offset);
@@ -369,7 +368,7 @@ impl Search {
     /// Extends the wait a little, up to `at_most`, if a transmission has begun. Returns whether a transmission has
     /// begun.
     fn extend(&mut self, until: Nanos, at_most: Nanos) -> bool {
-        let mut probes = self.probes.iter().filter(|probe| listens_at(probe.approach(), self.rate));
+        let mut probes = self.probes.iter().filter(|probe| listens_at(probe.search_steps(), self.rate));
         if self.now >= at_most || !probes.any(|probe| probe.evidence() == Evidence::Partial) {
             return false;
         }
@@ -421,17 +420,17 @@ impl Search {
                 self.phase = Phase::Listening { until, at_most: until.saturating_add(extension) };
             }
             StepAction::Request(probe) => {
-                let Some(asks) = self.probes[probe].approach().request_steps.as_ref() else { return };
+                let Some(requests) = self.probes[probe].search_steps().request_steps.as_ref() else { return };
                 self.is_memory_requested |= step.condition == StepCondition::KnownScanner;
-                let repeats = if self.is_slow_round() { asks.repeats.saturating_sub(1) } else { 0 };
+                let repeats = if self.is_slow_round() { requests.repeats.saturating_sub(1) } else { 0 };
                 let ask = RequestState {
                     probe,
-                    steps: asks,
+                    steps: requests,
                     repeats,
                     retries: MAX_RETRIES,
-                    is_stop: asks.stop.is_some(),
+                    is_stop: requests.stop.is_some(),
                 };
-                let ready_at = if self.change_rate { self.now + asks.settle_time } else { self.now };
+                let ready_at = if self.change_rate { self.now + requests.settle_time } else { self.now };
                 self.phase = Phase::Settling { ask, until: ready_at.max(self.opened_at + SILENT_AFTER_OPEN) };
             }
         }
@@ -489,7 +488,7 @@ impl Search {
         self.bytes_per_second = self.bytes_per_second.filter(is_same).or(measured);
         let pause = if bytes == 0 { PAUSES[self.round.min(PAUSES.len() - 1)] } else { 0 };
         self.round += 1;
-        let boot_rate = self.probes.iter().find_map(|probe| probe.approach().boot_rate);
+        let boot_rate = self.probes.iter().find_map(|probe| probe.search_steps().boot_rate);
         if let Some(rate) = boot_rate.filter(|rate| !self.rejected.contains(rate))
             && pause > 0
             && self.port == PortKind::Serial
@@ -505,10 +504,10 @@ impl Search {
         self.round % 2 == 1
     }
 
-    fn reply_timeout(&self, asks: &RequestSteps) -> Nanos {
+    fn reply_timeout(&self, requests: &RequestSteps) -> Nanos {
         match self.port {
-            PortKind::Serial if self.is_slow_round() => asks.reply_timeout + asks.extra_reply_time,
-            PortKind::Serial => asks.reply_timeout,
+            PortKind::Serial if self.is_slow_round() => requests.reply_timeout + requests.extra_reply_time,
+            PortKind::Serial => requests.reply_timeout,
             PortKind::Server | PortKind::Recording => SERVER_STEP_TIME,
         }
     }
@@ -526,7 +525,7 @@ impl Search {
                 numbers.sort_by_key(is_other);
                 for number in numbers
                     .into_iter()
-                    .filter(|&number| self.probes[number].approach().request_steps.is_some())
+                    .filter(|&number| self.probes[number].search_steps().request_steps.is_some())
                 {
                     push(StepCondition::Always, None, StepAction::Request(number));
                 }
@@ -537,14 +536,14 @@ impl Search {
                 if let Some(Memory { family, stream_rate, reply_rate }) = memory
                     && let Some(number) = (0..self.probes.len()).find(|&number| self.family(number) == family)
                 {
-                    let approach = self.probes[number].approach();
-                    let telegrams = 2 * line_time(approach.max_transmission, stream_rate);
+                    let steps = self.probes[number].search_steps();
+                    let telegrams = 2 * line_time(steps.max_transmission, stream_rate);
                     push(
                         StepCondition::Always,
                         Some(stream_rate),
                         StepAction::Listen(SILENT_AFTER_OPEN, telegrams),
                     );
-                    if approach.request_steps.is_some() {
+                    if steps.request_steps.is_some() {
                         remembered.push((number, reply_rate));
                         remembered.extend((stream_rate != reply_rate).then_some((number, stream_rate)));
                     }
@@ -554,7 +553,7 @@ impl Search {
                 }
                 for needs_bytes in [false, true] {
                     let condition = if needs_bytes { StepCondition::Bytes } else { StepCondition::Always };
-                    let listens = self.probes.iter().flat_map(|probe| probe.approach().listen_steps);
+                    let listens = self.probes.iter().flat_map(|probe| probe.search_steps().listen_steps);
                     for listen in listens.filter(|listen| listen.needs_bytes == needs_bytes) {
                         if memory.is_none_or(|memory| memory.stream_rate != listen.rate) {
                             push(
@@ -581,14 +580,14 @@ impl Search {
     }
 
     fn family(&self, number: usize) -> Family {
-        self.probes[number].approach().family
+        self.probes[number].search_steps().family
     }
 
     /// Returns the baud rates at which the search sends requests of a family. The rates in `memory` come first.
     fn rates(&self, number: usize) -> Vec<u32> {
-        let approach = self.probes[number].approach();
-        let mut rates = approach.request_steps.map_or_else(Vec::new, |asks| asks.rates.to_vec());
-        if let Some(memory) = self.memory.filter(|memory| memory.family == approach.family) {
+        let steps = self.probes[number].search_steps();
+        let mut rates = steps.request_steps.map_or_else(Vec::new, |requests| requests.rates.to_vec());
+        if let Some(memory) = self.memory.filter(|memory| memory.family == steps.family) {
             let order = [memory.reply_rate, memory.stream_rate];
             rates.sort_by_key(|rate| order.iter().position(|first| first == rate).unwrap_or(order.len()));
         }
@@ -617,7 +616,7 @@ impl Protocol for Search {
             _ => {}
         }
         for probe in &mut self.probes {
-            if listens_at(probe.approach(), self.rate) {
+            if listens_at(probe.search_steps(), self.rate) {
                 probe.receive(self.capture.last(len));
             }
         }
@@ -685,7 +684,7 @@ impl Protocol for Search {
                 | Phase::Pausing { until } => *until,
             };
             if until > self.now {
-                let holds = self.probes.iter().filter_map(|probe| probe.hold());
+                let holds = self.probes.iter().filter_map(|probe| probe.hold_time());
                 let held_until = holds.map(|hold| self.last_byte + hold).filter(|&at| at > self.now).min();
                 return Action::Wait { until: until.min(held_until.unwrap_or(Nanos::MAX)) };
             }
@@ -698,9 +697,9 @@ impl Memory {
     /// Returns the memory if the search can use its baud rates for its family. Replaces an unknown reply rate by the
     /// stream rate. Returns `None` if the stream rate is unknown.
     fn checked(self, probes: &[Box<dyn Probe>]) -> Option<Memory> {
-        let approach =
-            probes.iter().map(|probe| probe.approach()).find(|approach| approach.family == self.family)?;
-        let is_known = |rate| listens_at(approach, Some(rate));
+        let steps =
+            probes.iter().map(|probe| probe.search_steps()).find(|steps| steps.family == self.family)?;
+        let is_known = |rate| listens_at(steps, Some(rate));
         let reply_rate = if is_known(self.reply_rate) { self.reply_rate } else { self.stream_rate };
         is_known(self.stream_rate).then_some(Memory { reply_rate, ..self })
     }
@@ -819,9 +818,9 @@ impl fmt::Display for Problem {
 }
 
 /// Returns whether scanners of a family may use `rate`. Returns `true` if the rate is unknown.
-fn listens_at(approach: &Approach, rate: Option<u32>) -> bool {
-    let asks = approach.request_steps.map_or(&[][..], |asks| asks.rates);
-    let mut rates = approach.listen_steps.iter().map(|listen| listen.rate).chain(asks.iter().copied());
+fn listens_at(steps: &SearchSteps, rate: Option<u32>) -> bool {
+    let requests = steps.request_steps.map_or(&[][..], |requests| requests.rates);
+    let mut rates = steps.listen_steps.iter().map(|listen| listen.rate).chain(requests.iter().copied());
     rate.is_none_or(|rate| rates.any(|known| known == rate))
 }
 
@@ -900,7 +899,7 @@ mod tests {
     fn skips_families_with_only_rejected_rates() {
         let mut search = Search::new(PortKind::Serial, None, 0);
         let (ld, lms) = (crate::ld::Probe::default(), crate::lms::Probe::default());
-        let rates = |probe: &dyn Probe| probe.approach().rates();
+        let rates = |probe: &dyn Probe| probe.search_steps().rates();
         search.rejected = [rates(&ld), vec![500_000]].concat();
         let coverage = search.coverage();
         let of = |family| coverage.iter().find(|it| it.family == family).expect("all families");

@@ -4,7 +4,7 @@
 
 use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::{CONFIGURATION_LEN, Configuration, ITEMS, Item};
-use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::identity_probe::Report;
 use scanhub_drivers::lms::variant::Baud;
 
 use crate::eeprom::PowerOn;

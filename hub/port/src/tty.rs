@@ -304,7 +304,7 @@ fn check_rate(result: Result<(), Errno>, actual: u32, requested: u32) -> Result<
         Ok(()) | Err(Errno::INVAL) if !is_near(actual, requested) => {
             Err(PortError::Rate { requested, actual })
         }
-        told => Ok(told?),
+        result => Ok(result?),
     }
 }
 

@@ -242,9 +242,9 @@ fn a_line_says_how_well_it_is_known() {
     };
     let reported = |of: fn(&Line) -> f32| found.iter().map(|line| f64::from(of(line))).sum::<f64>() / count;
     let (r, alpha) = (spread(|line| line.r_m), spread(|line| line.alpha_rad));
-    let (said_r, said_alpha) = (reported(|line| line.sd_r_m), reported(|line| line.sd_alpha_rad));
-    assert!((0.8..1.25).contains(&(said_r / r)), "{said_r} m, and it is {r}");
-    assert!((0.8..1.25).contains(&(said_alpha / alpha)), "{said_alpha}, and it is {alpha}");
+    let (reported_r, reported_alpha) = (reported(|line| line.sd_r_m), reported(|line| line.sd_alpha_rad));
+    assert!((0.8..1.25).contains(&(reported_r / r)), "{reported_r} m, and it is {r}");
+    assert!((0.8..1.25).contains(&(reported_alpha / alpha)), "{reported_alpha}, and it is {alpha}");
 }
 
 /// The points of a scanner with exact angles do not lie on the grid of beams.

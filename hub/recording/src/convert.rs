@@ -318,7 +318,7 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
         });
         let message = format!(
             "{} has telegrams of families {one} and {other}, because the scanner was replaced; raw bytes of both cannot be \
-             told apart",
+             distinguished",
             recording.path().display()
         );
         let hint = "name OUT.mcap, which keeps the family of each telegram, or OUT.csv for the scans";

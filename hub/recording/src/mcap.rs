@@ -1,5 +1,5 @@
 //! MCAP files that the hub recorded. [`Reader`] yields the telegrams of all sensors and all other records, [`Catalog`]
-//! has the channels, and [`Survey`] has the contents of the whole file, which is read once before it is used.
+//! has the channels, and [`FileSummary`] has the contents of the whole file, which is read once before it is used.
 
 mod records;
 
@@ -106,7 +106,7 @@ impl<R: Read> Reader<R> {
 
 /// Contents of a file that was read to its end.
 #[derive(Debug, Default)]
-pub(crate) struct Survey {
+pub(crate) struct FileSummary {
     whole: Contents,
     sensors: BTreeMap<String, Contents>,
     catalog: Catalog,
@@ -118,43 +118,43 @@ pub(crate) struct Survey {
     runs: usize,
 }
 
-impl Survey {
+impl FileSummary {
     /// Reads the file that `open` opens. A damaged file may be read twice, because its index can name channels whose first
     /// chunk is lost.
     ///
     /// # Errors
     ///
     /// Returns the errors of `open` and of [`Reader::next`].
-    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>) -> io::Result<Survey> {
-        let (survey, is_complete) = Survey::read(Reader::new(open()?, Catalog::default()))?;
+    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>) -> io::Result<FileSummary> {
+        let (summary, is_complete) = FileSummary::read(Reader::new(open()?, Catalog::default()))?;
         if is_complete {
-            return Ok(survey);
+            return Ok(summary);
         }
-        Survey::read(Reader::new(open()?, survey.catalog)).map(|(survey, _)| survey)
+        FileSummary::read(Reader::new(open()?, summary.catalog)).map(|(summary, _)| summary)
     }
 
     /// Reads a file, and returns whether all of its messages have known channels.
-    fn read<R: Read>(mut reader: Reader<R>) -> io::Result<(Survey, bool)> {
-        let mut survey = Survey::default();
+    fn read<R: Read>(mut reader: Reader<R>) -> io::Result<(FileSummary, bool)> {
+        let mut summary = FileSummary::default();
         while let Some(item) = reader.next()? {
             match item {
-                Item::Telegram(sample) => survey.note(&sample),
-                Item::Record(record) => survey.note_record(&reader.catalog, &record),
+                Item::Telegram(sample) => summary.note(&sample),
+                Item::Record(record) => summary.note_record(&reader.catalog, &record),
             }
         }
-        survey.whole.sensors = reader.catalog.sensors();
-        for sensor in &survey.whole.sensors {
-            of_sensor(&mut survey.sensors, sensor);
+        summary.whole.sensors = reader.catalog.sensors();
+        for sensor in &summary.whole.sensors {
+            of_sensor(&mut summary.sensors, sensor);
         }
-        let named: HashSet<_> = survey.whole.sensors.iter().collect();
-        let nameless: Vec<_> = survey.sensors.keys().filter(|name| !named.contains(name)).cloned().collect();
-        survey.whole.sensors.extend(nameless);
+        let named: HashSet<_> = summary.whole.sensors.iter().collect();
+        let nameless: Vec<_> = summary.sensors.keys().filter(|name| !named.contains(name)).cloned().collect();
+        summary.whole.sensors.extend(nameless);
         let damage = reader.records.damage();
-        for contents in std::iter::once(&mut survey.whole).chain(survey.sensors.values_mut()) {
+        for contents in std::iter::once(&mut summary.whole).chain(summary.sensors.values_mut()) {
             contents.damage = Damage { telegrams: contents.damage.telegrams, ..damage };
         }
-        survey.catalog = reader.catalog;
-        Ok((survey, !reader.has_unknown))
+        summary.catalog = reader.catalog;
+        Ok((summary, !reader.has_unknown))
     }
 
     /// Returns the contents of the whole file.

@@ -24,7 +24,7 @@ pub struct Recording {
     contents: Contents,
     /// Contents of an MCAP file, by sensor.
     #[cfg(feature = "mcap")]
-    survey: std::sync::Arc<crate::mcap::Survey>,
+    summary: std::sync::Arc<crate::mcap::FileSummary>,
     /// Sensor that [`of`](Self::of) selected.
     sensor: Option<String>,
 }
@@ -93,16 +93,17 @@ impl Recording {
             path,
             contents,
             #[cfg(feature = "mcap")]
-            survey: Default::default(),
+            summary: Default::default(),
             sensor: None,
         })
     }
 
     #[cfg(feature = "mcap")]
     fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
-        let survey = crate::mcap::Survey::of(|| open(&path)).map_err(|error| unreadable(&path, &error))?;
-        let contents = survey.contents();
-        Ok(Recording { path, contents, survey: survey.into(), sensor: None })
+        let summary =
+            crate::mcap::FileSummary::of(|| open(&path)).map_err(|error| unreadable(&path, &error))?;
+        let contents = summary.contents();
+        Ok(Recording { path, contents, summary: summary.into(), sensor: None })
     }
 
     #[cfg(not(feature = "mcap"))]
@@ -135,7 +136,7 @@ impl Recording {
         let mut chosen = self.clone();
         #[cfg(feature = "mcap")]
         {
-            chosen.contents = self.survey.contents_of(sensor);
+            chosen.contents = self.summary.contents_of(sensor);
         }
         chosen.sensor = Some(sensor.to_owned());
         Ok(chosen)
@@ -146,7 +147,7 @@ impl Recording {
     /// it; only MCAP files do.
     pub fn first_understood(&self, boot: u64) -> Option<u64> {
         #[cfg(feature = "mcap")]
-        return self.survey.first_understood(self.contents.sensors.first()?, boot);
+        return self.summary.first_understood(self.contents.sensors.first()?, boot);
         #[cfg(not(feature = "mcap"))]
         {
             let _ = boot;
@@ -282,7 +283,7 @@ impl Recording {
                 return Err(Failure::new(Kind::Usage, message, self.sensor_choice()));
             }
         };
-        Ok(Box::new(self.survey.frames(reader, sensor)))
+        Ok(Box::new(self.summary.frames(reader, sensor)))
     }
 
     #[cfg(not(feature = "mcap"))]
@@ -297,13 +298,13 @@ impl Recording {
     /// Returns a reader of all records of an MCAP file, and its channels.
     #[cfg(feature = "mcap")]
     pub(crate) fn reader(&self) -> Result<(Reader<impl Read + use<>>, &Catalog), Failure> {
-        Ok((self.survey.reader(reader(&self.path)?), self.survey.catalog()))
+        Ok((self.summary.reader(reader(&self.path)?), self.summary.catalog()))
     }
 
     /// Returns the names of the mounts whose angles are in the recording.
     pub fn mounts(&self) -> Vec<String> {
         #[cfg(feature = "mcap")]
-        return self.survey.catalog().mounts();
+        return self.summary.catalog().mounts();
         #[cfg(not(feature = "mcap"))]
         Vec::new()
     }
@@ -316,7 +317,7 @@ impl Recording {
     /// Returns [`Kind::Input`] if the file cannot be opened.
     #[cfg(feature = "mcap")]
     pub fn angles(&self, mount: &str) -> Result<Box<dyn Iterator<Item = MountRecord> + Send>, Failure> {
-        Ok(Box::new(self.survey.angles(reader(&self.path)?, mount.to_owned())))
+        Ok(Box::new(self.summary.angles(reader(&self.path)?, mount.to_owned())))
     }
 
     /// Returns no angles, because only MCAP files contain them.

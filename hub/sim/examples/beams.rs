@@ -62,7 +62,7 @@ where
             }
         }
     }
-    (revolutions, session.beams().expect("it was heard"))
+    (revolutions, session.beams().expect("a beam count"))
 }
 
 /// A grid and the arrays that it fills.

@@ -98,9 +98,8 @@ impl LdSimulator {
     }
 
     fn of(settings: LdSettings, source: Source) -> LdSimulator {
-        let LdSettings { revolutions_per_second: turns_per_second, speed_variation: wander, seed, .. } =
-            settings;
-        let rotation = Rotation::new(turns_per_second, wander, 0.0, seed);
+        let LdSettings { revolutions_per_second, speed_variation: wander, seed, .. } = settings;
+        let rotation = Rotation::new(revolutions_per_second, wander, 0.0, seed);
         let tx_queue = TxQueue::new(settings.model.baud(), settings.chunk);
         LdSimulator { settings, source, power_ns: 0, rotates_from_ns: 0, sent: 0, rotation, tx_queue }
     }
@@ -149,9 +148,8 @@ impl LdSimulator {
         let broken = self.tx_queue.abort(now);
         self.power_ns = now;
         self.rotates_from_ns = now + boot_ns;
-        let LdSettings { revolutions_per_second: turns_per_second, speed_variation: wander, seed, .. } =
-            self.settings;
-        (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, spin_up_s, seed), 0);
+        let LdSettings { revolutions_per_second, speed_variation: wander, seed, .. } = self.settings;
+        (self.rotation, self.sent) = (Rotation::new(revolutions_per_second, wander, spin_up_s, seed), 0);
         if let Source::Recorded { elapsed_ms: passed_ms, .. } = &mut self.source {
             *passed_ms = 0;
         }

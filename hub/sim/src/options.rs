@@ -189,7 +189,7 @@ impl SimulateOptions {
                 ("indices", self.indices || self.short_configuration),
                 ("recording", self.replay.is_some() && talks),
             ];
-            if let Some((name, _)) = lms.into_iter().find(|(_, is_said)| *is_said) {
+            if let Some((name, _)) = lms.into_iter().find(|(_, is_set)| *is_set) {
                 let message = format!("a scanner {} has no {name} to choose", scanner.name());
                 let hint = match name {
                     "state" if talks => "use idle, streaming or starting, or --family lms",

@@ -158,28 +158,28 @@ mod tests {
     use scanhub_drivers::lms::command::Request;
 
     /// Returns the time at which a status request is received whose bytes have `gap` of idle time between them.
-    fn heard_at(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> Option<Nanos> {
+    fn accepted_at(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> Option<Nanos> {
         let request = Request::Status.encode(0);
         let step = line_time(1, 9_600) + gap;
-        let mut heard = None;
+        let mut decoded = None;
         for (i, &byte) in request.bytes().iter().enumerate() {
             let at = start + i as Nanos * step;
             let arrival = Arrival { not_before: at.saturating_sub(width), not_after: at + width };
-            heard = heard.or(decoder.receive(byte, arrival, 9_600));
+            decoded = decoded.or(decoder.receive(byte, arrival, 9_600));
         }
-        heard.filter(|heard| heard.bytes == request.bytes()).map(|heard| heard.at)
+        decoded.filter(|decoded| decoded.bytes == request.bytes()).map(|decoded| decoded.at)
     }
 
-    fn heard(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> bool {
-        heard_at(decoder, start, gap, width).is_some()
+    fn is_accepted(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> bool {
+        accepted_at(decoder, start, gap, width).is_some()
     }
 
     /// Returns the time at which a status request is received that is written at once at `start`.
     fn written_at_once(decoder: &mut RequestDecoder, start: Nanos, baud: u32) -> Option<Nanos> {
         let request = Request::Status.encode(0);
-        let heard =
+        let decoded =
             request.bytes().iter().filter_map(|&byte| decoder.receive(byte, Arrival::at(start), baud)).last();
-        heard.filter(|heard| heard.bytes == request.bytes()).map(|heard| heard.at)
+        decoded.filter(|decoded| decoded.bytes == request.bytes()).map(|decoded| decoded.at)
     }
 
     #[test]
@@ -219,13 +219,16 @@ mod tests {
             (6_100 * MICROS, MILLIS, true),
         ] {
             let mut decoder = RequestDecoder::new(1.0, false);
-            assert_eq!(heard(&mut decoder, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
+            assert_eq!(is_accepted(&mut decoder, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
             assert_eq!(
                 decoder.take_dropped(),
                 (!expected).then_some(DroppedRequest::LongGap { after: 1 }),
                 "{gap}"
             );
-            assert!(heard(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
+            assert!(
+                is_accepted(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0),
+                "not accepted again after {gap}"
+            );
             assert_eq!(decoder.take_dropped(), None);
         }
         // Bytes that were written at once need their time on the line, and the gap begins after it.
@@ -235,9 +238,9 @@ mod tests {
         for (pause, expected) in [(4 * byte_ns + 6 * MILLIS, true), (4 * byte_ns + 6 * MILLIS + 1, false)] {
             let mut decoder = RequestDecoder::new(1.0, false);
             assert!(head.iter().all(|&byte| decoder.receive(byte, Arrival::at(0), 9_600).is_none()));
-            let heard =
+            let decoded =
                 tail.iter().filter_map(|&byte| decoder.receive(byte, Arrival::at(pause), 9_600)).count();
-            assert_eq!(heard == 1, expected, "{pause}");
+            assert_eq!(decoded == 1, expected, "{pause}");
             assert_eq!(decoder.take_dropped(), (!expected).then_some(DroppedRequest::LongGap { after: 4 }));
         }
     }
@@ -257,11 +260,14 @@ mod tests {
             (6_100 * MICROS, MILLIS, true),
         ] {
             let mut decoder = RequestDecoder::new(1.0, true);
-            assert_eq!(heard(&mut decoder, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
+            assert_eq!(is_accepted(&mut decoder, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
             let dropped =
                 if gap < MIN_GAP { DroppedRequest::ShortGap } else { DroppedRequest::LongGap { after: 1 } };
             assert_eq!(decoder.take_dropped(), (!expected).then_some(dropped), "{gap} {width}");
-            assert!(heard(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
+            assert!(
+                is_accepted(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0),
+                "not accepted again after {gap}"
+            );
         }
     }
 
@@ -272,9 +278,9 @@ mod tests {
         for (window, expected) in [(least, true), (least - 1, false)] {
             let mut decoder = RequestDecoder::new(1.0, true);
             let arrival = Arrival { not_before: 5 * MILLIS, not_after: 5 * MILLIS + window };
-            let heard =
+            let decoded =
                 request.bytes().iter().filter_map(|&byte| decoder.receive(byte, arrival, 9_600)).count();
-            assert_eq!(heard == 1, expected, "{window}");
+            assert_eq!(decoded == 1, expected, "{window}");
         }
     }
 
@@ -283,8 +289,8 @@ mod tests {
         let mut decoder = RequestDecoder::new(1.0, false);
         let arrival = Arrival { not_before: 5 * MILLIS, not_after: 25 * MILLIS };
         let request = Request::Status.encode(0);
-        let heard = request.bytes().iter().filter_map(|&byte| decoder.receive(byte, arrival, 9_600)).last();
-        assert_eq!(heard.map(|heard| heard.at), Some(25 * MILLIS));
+        let decoded = request.bytes().iter().filter_map(|&byte| decoder.receive(byte, arrival, 9_600)).last();
+        assert_eq!(decoded.map(|decoded| decoded.at), Some(25 * MILLIS));
     }
 
     #[test]
@@ -292,12 +298,12 @@ mod tests {
         // At four times the speed, 240 us of the scanner are 60 us of the host.
         let mut decoder = RequestDecoder::new(4.0, true);
         let request = Request::Stop.encode(0);
-        let mut heard = None;
+        let mut decoded = None;
         for (i, &byte) in request.bytes().iter().enumerate() {
             let at = 4 * i as Nanos * (line_time(1, 500_000) + 60 * MICROS);
-            heard = heard.or(decoder.receive(byte, Arrival::at(at), 500_000));
+            decoded = decoded.or(decoder.receive(byte, Arrival::at(at), 500_000));
         }
-        assert!(heard.is_some());
+        assert!(decoded.is_some());
     }
 
     #[test]
@@ -307,7 +313,7 @@ mod tests {
             for byte in [0x00, 0xFF, 0x06] {
                 assert_eq!(decoder.receive(byte, Arrival::at(0), 9_600), None);
             }
-            assert!(heard(&mut decoder, 100 * MILLIS, 100 * MICROS, 0));
+            assert!(is_accepted(&mut decoder, 100 * MILLIS, 100 * MICROS, 0));
             // An impossible length is dropped at once.
             for (i, byte) in [STX, 0, 0xFF, 0xFF].into_iter().enumerate() {
                 assert_eq!(
@@ -315,7 +321,7 @@ mod tests {
                     None
                 );
             }
-            assert!(heard(&mut decoder, 210 * MILLIS, 100 * MICROS, 0));
+            assert!(is_accepted(&mut decoder, 210 * MILLIS, 100 * MICROS, 0));
             assert_eq!(decoder.take_dropped(), None);
         }
     }

@@ -201,11 +201,9 @@ impl RplidarSimulator {
 
     /// Returns the motion of a motor that starts at `now`, with this share of its usual speed.
     fn motion(&self, now: Nanos, share: f64) -> Motion {
-        let RplidarSettings {
-            revolutions_per_second: turns_per_second, speed_variation: wander, seed, ..
-        } = self.settings;
-        let turns_per_second = turns_per_second * share;
-        let rotation = Rotation::new(turns_per_second, wander, SPIN_UP_TIME_S, seed);
+        let RplidarSettings { revolutions_per_second, speed_variation: wander, seed, .. } = self.settings;
+        let revolutions_per_second = revolutions_per_second * share;
+        let rotation = Rotation::new(revolutions_per_second, wander, SPIN_UP_TIME_S, seed);
         Motion { since_ns: now, steady_ns: now + SETTLE_TIME_NS, rotation }
     }
 

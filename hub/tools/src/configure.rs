@@ -12,10 +12,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use clap::Args;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{QueueSelector, tcflush};
-use scanhub_drivers::Inquiry;
+use scanhub_drivers::IdentityProbe;
 use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::{Item, availability_text};
-use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::identity_probe::Report;
 use scanhub_drivers::lms::lms_model::LmsModel;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::variant::{Mode, Unit};
@@ -101,8 +101,8 @@ impl ConfigureArgs {
         check_unused(&source, locations)?;
         let (port, first) = open(&source, stop)?;
         let rate = if let PortSpec::Tcp { .. } = source { None } else { Some(first) };
-        let inquiry = Inquiry::begin(rate, clock::now());
-        let report = request_report(&port, first, inquiry, (&source, true), stop, |rate| {
+        let probe = IdentityProbe::begin(rate, clock::now());
+        let report = request_report(&port, first, probe, (&source, true), stop, |rate| {
             progress.show(&format!("trying {rate} Bd"))
         })?;
         let name = source.name();

@@ -134,7 +134,7 @@ pub(crate) fn detect(
     let start = clock::now();
     let mut session = Session::begin(found.family, &settings, start);
     if let Some(rate) = found.rate {
-        session.begin_at(rate, start);
+        session.set_start_rate(rate, start);
     }
     let mut detection = Detection {
         start,

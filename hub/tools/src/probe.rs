@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use scanhub_drivers::search::{self, Coverage};
-use scanhub_drivers::{Inquiry, Report, features, inquiry};
+use scanhub_drivers::{IdentityProbe, Report, features, identity_probe};
 use scanhub_port::{
     Port, PortError, PortSpec, PortlessAdapter, SerialPortInfo, all_holders, check_tty, clock, serial_ports,
     serial_ports_in,
@@ -233,11 +233,11 @@ fn probe(
             _ => failure,
         })?;
     Ok(match found_scanner {
-        FoundScanner::Inquiry(report) => {
+        FoundScanner::Reported(report) => {
             // The rate of a serial server is set there.
             let rate = if is_server(source) { report.baud.map(|baud| baud.rate()) } else { None };
             let settings = link_settings(&report, rate.unwrap_or(first));
-            let found = FoundDescription::Inquiry(Box::new(Description::new(source.name(), &report)));
+            let found = FoundDescription::Reported(Box::new(Description::new(source.name(), &report)));
             ProbeResult::new(found, SuggestedLink::new(source, &serial_ports, settings), caution)
         }
         FoundScanner::Rotating(scanner) => {
@@ -254,7 +254,7 @@ fn probe(
 /// The scanner that was found.
 pub(crate) enum FoundScanner {
     /// A scanner that reports its settings on request, with its replies.
-    Inquiry(Box<Report>),
+    Reported(Box<Report>),
     /// A rotating scanner.
     Rotating(Box<DetectedScanner>),
 }
@@ -273,17 +273,17 @@ pub(crate) fn find(
     stop: &AtomicBool,
     mut on_rate: impl FnMut(u32),
 ) -> Result<FoundScanner, Failure> {
-    // An inquiry finds the rate, too.
-    let known = only.filter(|&family| features(family).has_inquiry);
+    // A probe finds the rate, too.
+    let known = only.filter(|&family| features(family).has_probe);
     let found = match known {
         Some(family) => search::FoundScanner { family, model: None, rate: None },
         None => driver::search(port, only, stop, &mut on_rate)?
             .map_err(|not_found| nothing_found(source, only.is_some(), &not_found))?,
     };
     let rate = (!is_server(source)).then_some(found.rate.unwrap_or(first));
-    if let Some(inquiry) = inquiry(found.family, rate, clock::now()) {
-        let report = request_report(port, first, inquiry, (source, only.is_some()), stop, on_rate)?;
-        return Ok(FoundScanner::Inquiry(Box::new(report)));
+    if let Some(probe) = identity_probe(found.family, rate, clock::now()) {
+        let report = request_report(port, first, probe, (source, only.is_some()), stop, on_rate)?;
+        return Ok(FoundScanner::Reported(Box::new(report)));
     }
     let detected = detect(port, found, stop)?;
     let scanner = detected.map_err(|bytes| not_detected(&source.name(), found, bytes))?;
@@ -376,7 +376,7 @@ pub(crate) fn check_unused(source: &PortSpec, locations: &[Domain]) -> Result<()
     }
 }
 
-/// Opens `source` at the highest rate of an inquiry that it supports, in bits per second, unless `stop` is set before
+/// Opens `source` at the highest rate of a probe that it supports, in bits per second, unless `stop` is set before
 /// it is open.
 pub(crate) fn open(source: &PortSpec, stop: &AtomicBool) -> Result<(Port, u32), Failure> {
     let open = |rate: u32| Port::open(source, rate, stop).map(|port| (port, rate));
@@ -389,7 +389,7 @@ pub(crate) fn open(source: &PortSpec, stop: &AtomicBool) -> Result<(Port, u32), 
     Ok((port, rate))
 }
 
-/// Requests identity, settings and state of the scanner at `port` by `inquiry`. The highest rate of the port is
+/// Requests identity, settings and state of the scanner at `port` by `probe`. The highest rate of the port is
 /// `first`, in bits per second. If the family was named, the scanner may belong to another one.
 ///
 /// # Errors
@@ -398,21 +398,21 @@ pub(crate) fn open(source: &PortSpec, stop: &AtomicBool) -> Result<(Port, u32), 
 pub(crate) fn request_report(
     port: &Port,
     first: u32,
-    mut inquiry: Inquiry,
+    mut probe: IdentityProbe,
     (source, is_named): (&PortSpec, bool),
     stop: &AtomicBool,
     mut on_rate: impl FnMut(u32),
 ) -> Result<Report, Failure> {
     let mut shown_rate = None;
-    let mut procedure = Procedure::new(|inquiry: &Inquiry| {
-        if shown_rate != Some(inquiry.baud()) && !is_server(source) {
-            shown_rate = Some(inquiry.baud());
-            on_rate(inquiry.baud().rate());
+    let mut procedure = Procedure::new(|probe: &IdentityProbe| {
+        if shown_rate != Some(probe.baud()) && !is_server(source) {
+            shown_rate = Some(probe.baud());
+            on_rate(probe.baud().rate());
         }
         true
     });
-    run_protocol(port, &mut inquiry, &mut procedure, stop)?;
-    let report = inquiry.report().clone();
+    run_protocol(port, &mut probe, &mut procedure, stop)?;
+    let report = probe.report().clone();
     let streams_at = report.baud.map(|baud| baud.rate());
     if report.has_replied() {
         return Ok(report);
@@ -428,7 +428,7 @@ fn is_server(source: &PortSpec) -> bool {
     matches!(source, PortSpec::Tcp { .. })
 }
 
-/// Returns the failure for a scanner that did not reply to an inquiry, with possible reasons, after `bytes` bytes
+/// Returns the failure for a scanner that did not reply to a probe, with possible reasons, after `bytes` bytes
 /// arrived. It may stream at `streams_at`. The highest rate of the port is `first`. Rates are in bits per second.
 fn no_reply(source: &PortSpec, first: u32, streams_at: Option<u32>, bytes: u64) -> Failure {
     let name = source.name();
@@ -436,7 +436,8 @@ fn no_reply(source: &PortSpec, first: u32, streams_at: Option<u32>, bytes: u64) 
         0 => "no byte arrived".to_owned(),
         bytes => format!("{bytes} bytes arrived, without a telegram"),
     };
-    let lower: Vec<_> = Inquiry::RATES.iter().filter(|&&rate| rate < first).map(u32::to_string).collect();
+    let lower: Vec<_> =
+        IdentityProbe::RATES.iter().filter(|&&rate| rate < first).map(u32::to_string).collect();
     let rates = format!("{} or {first} Bd", lower.join(", "));
     let (what, remedy) = match (streams_at, source) {
         (Some(_), PortSpec::Tcp { .. }) => (
@@ -542,10 +543,10 @@ fn toml_string(text: &str) -> String {
     string + "\""
 }
 
-/// Highest rate of an inquiry, in bits per second.
-pub(crate) const HIGHEST_RATE: u32 = Inquiry::RATES[Inquiry::RATES.len() - 1];
-/// Highest rate of an inquiry that every serial port supports, in bits per second.
-const COMMON_RATE: u32 = Inquiry::RATES[Inquiry::RATES.len() - 2];
+/// Highest rate of a probe, in bits per second.
+pub(crate) const HIGHEST_RATE: u32 = IdentityProbe::RATES[IdentityProbe::RATES.len() - 1];
+/// Highest rate of a probe that every serial port supports, in bits per second.
+const COMMON_RATE: u32 = IdentityProbe::RATES[IdentityProbe::RATES.len() - 2];
 /// Name of the sensor; the user may choose another one.
 const SENSOR_NAME: &str = "front";
 

@@ -115,17 +115,20 @@ mod tests {
     fn a_sensor_is_as_good_as_its_state_and_its_line() {
         let mut status = Status { rate_mhz: 37_500, ..Status::default() };
         status.set_sensor_type("LMS291-S05 30106");
-        let mut judge = |state: State, damaged_ppm: u64| {
+        let mut diagnose = |state: State, damaged_ppm: u64| {
             status.state = state as u8;
             status.counters[Counter::DamagedPpm] = damaged_ppm;
             let told = diagnosis_of(Some(&status), Some(250_000_000));
             (told.number("status.0.level").unwrap() as u8, told.text("status.0.message").unwrap().to_owned())
         };
-        assert_eq!(judge(State::Streaming, 0), (0, "streaming".to_owned()));
-        assert_eq!(judge(State::Streaming, 430_000), (1, "streaming, 43 % damaged on the line".to_owned()));
-        assert_eq!(judge(State::Probing, 0), (1, "probing".to_owned()));
-        assert_eq!(judge(State::Silent, 0), (2, "silent".to_owned()));
-        assert_eq!(judge(State::Absent, 0), (2, "absent".to_owned()));
+        assert_eq!(diagnose(State::Streaming, 0), (0, "streaming".to_owned()));
+        assert_eq!(
+            diagnose(State::Streaming, 430_000),
+            (1, "streaming, 43 % damaged on the line".to_owned())
+        );
+        assert_eq!(diagnose(State::Probing, 0), (1, "probing".to_owned()));
+        assert_eq!(diagnose(State::Silent, 0), (2, "silent".to_owned()));
+        assert_eq!(diagnose(State::Absent, 0), (2, "absent".to_owned()));
         let told = diagnosis_of(Some(&status), Some(250_000_000));
         assert_eq!(
             (told.number("header.stamp.sec"), told.number("header.stamp.nanosec")),

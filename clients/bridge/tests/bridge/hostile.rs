@@ -87,7 +87,7 @@ fn invalid_datagrams_do_not_block_a_valid_sender() {
     }
     // The honest sender continues. It sends an announcement again, because it had sent for less than a second and its
     // entry was evicted.
-    wait_until("who is honest is heard", || {
+    wait_until("samples of an honest sender arrive", || {
         put(&session, &format!("{SENSOR_KEY}/announce"), &sender.announcement(&topics));
         put(&session, &format!("{SENSOR_KEY}/zones"), &zones(&mut sender, Verdict::Stop));
         echo.prints(|line| line["class"] == "zones" && line["verdict"] == "stop")

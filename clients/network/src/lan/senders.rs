@@ -216,16 +216,16 @@ mod tests {
         let mut senders = Senders::NONE;
         assert_eq!(send(&mut senders, 1, None, 0), SenderMatch::Own);
         assert_eq!(send(&mut senders, 2, None, 1), SenderMatch::Twin, "it did not say who it is");
-        let mut told_ms = None;
+        let mut reported_ms = None;
         for at_ms in 2..3000 {
             let boot = |begin: u64| (at_ms % 1000 == begin).then_some(begin);
             assert_eq!(send(&mut senders, 1, boot(10), at_ms), SenderMatch::Own);
             assert_eq!(send(&mut senders, 2, boot(300), at_ms), SenderMatch::Twin);
             if senders.is_shared() {
-                told_ms.get_or_insert(at_ms);
+                reported_ms.get_or_insert(at_ms);
             }
         }
-        assert_eq!(told_ms, Some(1300));
+        assert_eq!(reported_ms, Some(1300));
         for (from, boot) in [(2, None), (2, Some(300)), (3, Some(9))] {
             assert_eq!(
                 send(&mut senders, from, boot, 60_000),

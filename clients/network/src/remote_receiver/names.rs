@@ -150,14 +150,14 @@ mod tests {
 
     #[test]
     fn refuses_single_sensors_and_thinning() {
-        for (text, said) in [
+        for (text, expected) in [
             ("front/scan", "*/scan"),
             ("robot1.front/*", "*/*"),
             ("*/scan:every=4", "where it is sent"),
             ("*/scam", "scan"),
         ] {
             let failure = received(&[text]).unwrap_err();
-            assert!(failure.kind == Kind::Usage && failure.hint.contains(said), "{failure}");
+            assert!(failure.kind == Kind::Usage && failure.hint.contains(expected), "{failure}");
         }
     }
 }

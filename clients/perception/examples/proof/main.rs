@@ -101,7 +101,7 @@ fn main() {
     let sum = |f: &dyn Fn(&Outcome) -> usize| passages.iter().map(f).sum::<usize>();
     let (real, counted, right) = (sum(&|o| o.doors.0), sum(&|o| o.doors.1), sum(&|o| o.doors.2));
     println!(
-        "passages of doors: {real}, told {counted}, right {right}: {:.4}",
+        "passages of doors: {real}, reported {counted}, right {right}: {:.4}",
         right as f64 / real.max(counted) as f64
     );
 }

@@ -23,10 +23,10 @@ const MIN_WALKING_SPEED_M_S: f64 = 0.5;
 const MIN_RETURN_SPEED_M_S: f64 = 0.35;
 /// Standard deviations of a person's position along and across the path, in meters. The deviation across the path grows
 /// every second, up to the width of a path.
-const ALONG_M: f64 = 0.25;
-const ACROSS_M: f64 = 0.25;
-const ACROSS_M_S: f64 = 0.3;
-const MAX_ACROSS_M: f64 = 0.7;
+const ALONG_SIGMA_M: f64 = 0.25;
+const ACROSS_SIGMA_M: f64 = 0.25;
+const ACROSS_SIGMA_M_S: f64 = 0.3;
+const MAX_ACROSS_SIGMA_M: f64 = 0.7;
 /// Likelihood for a person who arrives earlier or much later than the gap allows.
 const MIN_LIKELIHOOD: f64 = 1e-6;
 /// Length of a path with an unknown end, in meters.
@@ -96,7 +96,7 @@ impl Site {
         };
         let across_m = (far_m * far_m - ahead_m * ahead_m).max(0.0).sqrt();
         let walked_m = departed.pace.max(0.3) * t;
-        let (range_m, sigma_m) = (walked_m.max(0.3), ALONG_M + PACE_SPREAD * walked_m);
+        let (range_m, sigma_m) = (walked_m.max(0.3), ALONG_SIGMA_M + PACE_SPREAD * walked_m);
         let walks = if departed.speed > MIN_WALKING_SPEED_M_S {
             CONTINUE_SHARE_WALKING
         } else {
@@ -107,13 +107,13 @@ impl Site {
         let within = |from: f64, to: f64| if (from..=to).contains(&ahead_m) { 1.0 / range_m } else { 0.0 };
         let density = walks * normal(ahead_m - walked_m, sigma_m)
             + stops * within(-0.1, range_m)
-            + staying * normal(ahead_m, ALONG_M)
+            + staying * normal(ahead_m, ALONG_SIGMA_M)
             + TURN_BACK_SHARE * within(-range_m, 0.0).max(0.01);
         let remains = walks * normal_below((rest_m - walked_m) / sigma_m)
             + stops * (rest_m / range_m).min(1.0)
             + staying
             + TURN_BACK_SHARE;
-        let across = normal(across_m, (ACROSS_M + ACROSS_M_S * t).min(MAX_ACROSS_M));
+        let across = normal(across_m, (ACROSS_SIGMA_M + ACROSS_SIGMA_M_S * t).min(MAX_ACROSS_SIGMA_M));
         let turns = if speed < -MIN_RETURN_SPEED_M_S { TURN_BACK_SHARE } else { 1.0 };
         turns * across * density / remains
     }

@@ -177,7 +177,7 @@ const MAX_STEP_S: f64 = 0.05;
 const MAX_STEPS: f64 = 40.0;
 /// Standard deviations for a new person: velocity in m/s, and half of the distance between the legs in m.
 const INITIAL_SPEED_M_S: f64 = 0.9;
-const INITIAL_HALF_M: f64 = 0.17;
+const INITIAL_HALF_DISTANCE_M: f64 = 0.17;
 
 /// One of the two legs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -207,7 +207,7 @@ impl Filter {
     /// Creates the filter of a person with one detected leg, at `at`.
     pub(crate) fn of_leg(at: Point, sigma_m: f64) -> Filter {
         let mut covariance = Matrix4::zeros();
-        let half = INITIAL_HALF_M * INITIAL_HALF_M;
+        let half = INITIAL_HALF_DISTANCE_M * INITIAL_HALF_DISTANCE_M;
         covariance[(0, 0)] = half + sigma_m * sigma_m;
         covariance[(0, 2)] = -half;
         covariance[(2, 0)] = -half;

@@ -179,7 +179,7 @@ fn misplaced_sensor_is_reported_once_and_corrected() {
         "{misplaced:?}"
     );
     // After the correction, the tracker sees no person twice.
-    let since = shown.iter().position(|sample| !sample.misplaced.is_empty()).expect("it is told");
+    let since = shown.iter().position(|sample| !sample.misplaced.is_empty()).expect("a report");
     let is_known = |track: &&scanhub_perception::track::Track| {
         matches!(track.state, TrackState::Confirmed | TrackState::Hidden)
     };

@@ -154,34 +154,34 @@ Shown = Background
 """A background model that the hub sends on request."""
 
 
-async def _next(follower: _scanhub.Subscriber | _scanhub.RobotSubscriber) -> Any:
+async def _next(subscriber: _scanhub.Subscriber | _scanhub.RobotSubscriber) -> Any:
     """Waits for the next item. A canceled task loses no item, because an item is received just before the return."""
     loop = asyncio.get_running_loop()
-    if follower in _waiting:
+    if subscriber in _waiting:
         raise Failure("another task waits for this object", "make one for each task")
-    until = None if follower._timeout is None else loop.time() + follower._timeout
-    while follower._is_open:
-        descriptor = follower._descriptor()
-        item = follower._poll()
+    until = None if subscriber._timeout is None else loop.time() + subscriber._timeout
+    while subscriber._is_open:
+        descriptor = subscriber._descriptor()
+        item = subscriber._poll()
         if item is not None:
             return item
         if until is not None and loop.time() >= until:
-            raise follower._silence()
+            raise subscriber._silence()
         # Without a hub, the descriptor may never become readable, but the warning has a deadline.
-        due = follower._warning_due
+        due = subscriber._warning_due
         ends = [end for end in (until, None if due is None else loop.time() + due) if end is not None]
-        await _readable(follower, loop, descriptor, min(ends, default=None))
+        await _readable(subscriber, loop, descriptor, min(ends, default=None))
     raise StopAsyncIteration
 
 
-_Follower = Union[_scanhub.Subscriber, _scanhub.RobotSubscriber]
+_Subscriber = Union[_scanhub.Subscriber, _scanhub.RobotSubscriber]
 _Waiting = Tuple[asyncio.AbstractEventLoop, int, Callable[[], None]]
-_waiting: weakref.WeakKeyDictionary[_Follower, _Waiting] = weakref.WeakKeyDictionary()
+_waiting: weakref.WeakKeyDictionary[_Subscriber, _Waiting] = weakref.WeakKeyDictionary()
 """For each object for which a task waits: the loop, the descriptor in it, and the function that ends the wait."""
 
 
 async def _readable(
-    follower: _Follower, loop: asyncio.AbstractEventLoop, descriptor: int, until: float | None
+    subscriber: _Subscriber, loop: asyncio.AbstractEventLoop, descriptor: int, until: float | None
 ) -> None:
     ready = loop.create_future()
 
@@ -189,39 +189,39 @@ async def _readable(
         if not ready.done():
             ready.set_result(None)
 
-    _waiting[follower] = (loop, descriptor, wake)
+    _waiting[subscriber] = (loop, descriptor, wake)
     loop.add_reader(descriptor, wake)
     timer = None if until is None else loop.call_at(until, wake)
     try:
         await ready
     finally:
-        _end_wait(follower)
+        _end_wait(subscriber)
         if timer is not None:
             timer.cancel()
 
 
-def _end_wait(follower: _Follower) -> None:
-    """Ends the wait of the task for `follower`. Runs in the thread of its loop."""
-    waiting = _waiting.pop(follower, None)
+def _end_wait(subscriber: _Subscriber) -> None:
+    """Ends the wait of the task for `subscriber`. Runs in the thread of its loop."""
+    waiting = _waiting.pop(subscriber, None)
     if waiting is not None:
         loop, descriptor, wake = waiting
         loop.remove_reader(descriptor)
         wake()
 
 
-def _close(follower: _Follower, close: Callable[[], None]) -> None:
-    """Calls `close` after the descriptor of `follower` is removed from its loop. That happens in the thread of the
+def _close(subscriber: _Subscriber, close: Callable[[], None]) -> None:
+    """Calls `close` after the descriptor of `subscriber` is removed from its loop. That happens in the thread of the
     loop: if another thread closes the object, `close` is called later."""
-    waiting = _waiting.get(follower)
+    waiting = _waiting.get(subscriber)
     if waiting is not None:
         try:
             is_in_loop = asyncio.get_running_loop() is waiting[0]
         except RuntimeError:
             is_in_loop = False
         if not is_in_loop and not waiting[0].is_closed():
-            waiting[0].call_soon_threadsafe(_close, follower, close)
+            waiting[0].call_soon_threadsafe(_close, subscriber, close)
             return
-        _end_wait(follower)
+        _end_wait(subscriber)
     close()
 
 

@@ -220,9 +220,9 @@ mod tests {
         root.plug("red", "[none]\n");
         let (mut red, _) = Device::open(root.0.path(), "red").unwrap();
         root.unplug("red");
-        let Some(DeviceEvent::Failed(failure)) = red.show(true, start) else { panic!("nothing told") };
+        let Some(DeviceEvent::Failed(failure)) = red.show(true, start) else { panic!("no failure") };
         assert!(failure.message.contains("red/brightness cannot be written"), "{failure}");
-        assert_eq!(red.show(true, start + RETRY_INTERVAL), None, "it was told");
+        assert_eq!(red.show(true, start + RETRY_INTERVAL), None, "reported already");
         root.plug("red", "[timer]\n");
         assert_eq!(
             (red.show(true, start + RETRY_INTERVAL), root.brightness("red").as_str()),
@@ -240,9 +240,7 @@ mod tests {
         root.plug("red", "[none]\n");
         let (mut red, _) = Device::open(root.0.path(), "red").unwrap();
         fs::write(root.0.path().join("red").join("max_brightness"), "bright\n").unwrap();
-        let Some(DeviceEvent::Failed(failure)) = red.show(true, Instant::now()) else {
-            panic!("nothing told")
-        };
+        let Some(DeviceEvent::Failed(failure)) = red.show(true, Instant::now()) else { panic!("no failure") };
         assert!(failure.message.contains("its max_brightness is \"bright\""), "{failure}");
     }
 }

@@ -337,7 +337,7 @@ const CHANNEL_END_LEN: u64 = 10;
 const TRACK_END_LEN: u64 = 100;
 const TOPIC_END_LEN: u64 = 100 + scanhub_schema::file::LAYOUT.len() as u64;
 /// Name of the metadata record that is written before the first sample of a hub's run.
-const HUB_RECORD_NAME: &str = "scanhub.life";
+const HUB_RECORD_NAME: &str = "scanhub.run";
 /// Name of the metadata record about dropped samples.
 const GAP_RECORD_NAME: &str = "scanhub.gap";
 

@@ -135,10 +135,10 @@ fn a_client_that_comes_between_two_hubs() {
     assert!(scans.next().unwrap().is_none() && !scans.hub_is_running());
     let hub = HubProcess::start(&test_domain, 2);
     // The subscriber polls for a hub continuously, so it may receive a scan while the hub still starts.
-    let mut is_heard = false;
+    let mut is_received = false;
     let mut receive = || {
-        is_heard |= scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted);
-        is_heard
+        is_received |= scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted);
+        is_received
     };
     let pid = hub.0.id();
     wait_until("the second hub", || receive() || hub_pid(test_domain.domain.root()) == Ok(Some(pid)));

@@ -49,7 +49,7 @@ fn a_silence_is_unknown_once() {
     assert_eq!((received.zones.verdict(), received.header, received.stale), (Verdict::Unknown, None, true));
     let quiet_until = Instant::now() + Duration::from_millis(700);
     while Instant::now() < quiet_until {
-        assert!(zones.try_next().unwrap().is_none(), "said already");
+        assert!(zones.try_next().unwrap().is_none(), "published already");
         std::thread::sleep(Duration::from_millis(5));
     }
     hub.front_sensor().publish_zones(Verdict::Clear, 5000);
@@ -68,7 +68,7 @@ fn without_a_hub_and_after_one() {
     let mut hub = slow_hub(&test_domain, &["front"], 1);
     publish_until_received(hub.front_sensor(), Verdict::Clear, || zones.try_next().unwrap().is_some());
     drop(hub);
-    let last = std::iter::from_fn(|| zones.next().ok()).find(|heard| heard.stale);
+    let last = std::iter::from_fn(|| zones.next().ok()).find(|update| update.stale);
     assert_eq!(last.map(|update| update.zones.verdict()), Some(Verdict::Unknown));
 }
 
@@ -169,7 +169,7 @@ fn the_robot_is_the_worst_of_its_sensors() {
         named.next().unwrap().verdict() == Verdict::Stop
     });
     let verdicts: Vec<_> = named.now().unwrap().sensors().map(|(_, verdict)| verdict).collect();
-    assert_eq!(verdicts, [Verdict::Stop, Verdict::Unknown], "never heard");
+    assert_eq!(verdicts, [Verdict::Stop, Verdict::Unknown], "never received");
     let refused = RobotSubscriber::builder(&["robot"]).in_domain(&test_domain.domain).open().err();
     assert_eq!(refused.map(|error| error.kind()), Some(ErrorKind::InvalidInput));
 }

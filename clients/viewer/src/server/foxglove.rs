@@ -175,10 +175,11 @@ mod tests {
             schema: "x",
             is_kept: false,
         };
-        let said: serde_json::Value = serde_json::from_str(&advertise([(0, &channel)].into_iter())).unwrap();
+        let advertised: serde_json::Value =
+            serde_json::from_str(&advertise([(0, &channel)].into_iter())).unwrap();
         let channels = serde_json::json!([{"id": 1, "topic": "/front/scan", "encoding": "cdr",
             "schemaName": "sensor_msgs/msg/LaserScan", "schema": "x", "schemaEncoding": "ros2msg"}]);
-        assert_eq!((&said["op"], &said["channels"]), (&"advertise".into(), &channels));
+        assert_eq!((&advertised["op"], &advertised["channels"]), (&"advertise".into(), &channels));
         let info: serde_json::Value = serde_json::from_str(&server_info("5")).unwrap();
         assert_eq!((&info["op"], &info["sessionId"]), (&"serverInfo".into(), &"5".into()));
         assert_eq!(message(0x0403_0201, 9, b"ab"), [1, 1, 2, 3, 4, 9, 0, 0, 0, 0, 0, 0, 0, b'a', b'b']);

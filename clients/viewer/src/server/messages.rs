@@ -194,17 +194,17 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
 pub(crate) fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Background) {
     let as_scan = |range: &u16| match *range {
         Background::UNKNOWN => Scan::NOT_MEASURED,
-        Background::FAR => BEYOND,
-        range => range.min(BEYOND - 1),
+        Background::FAR => BEYOND_RANGE,
+        range => range.min(BEYOND_RANGE - 1),
     };
     let ranges: Vec<u16> = model.ranges().iter().map(as_scan).collect();
     let head = ScanHead {
         first_angle: model.first_angle,
         step: model.step,
         unit_um: model.unit_um,
-        valid_to: BEYOND - 1,
-        no_return: BEYOND,
-        beyond: BEYOND,
+        valid_to: BEYOND_RANGE - 1,
+        no_return: BEYOND_RANGE,
+        beyond: BEYOND_RANGE,
         ..ScanHead::default()
     };
     let header = Header { wall_ns, ..Header::default() };
@@ -212,7 +212,7 @@ pub(crate) fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, mode
 }
 
 /// Value for ranges that are out of range.
-const BEYOND: u16 = u16::MAX - 1;
+const BEYOND_RANGE: u16 = u16::MAX - 1;
 
 /// Encodes the known poses of the sensors.
 pub(crate) fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {

@@ -123,13 +123,13 @@ impl Revolution {
     /// Returns the result for the packets before a packet whose first point is at `angle`.
     fn count_until(&self, angle: f64) -> CountedRevolution {
         let (sum, count) = self.speeds;
-        let points_per_turn =
+        let points_per_revolution =
             f64::from(self.packets) * POINTS_PER_PACKET as f64 * 360.0 / (angle - self.angle).max(0.01);
-        let turns_per_second = sum / f64::from(count) / 360.0;
+        let revolutions_per_second = sum / f64::from(count) / 360.0;
         CountedRevolution {
             packets: self.packets,
-            points_per_revolution: points_per_turn,
-            revolutions_per_second: turns_per_second,
+            points_per_revolution,
+            revolutions_per_second,
             steady_time: 0,
             at: 0,
         }

@@ -470,7 +470,7 @@ impl line::Protocol for LdSession {
             Phase::Streaming(watchdog) => watchdog.silent_at(),
             Phase::Paused => Nanos::MAX,
         };
-        self.reads.wait_action(self.now, until, self.framer.buffer.hold())
+        self.reads.wait_action(self.now, until, self.framer.buffer.hold_time())
     }
 }
 
@@ -521,7 +521,7 @@ impl line::ScannerSession for LdSession {
         SessionStats { restarts: self.restarts.count, ..stats }
     }
 
-    fn begin_at(&mut self, rate: u32, _: Nanos) {
+    fn set_start_rate(&mut self, rate: u32, _: Nanos) {
         self.baud = rate;
     }
 

@@ -1,5 +1,5 @@
 //! Description of a scanner family: its models and settings, and the steps with which the search recognizes a scanner
-//! of the family. [`crate::search`] runs the steps of an [`Approach`] and passes the received bytes to a [`Probe`].
+//! of the family. [`crate::search`] runs the steps of [`SearchSteps`] and passes the received bytes to a [`Probe`].
 
 use core::fmt;
 
@@ -26,8 +26,8 @@ pub struct Features {
     /// Whether each telegram is a complete scan or a complete reply. Otherwise the scanner sends packets, and several
     /// packets form a scan.
     pub has_whole_telegrams: bool,
-    /// Whether the scanner reports its settings outside a session, in reply to an [inquiry](crate::inquiry).
-    pub has_inquiry: bool,
+    /// Whether the scanner reports its settings outside a session, to a [probe](crate::identity_probe).
+    pub has_probe: bool,
     /// Flags for the arrays that a scan contains: bits of [`scanhub_schema::ArrayFlags`].
     pub array_flags: u8,
     /// Maximum length of a telegram, or of packets that arrive together, in bytes.
@@ -84,7 +84,7 @@ pub(crate) use table;
 /// Recognizer of one family's scanners in the bytes of a line.
 pub trait Probe: fmt::Debug + Send {
     /// Returns the rates, steps and requests with which the search may find this family.
-    fn approach(&self) -> &'static Approach;
+    fn search_steps(&self) -> &'static SearchSteps;
 
     /// Discards all bytes, because the baud rate has changed. After the call, the probe expects no reply.
     fn clear(&mut self);
@@ -99,7 +99,7 @@ pub trait Probe: fmt::Debug + Send {
 
     /// Returns how long the line must be idle before [`release`](Self::release) may accept ambiguous bytes. Returns
     /// `None` if no bytes are ambiguous.
-    fn hold(&self) -> Option<Nanos> {
+    fn hold_time(&self) -> Option<Nanos> {
         None
     }
 
@@ -129,7 +129,7 @@ pub enum Evidence {
 
 /// Baud rates and requests with which the search may find a family.
 #[derive(Clone, Copy, Debug)]
-pub struct Approach {
+pub struct SearchSteps {
     /// The family that the search can find with these steps.
     pub family: Family,
     /// Steps that only listen, in the order in which they run.
@@ -145,10 +145,10 @@ pub struct Approach {
     pub advice: &'static str,
 }
 
-impl Approach {
+impl SearchSteps {
     /// Returns all baud rates at which the search tries to find the family, in bits per second, in increasing order.
     pub fn rates(&self) -> Vec<u32> {
-        let request_rates = self.request_steps.map_or(&[][..], |asks| asks.rates);
+        let request_rates = self.request_steps.map_or(&[][..], |requests| requests.rates);
         let mut rates: Vec<u32> = self.listen_steps.iter().map(|step| step.rate).collect();
         rates.extend(request_rates);
         rates.sort_unstable();

@@ -87,7 +87,7 @@ pub struct Buffer<const N: usize> {
     start: usize,
     end: usize,
     /// Time without a byte after which no byte can still arrive from the line.
-    hold: Nanos,
+    hold_time: Nanos,
     /// Whether the framer holds a packet back because another packet may begin inside it.
     is_held: bool,
     /// Whether the line has been idle long enough that the framer no longer holds packets back.
@@ -97,10 +97,10 @@ pub struct Buffer<const N: usize> {
 
 impl<const N: usize> Buffer<N> {
     /// Creates an empty buffer. If the framer holds a packet back, the buffer releases it after the line was idle for
-    /// `hold`.
-    pub fn new(hold: Nanos) -> Self {
+    /// `hold_time`.
+    pub fn new(hold_time: Nanos) -> Self {
         let counters = ByteCounters::default();
-        Buffer { bytes: [0; N], start: 0, end: 0, hold, is_held: false, is_released: false, counters }
+        Buffer { bytes: [0; N], start: 0, end: 0, hold_time, is_held: false, is_released: false, counters }
     }
 
     /// Returns the free space for the next bytes. The caller writes to the beginning of this space and then calls
@@ -138,13 +138,13 @@ impl<const N: usize> Buffer<N> {
 
     /// Returns how long the line must be idle before [`Buffer::release`] releases a packet that is held back. Returns
     /// `None` if no packet is held back.
-    pub fn hold(&self) -> Option<Nanos> {
-        self.is_held.then_some(self.hold)
+    pub fn hold_time(&self) -> Option<Nanos> {
+        self.is_held.then_some(self.hold_time)
     }
 
     /// Handles a read that returned no bytes. `idle` is the time since the last byte.
     pub fn release(&mut self, idle: Nanos) {
-        self.is_released |= self.is_held && idle >= self.hold;
+        self.is_released |= self.is_held && idle >= self.hold_time;
     }
 
     /// Returns the open bytes.

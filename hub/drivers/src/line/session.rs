@@ -118,13 +118,13 @@ pub trait ScannerSession: Protocol {
 
     /// Starts a session after a search has found the scanner at `rate`, in bits per second. The port is open at this
     /// rate. Call it before the first read, and after [`hint_rate`](Self::hint_rate).
-    fn begin_at(&mut self, rate: u32, now: Nanos) {
+    fn set_start_rate(&mut self, rate: u32, now: Nanos) {
         let _ = (rate, now);
     }
 
     /// Restores the model and the number of beams that an earlier session measured on the same port. The session
     /// ignores them if the scanner streams at a rate that this model does not have. Call it before the first read, and
-    /// after [`begin_at`](Self::begin_at).
+    /// after [`set_start_rate`](Self::set_start_rate).
     fn restore_beams(&mut self, model: Model, beams: usize) {
         let _ = (model, beams);
     }

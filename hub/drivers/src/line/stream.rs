@@ -85,12 +85,12 @@ impl ReadScheduler {
 
     /// Returns the next wait at `now`. The session sleeps until the time of the next read. After this time, it waits
     /// for bytes until the deadline `until`. If the framer holds a packet back, the deadline is at the latest the time
-    /// at which the line has been idle for `hold`.
-    pub fn wait_action<'a>(&self, now: Nanos, until: Nanos, hold: Option<Nanos>) -> Action<'a> {
+    /// at which the line has been idle for `hold_time`.
+    pub fn wait_action<'a>(&self, now: Nanos, until: Nanos, hold_time: Option<Nanos>) -> Action<'a> {
         if self.next_read_at > now {
             return Action::SleepUntil(self.next_read_at);
         }
-        let held_until = hold.map_or(Nanos::MAX, |hold| self.last_byte + hold);
+        let held_until = hold_time.map_or(Nanos::MAX, |hold| self.last_byte + hold);
         Action::Wait { until: until.min(held_until) }
     }
 

@@ -304,9 +304,9 @@ fn request_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>) -> O
         MEANS => show_scan_count(reader),
         RANGE => {
             reader.word_as("first value", |first| {
-                lazy_text(move |f| match first & DIRECT {
+                lazy_text(move |f| match first & DIRECT_OUTPUT {
                     0 => Ok(()),
-                    _ => write!(f, "{}, direct output of a partial scan", first & !DIRECT),
+                    _ => write!(f, "{}, direct output of a partial scan", first & !DIRECT_OUTPUT),
                 })
             })?;
             reader.word("last value").map(drop)
@@ -380,7 +380,7 @@ const POWER_ON_RATE: u8 = 0x66;
 /// Request that writes the EEPROM. It is explained here, and encoded only in `lms_configure`.
 const WRITE_CONFIGURATION: u8 = 0x77;
 /// Bit of the first value of a sub-range: direct output of a partial scan.
-const DIRECT: u16 = 1 << 15;
+const DIRECT_OUTPUT: u16 = 1 << 15;
 
 /// Reads the data of a reply. Data without a known layout are left to the caller.
 fn reply_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
@@ -720,7 +720,7 @@ mod tests {
     use std::vec::Vec;
     use std::{format, vec};
 
-    fn told(telegram: Telegram<'_>, mode: Option<Mode>) -> Vec<(usize, String)> {
+    fn explained(telegram: Telegram<'_>, mode: Option<Mode>) -> Vec<(usize, String)> {
         let mut lines = vec![];
         explain(telegram, mode, &mut |field| {
             let words = field.meaning.map(|words| words.to_string()).unwrap_or_default();
@@ -732,7 +732,7 @@ mod tests {
     #[test]
     fn a_request_field_by_field() {
         let request = Request::Variant(crate::lms::variant::Variant::HALF).encode(0);
-        let lines = told(request.telegram(), None);
+        let lines = explained(request.telegram(), None);
         let expected = [
             (0, "STX: "),
             (1, "address: to all sensors"),
@@ -749,7 +749,7 @@ mod tests {
     fn a_scan_with_and_without_its_mode() {
         let encoded = measured::encode(1, Unit::Cm, &[0xA3E8, 0x3FFF, 200], 0x92);
         let words =
-            |mode| told(encoded.telegram(), mode).into_iter().map(|(_, line)| line).collect::<Vec<_>>();
+            |mode| explained(encoded.telegram(), mode).into_iter().map(|(_, line)| line).collect::<Vec<_>>();
         let lines = words(None);
         assert_eq!(lines[1], "address: from sensor 1");
         assert_eq!(lines[4], "count and unit: 3 values in cm");

@@ -220,7 +220,7 @@ impl Framer {
 
     /// Returns the time without bytes after which [`Framer::release`] delivers the held frame. Returns `None` if no
     /// frame is held.
-    pub fn hold(&self) -> Option<Nanos> {
+    pub fn hold_time(&self) -> Option<Nanos> {
         self.held.map(|held| {
             if self.candidates.has_candidate_before(held.end) { VETO_HOLD_TIME } else { SUFFIX_HOLD_TIME }
         })
@@ -229,7 +229,7 @@ impl Framer {
     /// Handles a read without bytes, after the line has been idle for `idle` ns. If `idle` is long enough, the framer
     /// no longer waits for telegrams inside the held frame.
     pub fn release(&mut self, idle: Nanos) {
-        if self.hold().is_some_and(|hold| idle >= hold) {
+        if self.hold_time().is_some_and(|hold| idle >= hold) {
             self.refute_headers_inside();
             self.cursor = self.held.map_or(self.cursor, |held| self.cursor.max(held.end));
         }

@@ -14,7 +14,7 @@ use crate::lms::reply::{POWER_ON, REFUSED, Reply};
 use crate::lms::request_channel::{NAK_PAUSE, PARTIAL_REQUEST_TIMEOUT, PendingRequest, TRIES};
 use crate::lms::sensor::{Identity, Problem, Sensor};
 use crate::lms::session::Settings;
-use crate::lms::start::{MAX_STOPS, NextQuestion, Questions, Start, Step};
+use crate::lms::start::{MAX_STOPS, NextQuery, Start, Step, StreamQueries};
 use crate::lms::telegram::{REPLY, Telegram};
 use crate::lms::variant::Baud;
 
@@ -55,7 +55,7 @@ enum Phase {
     /// Starts the stream of a scanner that receives requests.
     Starting(Start),
     /// Receives measured data.
-    Streaming { header: StreamHeader, silent_at: Nanos, questions: Questions },
+    Streaming { header: StreamHeader, silent_at: Nanos, questions: StreamQueries },
     /// Reads a recording.
     Replaying,
     /// Has stopped the scanner. If a stream continues, the session sends up to `stops_left` more stop requests.
@@ -425,8 +425,8 @@ impl ProtocolState {
     }
 
     /// Starts at `baud`. The port is open at this rate, and a search has found the scanner at this rate.
-    pub(crate) fn begin_at(&mut self, baud: Baud, now: Nanos) {
-        self.rate.begin_at(baud);
+    pub(crate) fn set_start_rate(&mut self, baud: Baud, now: Nanos) {
+        self.rate.set_start_rate(baud);
         self.listen(now, State::Probing);
     }
 
@@ -605,11 +605,11 @@ impl ProtocolState {
         } else {
             now
         };
-        self.phase = Phase::Streaming { header, silent_at, questions: Questions::new(first_request_at) };
+        self.phase = Phase::Streaming { header, silent_at, questions: StreamQueries::new(first_request_at) };
         self.send_question(now);
     }
 
-    /// Sends the next of the [`Questions`] right after a scan. A reply costs the scan that it interrupts, so the
+    /// Sends the next of the [`StreamQueries`] right after a scan. A reply costs the scan that it interrupts, so the
     /// session sends at most one request per scan.
     fn send_question(&mut self, now: Nanos) {
         let Phase::Streaming { questions, .. } = &mut self.phase else { return };
@@ -617,13 +617,13 @@ impl ProtocolState {
             return;
         }
         match questions.next(&self.sensor, now) {
-            NextQuestion::Send(question) => self.send_request(question, now, 1),
-            NextQuestion::Later => {}
-            NextQuestion::Done => {
+            NextQuery::Send(question) => self.send_request(question, now, 1),
+            NextQuery::Later => {}
+            NextQuery::Done => {
                 self.sensor.accept_unconfirmed();
                 self.problem.take_if(|problem| *problem == Problem::ModeUnknown);
             }
-            NextQuestion::ModeUnknown => self.problem = Some(Problem::ModeUnknown),
+            NextQuery::ModeUnknown => self.problem = Some(Problem::ModeUnknown),
         }
     }
 

@@ -103,7 +103,7 @@ impl LineRate {
     }
 
     /// Starts at `baud`. The port is open at this rate, and a search has found the scanner at this rate.
-    pub(crate) fn begin_at(&mut self, baud: Baud) {
+    pub(crate) fn set_start_rate(&mut self, baud: Baud) {
         (self.idle_rate, self.first_tried) = (baud, baud);
         (self.baud, self.needs_change) = (baud, false);
         if baud != self.target && !self.is_preferred_forced {

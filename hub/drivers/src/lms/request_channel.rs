@@ -1,4 +1,4 @@
-//! Sends requests, and handles their timeouts and retries. [`crate::lms::inquiry`] and a change of the configuration
+//! Sends requests, and handles their timeouts and retries. [`crate::lms::identity_probe`] and a change of the configuration
 //! use [`RequestChannel`]. A session has its own framer and uses only `PendingRequest`.
 //!
 //! The scanner requires at least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror
@@ -164,7 +164,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
                 None => until = until.min(open.deadline),
             }
         }
-        if let Some(hold) = self.framer.hold() {
+        if let Some(hold) = self.framer.hold_time() {
             until = until.min(self.last_byte + hold);
         }
         Action::Wait { until }

@@ -300,7 +300,7 @@ impl line::Protocol for LmsSession {
             return Action::SleepUntil(until);
         }
         // A held telegram is delivered after the line has been idle for a while.
-        let held_until = self.framer.hold().map_or(Nanos::MAX, |hold| self.last_byte + hold);
+        let held_until = self.framer.hold_time().map_or(Nanos::MAX, |hold| self.last_byte + hold);
         Action::Wait { until: self.protocol.deadline().min(held_until) }
     }
 }
@@ -395,9 +395,9 @@ impl line::ScannerSession for LmsSession {
         }
     }
 
-    fn begin_at(&mut self, rate: u32, now: Nanos) {
+    fn set_start_rate(&mut self, rate: u32, now: Nanos) {
         if let Some(baud) = Baud::of_rate(rate) {
-            self.protocol.begin_at(baud, now);
+            self.protocol.set_start_rate(baud, now);
         }
     }
 

@@ -118,7 +118,7 @@ impl Start {
 /// measuring mode, which two replies report. A reply costs the scan that it interrupts. After some rounds, requests are
 /// rare. They continue only while the measuring mode is unknown, because the session cannot return scans without it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Questions {
+pub(crate) struct StreamQueries {
     /// Remaining requests of this round.
     remaining: &'static [Request],
     /// Number of complete rounds.
@@ -127,9 +127,9 @@ pub(crate) struct Questions {
     next_at: Nanos,
 }
 
-/// Action that follows from the state of [`Questions`].
+/// Action that follows from the state of [`StreamQueries`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum NextQuestion {
+pub(crate) enum NextQuery {
     /// Send this request.
     Send(Request),
     /// Send nothing now. Another round follows.
@@ -140,16 +140,16 @@ pub(crate) enum NextQuestion {
     ModeUnknown,
 }
 
-impl Questions {
+impl StreamQueries {
     /// Creates the requests. The first request is sent at `start_at` or later.
-    pub(crate) fn new(start_at: Nanos) -> Questions {
-        Questions { remaining: STATUS_REQUESTS, rounds: 0, next_at: start_at }
+    pub(crate) fn new(start_at: Nanos) -> StreamQueries {
+        StreamQueries { remaining: STATUS_REQUESTS, rounds: 0, next_at: start_at }
     }
 
     /// Returns the next action at `now`. Call it right after a scan, while no request is open.
-    pub(crate) fn next(&mut self, sensor: &Sensor, now: Nanos) -> NextQuestion {
+    pub(crate) fn next(&mut self, sensor: &Sensor, now: Nanos) -> NextQuery {
         if now < self.next_at {
-            return NextQuestion::Later;
+            return NextQuery::Later;
         }
         let is_unanswered = |question: Request| match question {
             Request::Type => sensor.kind().is_empty(),
@@ -159,20 +159,20 @@ impl Questions {
         while let Some((&question, rest)) = self.remaining.split_first() {
             self.remaining = rest;
             if is_unanswered(question) {
-                return NextQuestion::Send(question);
+                return NextQuery::Send(question);
             }
         }
         if STATUS_REQUESTS.iter().any(|&question| is_unanswered(question)) && self.rounds < ROUNDS - 1 {
             self.rounds += 1;
             self.remaining = STATUS_REQUESTS;
-            NextQuestion::Later
+            NextQuery::Later
         } else if sensor.mode.is_some() {
             self.next_at = Nanos::MAX;
-            NextQuestion::Done
+            NextQuery::Done
         } else {
             self.next_at = now + ROUND_PAUSE;
             self.remaining = STATUS_REQUESTS;
-            NextQuestion::ModeUnknown
+            NextQuery::ModeUnknown
         }
     }
 }

@@ -536,7 +536,7 @@ impl RateSearch {
     }
 
     /// Starts at `baud`. The port is open at this rate.
-    pub(crate) fn begin_at(&mut self, baud: u32) {
+    pub(crate) fn set_start_rate(&mut self, baud: u32) {
         self.baud = baud;
     }
 

@@ -546,7 +546,7 @@ impl line::Protocol for RplidarSession {
         if self.change_dtr.is_some() || self.rate.needs_change || !self.requests.bytes().is_empty() {
             return self.poll_action();
         }
-        self.reads.wait_action(self.now, self.deadline(), self.framer.buffer.hold())
+        self.reads.wait_action(self.now, self.deadline(), self.framer.buffer.hold_time())
     }
 }
 
@@ -677,8 +677,8 @@ impl line::ScannerSession for RplidarSession {
         self.reads.mark_suspect(reasons);
     }
 
-    fn begin_at(&mut self, rate: u32, _: Nanos) {
-        self.rate.begin_at(rate);
+    fn set_start_rate(&mut self, rate: u32, _: Nanos) {
+        self.rate.set_start_rate(rate);
     }
 
     fn device_info(&self) -> Option<DeviceInfo> {

@@ -73,7 +73,11 @@ impl FramedCapture {
             match found {
                 FramerEvent::Telegram(framed) => {
                     let (at, len) = (framed.offset as usize, framed.telegram.bytes().len());
-                    assert_eq!(framed.telegram.bytes(), &self.bytes[at..at + len], "not what the line said");
+                    assert_eq!(
+                        framed.telegram.bytes(),
+                        &self.bytes[at..at + len],
+                        "other bytes than on the line"
+                    );
                     self.found.push((at, len));
                     self.suspect += usize::from(framed.reasons != 0);
                 }

@@ -98,7 +98,7 @@ fn frame_ending_in_stx_waits_for_the_next_byte() {
     // The next byte refutes the header.
     let mut framer = framer(STREAM_EXPECT);
     assert_eq!(feed(&mut framer, &ends_with_stx, 16), []);
-    assert_eq!(framer.hold(), Some(SUFFIX_HOLD_TIME));
+    assert_eq!(framer.hold_time(), Some(SUFFIX_HOLD_TIME));
     assert_eq!(feed(&mut framer, &next[..1], 1), [(ends_with_stx.clone(), 0)]);
     // No byte follows, so the framer releases the frame after the idle time and not earlier.
     let mut framer = self::framer(STREAM_EXPECT);
@@ -129,7 +129,7 @@ fn a_frame_with_a_header_inside_waits_for_it_to_fail() {
     });
     let mut framer = framer(STREAM_EXPECT);
     assert_eq!(feed(&mut framer, &spelled, 16), []);
-    assert_eq!(framer.hold(), Some(VETO_HOLD_TIME));
+    assert_eq!(framer.hold_time(), Some(VETO_HOLD_TIME));
     framer.release(VETO_HOLD_TIME - 1);
     assert!(framer.poll().is_none());
     framer.release(VETO_HOLD_TIME);

@@ -201,7 +201,7 @@ pub(crate) trait Parser {
     fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(AcceptedFrame<'_>));
 
     /// Returns the time without bytes after which [`Parser::release`] may return more.
-    fn hold(&self) -> Option<Nanos> {
+    fn hold_time(&self) -> Option<Nanos> {
         None
     }
 
@@ -221,8 +221,8 @@ impl Parser for Framer {
         }
     }
 
-    fn hold(&self) -> Option<Nanos> {
-        Framer::hold(self)
+    fn hold_time(&self) -> Option<Nanos> {
+        Framer::hold_time(self)
     }
 
     fn release(&mut self, idle: Nanos, accept: &mut dyn FnMut(AcceptedFrame<'_>)) {
@@ -282,7 +282,7 @@ impl TelegramCounts {
             });
             begin = piece.end;
             let next = line.pieces.get(number + 1).map_or(Nanos::MAX, |next| next.at);
-            while let Some(hold) = parser.hold().filter(|hold| piece.at + hold < next) {
+            while let Some(hold) = parser.hold_time().filter(|hold| piece.at + hold < next) {
                 parser.release(hold, &mut |accepted| {
                     self.add_frame(line, accepted, piece.at + hold, &mut delivered);
                 });

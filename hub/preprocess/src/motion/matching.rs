@@ -408,8 +408,8 @@ fn same_lines(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) ->
             let of_other = of_other.map(|(x, y)| along((x.into(), y.into())));
             let (begin, end) = (of_other[0].min(of_other[1]), of_other[0].max(of_other[1]));
             let alongs = ends.map(along);
-            let is_beside = alongs[0].max(alongs[1]) < begin || alongs[0].min(alongs[1]) > end;
-            !is_beside
+            let overlaps = alongs[0].max(alongs[1]) >= begin && alongs[0].min(alongs[1]) <= end;
+            overlaps
                 && ends.iter().all(|end| (cos * end.0 + sin * end.1 - f64::from(other.r_m)).abs() <= near)
         };
         reference.lines.lines().iter().any(is_on)

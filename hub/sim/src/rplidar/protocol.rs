@@ -553,8 +553,8 @@ fn half(level: u32) -> i32 {
 fn predicted(range_mm: u16, (base_mm, level): (i32, u32)) -> u32 {
     const NO_RETURN: i32 = -512;
     let steps = (i32::from(range_mm) - base_mm + half(level)) >> level;
-    let is_told = range_mm > 0 && (-511..511).contains(&steps) && base_mm + (steps << level) > 0;
-    (if is_told { steps } else { NO_RETURN }) as u32 & 0x3FF
+    let is_encodable = range_mm > 0 && (-511..511).contains(&steps) && base_mm + (steps << level) > 0;
+    (if is_encodable { steps } else { NO_RETURN }) as u32 & 0x3FF
 }
 
 /// Encodes scale, range and quality in 20 bits.

@@ -318,9 +318,9 @@ fn every_brown_out_is_a_restart() {
         bench.run(4 * ONE_SECOND);
         for restarts in 1..=12 {
             // A falling voltage first makes the head slower.
-            let turns_per_second = f64::from(model.revolutions_per_second());
+            let revolutions_per_second = f64::from(model.revolutions_per_second());
             for slow in 0..restarts {
-                bench.scanner.set_speed(turns_per_second * (1.0 - 0.03 * slow as f64));
+                bench.scanner.set_speed(revolutions_per_second * (1.0 - 0.03 * slow as f64));
                 bench.run(bench.now + 30 * MILLIS);
             }
             bench.brown_out();

@@ -4,7 +4,7 @@
 
 mod faults;
 mod head;
-mod inquiry;
+mod identity_probe;
 mod machine;
 mod recognize;
 mod search;

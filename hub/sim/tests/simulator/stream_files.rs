@@ -84,8 +84,8 @@ impl LiveStream {
                     }
                     Action::Transmit { bytes, .. } => {
                         let bytes = bytes.to_vec();
-                        let is_heard = session.rate() == device.rate();
-                        for byte in bytes.iter().filter(|_| is_heard) {
+                        let is_received = session.rate() == device.rate();
+                        for byte in bytes.iter().filter(|_| is_received) {
                             wire.receive(device, *byte, Arrival::at(now));
                         }
                         session.handle_transmitted(now);

@@ -158,7 +158,7 @@ fn check_scanner(
 ) -> Result<ScannerCheck, Failure> {
     let (source, link) = (&subject.source, subject.link.as_ref());
     match probe::find(port, first, source, link.and_then(scanhub_config::Link::family), stop, |_| {}) {
-        Ok(FoundScanner::Inquiry(report)) => {
+        Ok(FoundScanner::Reported(report)) => {
             Ok(Ok((None, sensor::check_report(&source.name(), &report, link))))
         }
         Ok(FoundScanner::Rotating(scanner)) => {

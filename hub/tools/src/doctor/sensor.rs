@@ -3,7 +3,7 @@
 
 use scanhub_config::Link;
 use scanhub_drivers::line::{DeviceInfo, HealthStatus as ReportedHealth};
-use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::identity_probe::Report;
 use scanhub_drivers::lms::lms_model::LmsModel;
 use scanhub_drivers::lms::status::{Fault, Severity, StatusByte};
 use scanhub_drivers::lms::variant::Variant;
@@ -326,22 +326,22 @@ mod tests {
     use scanhub_drivers::lms::status::SimulatedStatus;
     use scanhub_drivers::lms::telegram::{Telegram, Writer};
     use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
-    use scanhub_drivers::lms::{Inquiry, configuration};
+    use scanhub_drivers::lms::{IdentityProbe, configuration};
     use scanhub_drivers::{Settings, features};
 
     use super::*;
     use crate::doctor::State as Verdict;
 
-    /// Returns the report of an inquiry to a scanner with this status report, status byte and errors.
+    /// Returns the report of a probe to a scanner with this status report, status byte and errors.
     fn report(status: [u8; 152], condition: u8, errors: &[u8]) -> Report {
-        let mut inquiry = Inquiry::new(Baud::B38400, 0);
+        let mut probe = IdentityProbe::new(Baud::B38400, 0);
         let (mut now, mut request, mut reply) = (0, Vec::new(), Vec::new());
         loop {
-            match inquiry.poll_action() {
+            match probe.poll_action() {
                 Action::Transmit { bytes, not_before } => {
                     now = not_before.max(now);
                     request.extend(bytes);
-                    inquiry.handle_transmitted(now);
+                    probe.handle_transmitted(now);
                     if let Some(received) = Telegram::check(&request) {
                         let data: Vec<u8> = match received.command() {
                             0x31 => status.to_vec(),
@@ -356,15 +356,15 @@ mod tests {
                     }
                 }
                 Action::Wait { until } => {
-                    if inquiry.is_done() {
-                        return inquiry.report().clone();
+                    if probe.is_done() {
+                        return probe.report().clone();
                     }
                     now = until;
                     let bytes = std::mem::take(&mut reply);
-                    inquiry.read_buffer()[..bytes.len()].copy_from_slice(&bytes);
-                    inquiry.commit(now, bytes.len());
+                    probe.read_buffer()[..bytes.len()].copy_from_slice(&bytes);
+                    probe.commit(now, bytes.len());
                     if bytes.is_empty() {
-                        inquiry.handle_timeout(now);
+                        probe.handle_timeout(now);
                     }
                 }
                 output => panic!("{output:?}"),
@@ -509,7 +509,7 @@ mod tests {
         scanhub_schema::Family::ALL.into_iter().find(is_streaming).expect("there is one")
     }
 
-    fn heard() -> DetectedScanner {
+    fn detected() -> DetectedScanner {
         let family = streaming();
         DetectedScanner {
             family,
@@ -536,22 +536,23 @@ mod tests {
 
     #[test]
     fn checks_rotating_scanner() {
-        let said = |heard: &DetectedScanner| {
-            let findings = check_rotating(heard, None);
+        let verdicts = |detected: &DetectedScanner| {
+            let findings = check_rotating(detected, None);
             findings.iter().map(|finding| (finding.name, finding.state)).collect::<Vec<_>>()
         };
         let names = ["sensor", "line-loss", "settings", "health"];
-        assert_eq!(said(&heard()), names.map(|name| (name, Verdict::Ok)));
-        let still = DetectedScanner { revolutions_per_second: 0.0, ..heard() };
-        assert_eq!(said(&still)[3], ("health", Verdict::Failed));
-        let lossy = DetectedScanner { stats: SessionStats { lost: 3, ..heard().stats }, ..heard() };
-        assert_eq!(said(&lossy)[1], ("line-loss", Verdict::Warning));
-        let damaged = DetectedScanner { stats: SessionStats { damaged: 100, ..heard().stats }, ..heard() };
-        assert_eq!(said(&damaged)[1], ("line-loss", Verdict::Warning));
+        assert_eq!(verdicts(&detected()), names.map(|name| (name, Verdict::Ok)));
+        let still = DetectedScanner { revolutions_per_second: 0.0, ..detected() };
+        assert_eq!(verdicts(&still)[3], ("health", Verdict::Failed));
+        let lossy = DetectedScanner { stats: SessionStats { lost: 3, ..detected().stats }, ..detected() };
+        assert_eq!(verdicts(&lossy)[1], ("line-loss", Verdict::Warning));
+        let damaged =
+            DetectedScanner { stats: SessionStats { damaged: 100, ..detected().stats }, ..detected() };
+        assert_eq!(verdicts(&damaged)[1], ("line-loss", Verdict::Warning));
         let text = check_rotating(&damaged, None)[1].to_string();
         assert!(text.contains(", 0 of "), "{text}");
         // If most bytes are damaged, a head that seems to stand still may rotate.
-        let account = SessionStats { damaged: 40_000, ..heard().stats };
+        let account = SessionStats { damaged: 40_000, ..detected().stats };
         let unreliable = [
             ("sensor", Verdict::Ok),
             ("line-loss", Verdict::Failed),
@@ -559,16 +560,17 @@ mod tests {
             ("health", Verdict::Skipped),
         ];
         let most = DetectedScanner { stats: account, ..still };
-        assert_eq!(said(&most), unreliable);
+        assert_eq!(verdicts(&most), unreliable);
         let text = check_rotating(&most, None)[1].to_string();
         assert!(text.contains("the number of lost packets is unknown"), "{text}");
     }
 
     #[test]
     fn checks_reported_health() {
-        let said = |condition| {
-            let said = DeviceInfo { identity: "firmware 1.29".into(), health: "so".into(), condition };
-            let findings = check_rotating(&DetectedScanner { introduction: Some(said), ..heard() }, None);
+        let verdicts = |condition| {
+            let verdicts = DeviceInfo { identity: "firmware 1.29".into(), health: "so".into(), condition };
+            let findings =
+                check_rotating(&DetectedScanner { introduction: Some(verdicts), ..detected() }, None);
             findings.iter().map(|finding| (finding.name, finding.state)).next_back()
         };
         for (condition, state) in [
@@ -577,24 +579,24 @@ mod tests {
             (ReportedHealth::Unknown, Verdict::Warning),
             (ReportedHealth::Error, Verdict::Failed),
         ] {
-            assert_eq!(said(condition), Some(("health", state)));
+            assert_eq!(verdicts(condition), Some(("health", state)));
         }
     }
 
     #[test]
     fn reports_model_that_differs_from_configuration() {
-        let family = format!("family={}", heard().family.name());
-        let judged = |heard: &DetectedScanner, set: &[&str]| {
-            model(heard, Some(&link(&[&[family.as_str()], set].concat())))
+        let family = format!("family={}", detected().family.name());
+        let judged = |detected: &DetectedScanner, set: &[&str]| {
+            model(detected, Some(&link(&[&[family.as_str()], set].concat())))
         };
         let models = features(streaming()).models;
         // A model with the same protocol counts as the same.
         let (like, other) = (format!("model={}", models[0].name), format!("model={}", models[3].name));
-        assert_eq!(judged(&heard(), &[&like]).state, Verdict::Ok);
-        let wrong = judged(&heard(), &[&other]);
+        assert_eq!(judged(&detected(), &[&like]).state, Verdict::Ok);
+        let wrong = judged(&detected(), &[&other]);
         assert!(wrong.state == Verdict::Warning && wrong.finding.contains(models[3].name), "{wrong}");
         assert!(wrong.remedy.contains("link.side.model="), "{wrong}");
-        let large = DetectedScanner { model: Some(models[3]), ..heard() };
+        let large = DetectedScanner { model: Some(models[3]), ..detected() };
         assert_eq!(judged(&large, &[&other]).state, Verdict::Ok);
         let room = judged(&large, &[]);
         assert!(room.state == Verdict::Warning && room.finding.contains("room for 720"), "{room}");

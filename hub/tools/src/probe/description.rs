@@ -21,7 +21,7 @@ use crate::driver::DetectedScanner;
 #[serde(untagged)]
 pub(super) enum FoundDescription {
     /// A scanner that reports its settings on request.
-    Inquiry(Box<Description>),
+    Reported(Box<Description>),
     /// A rotating scanner.
     Rotating(Box<RotatingDescription>),
 }
@@ -29,7 +29,7 @@ pub(super) enum FoundDescription {
 impl fmt::Display for FoundDescription {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            FoundDescription::Inquiry(description) => description.fmt(f),
+            FoundDescription::Reported(description) => description.fmt(f),
             FoundDescription::Rotating(turning) => turning.fmt(f),
         }
     }
@@ -230,7 +230,7 @@ pub(super) struct RotatingDescription {
     /// Share of bytes that belong to no packet.
     damaged: Option<f64>,
     points_per_second: Option<f64>,
-    turns_per_second: Option<f64>,
+    revolutions_per_second: Option<f64>,
     problem: Option<String>,
 }
 
@@ -254,7 +254,7 @@ impl RotatingDescription {
             packets: is_received.then_some(scanner.packets),
             damaged: is_received.then(|| scanner.damaged()),
             points_per_second: rounded(scanner.points_per_second),
-            turns_per_second: rounded(scanner.revolutions_per_second),
+            revolutions_per_second: rounded(scanner.revolutions_per_second),
             // If the line damages bytes, any other problem may be a consequence.
             problem: scanner.line_problem().or_else(|| scanner.problem.clone()),
         }
@@ -297,8 +297,8 @@ impl fmt::Display for RotatingDescription {
                 format!("{packets}, {:.1} % of the bytes damaged", 100.0 * damaged)
             }),
         )?;
-        row("points", self.points_per_second.map(|points| format!("{points:.0} a second")))?;
-        row("turns", self.turns_per_second.map(|turns| format!("{turns:.2} a second")))?;
+        row("points", self.points_per_second.map(|points| format!("{points:.0} per second")))?;
+        row("speed", self.revolutions_per_second.map(|speed| format!("{speed:.2} revolutions per second")))?;
         row("problem", self.problem.clone())
     }
 }
@@ -306,11 +306,11 @@ impl fmt::Display for RotatingDescription {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use scanhub_drivers::inquiry;
+    use scanhub_drivers::identity_probe;
 
     #[test]
     fn a_link_names_only_a_rate_below_the_highest() {
-        let report = inquiry(Family::Lms, None, 0).unwrap().report().clone();
+        let report = identity_probe(Family::Lms, None, 0).unwrap().report().clone();
         let family = ("family", "lms".to_owned());
         assert_eq!(link_settings(&report, 38_400), [family.clone(), ("baud", "38400".to_owned())]);
         assert_eq!(link_settings(&report, 500_000), [family]);
@@ -319,7 +319,7 @@ mod tests {
     #[test]
     fn a_family_has_an_inquiry_if_it_says_so() {
         for family in Family::ALL {
-            assert_eq!(inquiry(family, None, 0).is_some(), features(family).has_inquiry, "{family:?}");
+            assert_eq!(identity_probe(family, None, 0).is_some(), features(family).has_probe, "{family:?}");
         }
     }
 }

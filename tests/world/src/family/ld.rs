@@ -68,9 +68,8 @@ impl Family for Ld {
     /// If an object appears just after the head has passed it, the scanner measures the object one revolution later.
     /// The hub publishes that revolution when it is complete.
     fn scan_times(&self) -> (Nanos, Nanos) {
-        let LdSettings { revolutions_per_second: turns_per_second, speed_variation: wander, .. } =
-            self.settings;
-        let slowest = turns_per_second * MIN_SPEED * (1.0 - wander);
+        let LdSettings { revolutions_per_second, speed_variation: wander, .. } = self.settings;
+        let slowest = revolutions_per_second * MIN_SPEED * (1.0 - wander);
         let revolution_ns = (1e9 / slowest) as Nanos;
         (revolution_ns, 2 * revolution_ns + LAST_PACKET_TIME)
     }

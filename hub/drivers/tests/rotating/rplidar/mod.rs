@@ -202,10 +202,10 @@ impl TestBench {
             let sample = SimulatedScanner::sample(point);
             let range = if range == line::NO_RETURN { 0 } else { u32::from(range) };
             // The packet format encodes differences, and cannot encode the difference to a point without a return.
-            let is_untold = kind == PacketFormat::Ultra
+            let is_unencodable = kind == PacketFormat::Ultra
                 && point % 3 == 2
                 && SimulatedScanner::sample(point + 1).range == 0;
-            let sample = if is_untold { TestPoint { range: 0, ..sample } } else { sample };
+            let sample = if is_unencodable { TestPoint { range: 0, ..sample } } else { sample };
             let angle = point as f64 * step - SimulatedScanner::angle_before(kind, sample);
             sample.range.abs_diff(range) <= 4 && (angle - revolution * 360.0 - degrees).abs() < 0.1
         })
@@ -453,7 +453,7 @@ impl SimulatedScanner {
     }
 
     fn handle_request(&mut self, command: u8, payload: &[u8], now: Nanos) {
-        if let Some(at) = self.ignored_requests.iter().position(|unheard| *unheard == command) {
+        if let Some(at) = self.ignored_requests.iter().position(|ignored| *ignored == command) {
             self.ignored_requests.swap_remove(at);
             return;
         }
@@ -509,7 +509,7 @@ impl SimulatedScanner {
                 let zero = now + self.spin_up + 10 * MILLIS + (self.earlier_points % 7_777) * 10_000;
                 self.state = ScannerState::Measuring { kind, us, first_point_at: zero, packets: 0 };
             }
-            command => panic!("{command:02X} must not be said"),
+            command => panic!("{command:02X} must not be sent"),
         }
     }
 
@@ -673,8 +673,8 @@ pub(crate) fn encode(kind: PacketFormat, start: f64, samples: &[TestPoint], next
                     (encode_major(three[0].range), encode_major(behind.range));
                 let differs = |range: u32, base: i64, level: u32| {
                     let difference = (i64::from(range) - base) >> level;
-                    let is_told = range > 0 && (-511..511).contains(&difference);
-                    (if is_told { difference } else { -512 } & 0x3FF) as u32
+                    let is_encodable = range > 0 && (-511..511).contains(&difference);
+                    (if is_encodable { difference } else { -512 } & 0x3FF) as u32
                 };
                 let (first_base, first_level) =
                     if stored == 0 { (base_behind, level_behind) } else { (base, level) };

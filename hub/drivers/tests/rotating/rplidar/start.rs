@@ -75,7 +75,7 @@ fn where_the_rate_is_fixed_it_stays() {
     let mut bench = TestBench::new(settings, head);
     bench.run(5 * ONE_SECOND);
     assert!(bench.log.bauds.is_empty());
-    let problem = bench.session.problem().expect("told");
+    let problem = bench.session.problem().expect("a problem");
     assert!(matches!(problem, Problem::NoResponse { baud: Some(256_000), seconds: 2.. }), "{problem}");
     bench.scanner.is_on = true;
     bench.run_until(3 * ONE_SECOND, is_streaming);
@@ -139,7 +139,7 @@ fn reports_health_error_and_retries_until_it_clears() {
     bench.run(9 * ONE_SECOND);
     let problem = bench.session.problem();
     assert_eq!(problem, Some(Problem::Unhealthy(Health::Error(0x8001))));
-    assert!(problem.expect("told").to_string().contains("8001h"));
+    assert!(problem.expect("a problem").to_string().contains("8001h"));
     assert_eq!(bench.scanner.requests.iter().filter(|request| **request == 0x40).count(), 1);
     assert!(!bench.scanner.is_measuring());
     bench.scanner.health = (1, 7);

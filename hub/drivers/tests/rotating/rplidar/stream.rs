@@ -334,7 +334,7 @@ fn replayed_recording_yields_the_same_revolutions() {
         let live = record(model, mode, 6);
         for settings in [Settings::default(), Settings { mode: Some(mode.name()), ..settings_of(model) }] {
             let (session, revolutions) = replay(settings, &live.log.outputs);
-            let per_second = session.points_per_second().expect("told");
+            let per_second = session.points_per_second().expect("measured");
             assert_eq!(Some(per_second), live.session.points_per_second(), "{model:?} {mode:?}");
             assert_eq!(session.model(), Some(model));
             // Without the configured mode, the first quarter of a second may belong to another mode.
@@ -370,8 +370,8 @@ fn one_that_begins_in_the_midst_has_turns_soon() {
             replay(Settings { mode: Some(mode.name()), ..settings_of(model) }, &live.log.outputs[from..]);
         let first = revolutions.first().expect("some").first;
         assert!(first < 3 * ONE_SECOND + ONE_SECOND * 6 / 10, "{model:?} {mode:?}: {first}");
-        let is =
-            session.points_per_second().expect("measured") / live.session.points_per_second().expect("told");
+        let is = session.points_per_second().expect("measured")
+            / live.session.points_per_second().expect("measured");
         assert!((is - 1.0).abs() < 0.005, "{model:?} {mode:?}: {is}");
         assert!(revolutions.iter().all(|replayed| !replayed.incomplete), "{model:?} {mode:?}");
         let worst = stamp_errors(&live, &revolutions).into_iter().max().expect("some");

@@ -506,9 +506,9 @@ fn a_permanent_rate_is_found_worked_with_and_kept() {
         bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         bench.run(500 * MILLIS);
         // The permanent rate is a notice and not a problem.
-        let is_said = bench.session.sensor().notices().eq([Notice::PermanentBaud]);
-        assert_eq!(is_said, permanent != Baud::B9600, "{permanent:?}: {bench}");
-        assert_eq!(bench.session.sensor().permanent_baud, Some(is_said));
+        let is_noticed = bench.session.sensor().notices().eq([Notice::PermanentBaud]);
+        assert_eq!(is_noticed, permanent != Baud::B9600, "{permanent:?}: {bench}");
+        assert_eq!(bench.session.sensor().permanent_baud, Some(is_noticed));
         assert_eq!(bench.session.problem(), None);
         // The scanner restarts at its own rate, and the session finds it again.
         let now = bench.now;

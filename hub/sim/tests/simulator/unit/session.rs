@@ -77,12 +77,12 @@ impl SessionBench {
                 }
             }
             self.bench.run(wakes_at);
-            let is_heard = self.session.rate() == self.bench.unit.rate();
+            let is_received = self.session.rate() == self.bench.unit.rate();
             let room = self.session.read_buffer();
             let new = &self.bench.received[self.read..];
             let len = new.len().min(room.len());
             room[..len].copy_from_slice(&new[..len]);
-            if !is_heard {
+            if !is_received {
                 room[..len].iter_mut().for_each(|byte| *byte |= 0x80);
             }
             self.read += len;

@@ -1,7 +1,7 @@
 //! Tests of changes of permanent settings with the user's consent. The host writes the settings once and reads them
 //! back, and the stream resumes. If a step fails, the outcome states what is known.
 
-use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::IdentityProbe;
 use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::Configuration;
 use scanhub_drivers::lms::telegram::{NAK, Writer};
@@ -17,7 +17,7 @@ use super::{Bench, machine, make_stream, sensor};
 /// Requests the scanner's identity. Returns a plan that changes nothing, the scanner, and the time at which the plan
 /// was complete.
 pub(crate) fn probe_and_plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {
-    let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
+    let mut bench = Bench::new(IdentityProbe::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
     let plan = Plan::from_report(bench.protocol.report()).expect("a complete report");
     (plan, bench.machine, bench.now)

@@ -1,9 +1,9 @@
-//! Tests of inquiries and changes with random bytes, random sequences of events and the fault table. Inquiries and
+//! Tests of probes and changes with random bytes, random sequences of events and the fault table. Probes and
 //! changes do not panic, they end, and their results are true. A change writes no more often than permitted, and
 //! reports every write.
 
 use scanhub_drivers::line::{Action, Protocol};
-use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::IdentityProbe;
 use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::factory_configuration;
 use scanhub_drivers::lms::framer::FramerCounters;
@@ -101,12 +101,12 @@ fn are_bytes_conserved(tally: &FramerCounters, open: usize) -> bool {
 #[test]
 fn an_inquiry_ends_and_only_asks() {
     for seed in 0..200 {
-        let mut inquiry = Inquiry::new(Baud::ALL[seed as usize % 4], 0);
-        for telegram in drive(&mut inquiry, seed) {
+        let mut probe = IdentityProbe::new(Baud::ALL[seed as usize % 4], 0);
+        for telegram in drive(&mut probe, seed) {
             let telegram = Telegram::check(&telegram).unwrap_or_else(|| panic!("{telegram:02X?}"));
             assert!([0x31, 0x32, 0x35, 0x3A, 0x74].contains(&telegram.command()), "{telegram:?}");
         }
-        let (tally, open) = inquiry.byte_counters();
+        let (tally, open) = probe.byte_counters();
         assert!(are_bytes_conserved(tally, open), "seed {seed}: {tally:?}");
     }
 }
@@ -150,7 +150,7 @@ fn writes_the_plan_and_leaves_installation_mode() {
     assert!((1..=3).contains(&maximum), "{maximum} writes");
 }
 
-/// Faults. Each has the minimum number of 8 inquiries and the minimum number of 8 changes that must succeed despite the
+/// Faults. Each has the minimum number of 8 probes and the minimum number of 8 changes that must succeed despite the
 /// fault.
 const SCENES: &[(&str, [usize; 2])] = &[
     ("loss=0.001,burst=3", [7, 7]),
@@ -198,8 +198,8 @@ fn probe_report_is_right_despite_faults() {
         let mut found = 0;
         for seed in 0..SEED_COUNT {
             let (baud, machine, now, is_streaming) = any_scanner(seed);
-            let inquiry = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
-            let mut bench = with_faults(inquiry, &faults, seed);
+            let probe = Bench::new(IdentityProbe::new(Baud::B500000, now), Baud::B500000, machine, now);
+            let mut bench = with_faults(probe, &faults, seed);
             bench.finish(60_000 * MILLIS);
             let report = bench.protocol.report();
             if let Some(status) = report.status() {

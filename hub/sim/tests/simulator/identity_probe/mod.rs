@@ -1,4 +1,4 @@
-//! Tests of requests for the identity of a simulated scanner, in virtual time. The inquiry finds a scanner that replies
+//! Tests of requests for the identity of a simulated scanner, in virtual time. The probe finds a scanner that replies
 //! at any rate and in any mode, and leaves it in the same state. The line may lose bytes. The scanner may overlook
 //! requests or be missing.
 
@@ -8,7 +8,7 @@ mod random;
 use std::collections::VecDeque;
 
 use scanhub_drivers::line::{Action, Protocol};
-use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::IdentityProbe;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::telegram::{EncodedTelegram, FRAME_LEN, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
@@ -212,7 +212,7 @@ fn identifies_scanner_at_each_rate_and_in_each_mode() {
                     0x00 => send(&mut machine, &installation_request()),
                     _ => 0,
                 };
-                let mut bench = Bench::new(Inquiry::new(first, now), first, machine, now);
+                let mut bench = Bench::new(IdentityProbe::new(first, now), first, machine, now);
                 let elapsed = bench.finish(5_000 * MILLIS);
                 let report = bench.protocol.report();
                 let status =
@@ -235,7 +235,7 @@ fn identifies_scanner_at_each_rate_and_in_each_mode() {
 #[test]
 fn sends_only_requests_that_change_nothing() {
     for baud in Baud::ALL {
-        let mut bench = Bench::new(Inquiry::new(Baud::B500000, 0), Baud::B500000, sensor(baud), 0);
+        let mut bench = Bench::new(IdentityProbe::new(Baud::B500000, 0), Baud::B500000, sensor(baud), 0);
         bench.finish(5_000 * MILLIS);
         for telegram in &bench.sent_requests {
             assert!([0x31, 0x32, 0x35, 0x3A, 0x74].contains(&telegram[4]), "{telegram:02X?}");
@@ -257,7 +257,8 @@ fn found_in_every_operating_mode_and_left_in_it() {
         for baud in Baud::ALL {
             let start = StartState::Operating(operating.clone());
             let settings = Settings { baud, start, seed: 4, ..Settings::default() };
-            let mut bench = Bench::new(Inquiry::new(Baud::B500000, 0), Baud::B500000, machine(settings), 0);
+            let mut bench =
+                Bench::new(IdentityProbe::new(Baud::B500000, 0), Baud::B500000, machine(settings), 0);
             bench.finish(20_000 * MILLIS);
             let report = bench.protocol.report();
             let mode = report.status().map(|status| status.operating_mode());
@@ -285,7 +286,7 @@ fn reports_faults_and_settings_of_a_used_scanner() {
         configuration_len: 32,
         ..Settings::default()
     };
-    let mut bench = Bench::new(Inquiry::new(Baud::B9600, 0), Baud::B9600, machine(settings), 0);
+    let mut bench = Bench::new(IdentityProbe::new(Baud::B9600, 0), Baud::B9600, machine(settings), 0);
     bench.finish(20_000 * MILLIS);
     let report = bench.protocol.report();
     assert_eq!(report.status().map(|status| status.has_permanent_baud()), Some(true));
@@ -299,7 +300,7 @@ fn reports_faults_and_settings_of_a_used_scanner() {
 #[test]
 fn an_address_of_its_own_is_learned_and_used() {
     let settings = Settings { address: 5, baud: Baud::B19200, ..Settings::default() };
-    let mut bench = Bench::new(Inquiry::new(Baud::B9600, 0), Baud::B9600, machine(settings), 0);
+    let mut bench = Bench::new(IdentityProbe::new(Baud::B9600, 0), Baud::B9600, machine(settings), 0);
     bench.finish(5_000 * MILLIS);
     assert_eq!(bench.protocol.report().address, Some(5));
     assert_eq!(bench.sent_requests.last().map(|telegram| telegram[1]), Some(5));
@@ -308,10 +309,11 @@ fn an_address_of_its_own_is_learned_and_used() {
 #[test]
 fn a_rate_that_cannot_be_changed_is_not() {
     let mut bench =
-        Bench::new(Inquiry::at_fixed_rate(Baud::B38400, 0), Baud::B38400, sensor(Baud::B38400), 0);
+        Bench::new(IdentityProbe::at_fixed_rate(Baud::B38400, 0), Baud::B38400, sensor(Baud::B38400), 0);
     bench.finish(5_000 * MILLIS);
     assert!(bench.protocol.report().status().is_some());
-    let mut bench = Bench::new(Inquiry::at_fixed_rate(Baud::B38400, 0), Baud::B38400, sensor(Baud::B9600), 0);
+    let mut bench =
+        Bench::new(IdentityProbe::at_fixed_rate(Baud::B38400, 0), Baud::B38400, sensor(Baud::B9600), 0);
     bench.finish(5_000 * MILLIS);
     assert!(!bench.protocol.report().has_replied());
     assert_eq!(bench.protocol.baud(), Baud::B38400);
@@ -319,7 +321,7 @@ fn a_rate_that_cannot_be_changed_is_not() {
 
 #[test]
 fn the_answers_are_those_to_the_questions() {
-    let mut bench = Bench::new(Inquiry::new(Baud::B9600, 0), Baud::B9600, sensor(Baud::B9600), 0);
+    let mut bench = Bench::new(IdentityProbe::new(Baud::B9600, 0), Baud::B9600, sensor(Baud::B9600), 0);
     bench.finish(5_000 * MILLIS);
     let report = bench.protocol.report();
     assert!(report.reply(Request::Type).is_some());
@@ -333,7 +335,7 @@ fn lossy_line_never_leads_to_a_wrong_report() {
         let baud = Baud::ALL[seed as usize % 4];
         let mut machine = sensor(baud);
         let now = if seed % 2 == 0 { make_stream(&mut machine) } else { 0 };
-        let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
+        let mut bench = Bench::new(IdentityProbe::new(Baud::B500000, now), Baud::B500000, machine, now);
         let mut random = fastrand::Rng::with_seed(seed);
         bench.to_host = Box::new(move |bytes| bytes.into_iter().filter(|_| random.f64() > 0.002).collect());
         bench.finish(20_000 * MILLIS);
@@ -361,7 +363,7 @@ fn repeats_an_overlooked_request() {
         let baud = Baud::ALL[seed as usize % 4];
         let mut machine = sensor(baud);
         let now = make_stream(&mut machine);
-        let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
+        let mut bench = Bench::new(IdentityProbe::new(Baud::B500000, now), Baud::B500000, machine, now);
         // A request without its first byte is invalid.
         let mut random = fastrand::Rng::with_seed(seed);
         bench.to_scanner =
@@ -384,7 +386,7 @@ fn late_doubled_and_refused_replies() {
         for baud in Baud::ALL {
             let mut machine = sensor(baud);
             machine.set_quirks(quirks.clone());
-            let mut bench = Bench::new(Inquiry::new(Baud::B500000, 0), Baud::B500000, machine, 0);
+            let mut bench = Bench::new(IdentityProbe::new(Baud::B500000, 0), Baud::B500000, machine, 0);
             bench.finish(20_000 * MILLIS);
             let report = bench.protocol.report();
             assert_eq!(report.baud, Some(baud), "{word}");
@@ -396,7 +398,7 @@ fn late_doubled_and_refused_replies() {
 
 #[test]
 fn reports_silence_within_5_s() {
-    let mut bench = Bench::new(Inquiry::new(Baud::B500000, 0), Baud::B500000, sensor(Baud::B9600), 0);
+    let mut bench = Bench::new(IdentityProbe::new(Baud::B500000, 0), Baud::B500000, sensor(Baud::B9600), 0);
     bench.to_host = Box::new(|_| Vec::new());
     let elapsed = bench.finish(10_000 * MILLIS);
     let report = bench.protocol.report();
@@ -410,7 +412,7 @@ fn reports_rate_of_a_stream_that_ignores_requests() {
     for baud in Baud::ALL {
         let mut machine = sensor(baud);
         let now = make_stream(&mut machine);
-        let mut bench = Bench::new(Inquiry::new(baud, now), baud, machine, now);
+        let mut bench = Bench::new(IdentityProbe::new(baud, now), baud, machine, now);
         bench.to_scanner = Box::new(|_| Vec::new());
         let elapsed = bench.finish(20_000 * MILLIS);
         let report = bench.protocol.report();

@@ -1,9 +1,9 @@
-//! Dialog that finds the baud rate of a scanner and requests its identity and state. It does not change the scanner's
+//! Probe that finds the baud rate of an LMS and requests its identity and state. It does not change the scanner's
 //! mode, baud rate or settings. A scanner that streams continues to stream, but each reply costs a scan.
 //!
-//! The inquiry listens first, because a stream at the port's rate needs no request. Then it requests the status at each
+//! The probe listens first, because a stream at the port's rate needs no request. Then it requests the status at each
 //! rate. It does this in two rounds, because a scanner may overlook a request. If telegrams arrived at a rate, the
-//! inquiry sends more requests at this rate.
+//! probe sends more requests at this rate.
 
 use scanhub_schema::{Nanos, line_time};
 
@@ -22,14 +22,14 @@ use crate::lms::status::{DIRTY_BELOW_PERCENT, Errors, StatusByte, StatusReport};
 use crate::lms::telegram::{EncodedTelegram, MAX_TELEGRAM, REPLY};
 use crate::lms::variant::Baud;
 
-/// State machine of the dialog.
+/// State machine of the probe.
 #[derive(Clone, Debug)]
-pub struct Inquiry {
+pub struct IdentityProbe {
     channel: RequestChannel<Request>,
     phase: Phase,
     /// Baud rates in the order of the search.
     rates: [Baud; Baud::ALL.len()],
-    /// Number of entries of `rates` that the inquiry tries.
+    /// Number of entries of `rates` that the probe tries.
     count: usize,
     /// Number of telegrams that arrived without a request, for each entry of `rates`.
     unrequested: [u32; Baud::ALL.len()],
@@ -49,7 +49,7 @@ enum Phase {
     Requesting {
         question: usize,
     },
-    /// Bytes arrived, but no reply. The inquiry checks at each rate whether the bytes are a stream.
+    /// Bytes arrived, but no reply. The probe checks at each rate whether the bytes are a stream.
     ListeningPerRate {
         attempt: usize,
         give_up_at: Nanos,
@@ -57,38 +57,38 @@ enum Phase {
     Done,
 }
 
-impl Inquiry {
+impl IdentityProbe {
     /// All baud rates of a scanner.
     pub const RATES: [u32; Baud::ALL.len()] = table!(Baud::ALL, Baud::rate);
 
-    /// Creates an inquiry on a port that is open at `rate`, in bits per second. `rate` is `None` for a serial server,
+    /// Creates a probe on a port that is open at `rate`, in bits per second. `rate` is `None` for a serial server,
     /// on which the user sets the rate.
     pub fn begin(rate: Option<u32>, now: Nanos) -> Self {
         match rate {
-            Some(rate) => Inquiry::new(Baud::of_rate(rate).unwrap_or(Baud::B500000), now),
+            Some(rate) => IdentityProbe::new(Baud::of_rate(rate).unwrap_or(Baud::B500000), now),
             // The status will contain the rate. Timeouts for the slowest rate are long enough for every rate.
-            None => Inquiry::at_fixed_rate(Baud::B9600, now),
+            None => IdentityProbe::at_fixed_rate(Baud::B9600, now),
         }
     }
 
-    /// Creates an inquiry on a port that is open at `first`. The inquiry tries all baud rates, starting with `first`.
+    /// Creates a probe on a port that is open at `first`. The probe tries all baud rates, starting with `first`.
     pub fn new(first: Baud, now: Nanos) -> Self {
         let mut rates = Baud::ALL;
         if let Some(at) = rates.iter().position(|&baud| baud == first) {
             rates[..=at].rotate_right(1);
         }
-        Inquiry::with_rates(rates, rates.len(), now)
+        IdentityProbe::with_rates(rates, rates.len(), now)
     }
 
-    /// Creates an inquiry on the line of a serial server, whose baud rate is fixed at `baud`.
+    /// Creates a probe on the line of a serial server, whose baud rate is fixed at `baud`.
     pub fn at_fixed_rate(baud: Baud, now: Nanos) -> Self {
-        let mut inquiry = Inquiry::with_rates([baud; Baud::ALL.len()], 1, now);
-        inquiry.channel.is_behind_server = true;
-        inquiry
+        let mut probe = IdentityProbe::with_rates([baud; Baud::ALL.len()], 1, now);
+        probe.channel.is_behind_server = true;
+        probe
     }
 
     fn with_rates(rates: [Baud; Baud::ALL.len()], count: usize, now: Nanos) -> Self {
-        Inquiry {
+        IdentityProbe {
             channel: RequestChannel::new(rates[0], now),
             phase: Phase::Listening { give_up_at: now + LISTEN_TIME },
             rates,
@@ -99,12 +99,12 @@ impl Inquiry {
         }
     }
 
-    /// Returns the report. It is complete when the inquiry [is done](Protocol::is_done).
+    /// Returns the report. It is complete when the probe [is done](Protocol::is_done).
     pub fn report(&self) -> &Report {
         &self.report
     }
 
-    /// Returns the baud rate that the inquiry tries now.
+    /// Returns the baud rate that the probe tries now.
     pub fn baud(&self) -> Baud {
         self.channel.baud
     }
@@ -148,7 +148,7 @@ impl Inquiry {
         }
     }
 
-    /// Sends the request that follows `request` in [`REQUESTS`], or ends the inquiry.
+    /// Sends the request that follows `request` in [`REQUESTS`], or ends the probe.
     fn request_next(&mut self, request: Request) {
         let index = request_index(request).map_or(REQUESTS.len(), |at| at + 1);
         match REQUESTS.get(index) {
@@ -161,7 +161,7 @@ impl Inquiry {
         }
     }
 
-    /// Returns whether the scanner may have counters. If its model is unknown, the inquiry sends the request, and the
+    /// Returns whether the scanner may have counters. If its model is unknown, the probe sends the request, and the
     /// scanner can refuse it.
     fn has_counters(&self) -> bool {
         let family = self.report.kind().and_then(LmsModel::of_type);
@@ -181,7 +181,7 @@ impl Inquiry {
     }
 
     /// Waits for a telegram at each baud rate. At each rate, it waits for the duration of two telegrams of the maximum
-    /// length. If the line is silent, or if telegrams have already arrived, ends the inquiry instead.
+    /// length. If the line is silent, or if telegrams have already arrived, ends the probe instead.
     fn listen_per_rate(&mut self, attempt: usize) {
         let is_silent = self.channel.byte_counters().0.read == 0;
         if is_silent || attempt >= self.count || self.unrequested.iter().any(|&count| count > 0) {
@@ -193,7 +193,7 @@ impl Inquiry {
         self.phase = Phase::ListeningPerRate { attempt, give_up_at };
     }
 
-    /// Ends the inquiry without a reply. If the inquiry found a stream, the report contains the stream's baud rate.
+    /// Ends the probe without a reply. If the probe found a stream, the report contains the stream's baud rate.
     fn end_without_reply(&mut self) {
         self.phase = Phase::Done;
         let busiest = self.unrequested.iter().zip(self.rates).max_by_key(|(count, _)| **count);
@@ -219,7 +219,7 @@ impl Inquiry {
     }
 }
 
-impl Protocol for Inquiry {
+impl Protocol for IdentityProbe {
     fn read_buffer(&mut self) -> &mut [u8] {
         self.channel.read_buffer()
     }
@@ -276,7 +276,7 @@ impl Protocol for Inquiry {
     }
 }
 
-/// Result of an inquiry.
+/// Result of a probe.
 #[derive(Clone, Debug, Default)]
 pub struct Report {
     /// Baud rate of the scanner. `None` if no telegram arrived at any rate.
@@ -360,7 +360,7 @@ fn request_index(request: Request) -> Option<usize> {
     REQUESTS.iter().position(|&question| question == request)
 }
 
-/// Requests of an inquiry, in the order in which it sends them. The reply to the first request proves the baud rate.
+/// Requests of a probe, in the order in which it sends them. The reply to the first request proves the baud rate.
 const REQUESTS: [Request; 5] =
     [Request::Status, Request::Type, Request::Configuration, Request::Errors, Request::Counters];
 /// Number of rounds through all baud rates.
