@@ -297,7 +297,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rates() {
+    fn parses_replay_rates() {
         assert_eq!(
             (parse_rate("max"), parse_rate("0.5")),
             (Ok(PlaybackRate::Max), Ok(PlaybackRate::Times(0.5)))

@@ -225,7 +225,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_help_names_every_world() {
+    fn help_names_every_world() {
         let command = Simulate::augment_args(clap::Command::new("simulate"));
         let world = command.get_arguments().find(|argument| argument.get_id() == "world").expect("an option");
         let help = world.get_help().expect("a help").to_string();

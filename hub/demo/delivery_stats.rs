@@ -458,7 +458,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_single_beam_is_not_the_nearest() {
+    fn single_beam_is_not_the_nearest() {
         let mut sensor = Sensor::default();
         let scan = |ranges: Value| serde_json::json!({ "unit_um": 10_000, "first_angle_deg": -90.0, "step_deg": 0.5, "ranges": ranges });
         sensor.take_scan(&scan(serde_json::json!([400, 400, 3, 400, null, 7, null, 120, 110, 300])));
@@ -518,7 +518,7 @@ mod tests {
     }
 
     #[test]
-    fn a_revolution_is_shown_from_right_to_left() {
+    fn revolution_is_shown_from_right_to_left() {
         let mut sensor = Sensor { is_rotating: true, ..Sensor::default() };
         // The beams point ahead, right, to the rear, and left.
         let turn = serde_json::json!({ "unit_um": 1000, "first_angle_deg": 0.0, "step_deg": -90.0, "ranges": [1, 2, 3, 4] });

@@ -141,7 +141,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn how_far_it_is() {
+    fn progress_line_has_position_rate_and_lap() {
         let progress = Progress {
             position_ns: 65_250_000_000,
             length_ns: Some(130_500_000_000),
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn how_long_it_took() {
+    fn summary_has_duration_and_speed() {
         let played = Progress {
             position_ns: 60_000_000_000,
             length_ns: None,

@@ -385,7 +385,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn models_go_there_and_back() {
+    fn background_round_trips_through_bytes() {
         let head =
             BackgroundHead { generation: 3, known_beams: 2, unit_um: 10_000, ..BackgroundHead::default() };
         let model = Background::of(head, &[400, 0, Background::FAR]);

@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn models_go_there_and_back() {
+    fn background_round_trips_through_a_file() {
         for (count, unit_um) in [(101, 1_000), (181, 10_000), (201, 100_000), (361, 1_000), (401, 250)] {
             for flags in [0, Background::FROZEN] {
                 let mut model = lms(count);
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn models_of_version_1_look_ahead_too() {
+    fn version_1_angles_are_converted() {
         for count in [101, 181, 201, 361, 401] {
             let before = text(&lms(count)).replace(":-90.0", ":0.0").replace(":-50.0", ":40.0");
             assert_eq!(BackgroundFile::parse(before.as_bytes(), "m").unwrap().model, lms(count), "{count}");
@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_that_knows_nothing_is_none() {
+    fn empty_background_file_is_refused() {
         let mut empty = lms(361);
         empty.ranges_mut().fill(Background::UNKNOWN);
         empty.known_beams = 0;
@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_cut_short_anywhere_is_refused() {
+    fn truncated_background_file_is_refused() {
         let whole = text(&lms(361));
         for length in 0..whole.len() {
             let failure = BackgroundFile::parse(&whole.as_bytes()[..length], "/m.json").unwrap_err();

@@ -178,7 +178,7 @@ mod tests {
     use crate::BackgroundHead;
 
     #[test]
-    fn verbs_go_there_and_back() {
+    fn requests_round_trip() {
         for verb in Verb::all() {
             assert_eq!(Verb::parse(verb.name()), Some(verb));
             let request = Request::new("front", verb);
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn responses_go_there_and_back() {
+    fn responses_round_trip() {
         let failure = |kind, hint: &str| Response(Err(Failure::new(kind, "front: no", hint)));
         let head = BackgroundHead { generation: 7, ..BackgroundHead::default() };
         let model = Background::of(head, &[0; 361]);

@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_has_a_row_for_each_mark() {
+    fn csv_has_a_row_for_each_mark() {
         let mut marks = Marks { count: 2, ..Marks::default() };
         marks.mark_array[1] = Mark {
             angle_mdeg: -90_500,

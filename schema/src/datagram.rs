@@ -533,12 +533,12 @@ mod tests {
     }
 
     #[test]
-    fn the_checksum_is_that_of_the_catalogue() {
+    fn checksum_matches_the_crc_catalogue() {
         assert_eq!(CRC.checksum(b"123456789"), 0xE306_9283);
     }
 
     #[test]
-    fn datagrams_go_there_and_back() {
+    fn datagrams_round_trip() {
         let head = Head {
             topic: Topic::Scan.number(),
             flags: LanFlags::SUSPECT,
@@ -560,7 +560,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_failing_check_names_the_reason() {
+    fn first_failing_check_names_the_reason() {
         let good = sealed(Head::default(), b"1234");
         let with = |at: usize, byte: u8| {
             let mut bytes = good.clone();
@@ -585,7 +585,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_is_no_longer_than_a_datagram_on_an_ethernet() {
+    fn part_is_no_longer_than_a_datagram_on_an_ethernet() {
         let of = |parts, len| {
             let (head, mut buffer) = (Head { parts, ..Head::default() }, vec![0; 2000]);
             Datagram::read(head.seal(&mut buffer, len).unwrap()).map(|datagram| datagram.payload.len())
@@ -595,7 +595,7 @@ mod tests {
     }
 
     #[test]
-    fn every_flipped_bit_is_seen() {
+    fn every_flipped_bit_is_detected() {
         let good = sealed(Head { hub: 9, ..Head::default() }, &[0x55; 100]);
         for bit in 0..8 * good.len() {
             let mut bytes = good.clone();
@@ -605,7 +605,7 @@ mod tests {
     }
 
     #[test]
-    fn a_longer_header_of_a_later_version_is_skipped() {
+    fn longer_header_of_a_later_version_is_skipped() {
         let mut bytes = sealed(Head::default(), b"1234");
         bytes.splice(HEADER_LEN..HEADER_LEN, [1, 2, 3, 4]);
         bytes[5] = 52;
@@ -616,7 +616,7 @@ mod tests {
     }
 
     #[test]
-    fn announcements_go_there_and_back() {
+    fn announcements_round_trip() {
         let mut announce = Announce::new(0x1122, "front", "LMS200;301063;V02.30");
         for topic in [Topic::Scan, Topic::Status] {
             announce.add(Announced { topic: topic.number(), group: 81, port: 22_200, next: 5 });

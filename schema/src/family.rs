@@ -328,7 +328,7 @@ mod tests {
     use crate::Scan;
 
     #[test]
-    fn a_packet_that_begins_like_an_answer_is_none() {
+    fn data_packet_is_distinguished_from_a_reply() {
         let packet_facts = |bytes: &[u8]| {
             let facts = Family::Rplidar.packets(bytes).expect("packets");
             (facts.kind, facts.checked, facts.packets)
@@ -345,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nine_greatest_values_are_codes() {
+    fn nine_greatest_lms_values_are_codes() {
         for (bits, max) in [(13, 0x1FFF), (14, 0x3FFF), (15, 0x7FFF)] {
             let scan = Scan::of(ScanHead::lms(4, 0, 500, 10, bits), &[max, max - 8, max - 9, 0]);
             assert_eq!(scan.code(0), Some(Code::NoReturn));
@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn half_degrees_are_measured_one_turn_later() {
+    fn half_degrees_are_measured_one_revolution_later() {
         let of = |count, step_mdeg| Scan::of(ScanHead::lms(count, 0, step_mdeg, 1, 13), &vec![0; count]);
         let (turn_ns, half) = (i64::from(REVOLUTION_NS), of(361, 500));
         assert_eq!(half.beam_ns(360), -turn_ns);
@@ -369,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn intensities_only_where_the_mode_has_them() {
+    fn intensities_exist_only_if_the_mode_has_them() {
         let mut scan = Scan::of(ScanHead::lms(2, 0, 500, 1, 13), &[1, 2]);
         scan.arrays().upper[1] = 7;
         assert_eq!((scan.upper(), scan.intensities().len()), (&[0, 7][..], 0));
@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn fields_of_an_answer() {
+    fn reads_fields_of_an_lms_reply() {
         let bytes = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
         let longer = [&bytes[..], &[7; 5]].concat();
         let telegram = Telegram::of(Family::Lms as u8, &longer).expect("what follows is a later revision's");

@@ -165,10 +165,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn hub_time() {
+    fn hub_time_is_rounded_up_to_256_ns() {
         let mut header = Header { stamp_last_ns: 1_000_000, ..Header::default() };
         assert_eq!(header.hub_time_ns(), None);
-        for (now_ns, told) in [
+        for (now_ns, expected) in [
             (1_000_000, Some(256)),
             (1_000_256, Some(256)),
             (1_000_257, Some(512)),
@@ -179,7 +179,7 @@ mod tests {
             (5, Some(256)),
         ] {
             header.set_sent_at(now_ns);
-            assert_eq!(header.hub_time_ns(), told, "{now_ns}");
+            assert_eq!(header.hub_time_ns(), expected, "{now_ns}");
         }
     }
 }

@@ -143,7 +143,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unknown_method_has_no_step_and_no_pose() {
+    fn unknown_motion_method_has_no_step_and_no_pose() {
         for (number, method) in MotionMethod::ALL.into_iter().enumerate() {
             let motion = Motion { method: number as u8, ..Motion::default() };
             assert_eq!((motion.method(), method as usize), (method, number));

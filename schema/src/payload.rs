@@ -409,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn payloads_go_there_and_back() {
+    fn payloads_round_trip() {
         let head =
             ScanHead { unit_um: 1000, valid_to: 8182, contents: ArrayFlags::UPPER, ..ScanHead::default() };
         let mut scan = Scan::of(head, &[0; 361]);
@@ -452,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn a_foreground_leaves_out_the_segments_without_room() {
+    fn foreground_drops_segments_without_room() {
         let foreground = foreground();
         let mut room = [0; 24 + 46 + 128 + 16 * 10 + 15];
         assert_eq!(foreground.pack(&mut room), Some(24 + 46 + 128 + 160));
@@ -486,7 +486,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_go_there_and_back() {
+    fn lines_payload_round_trips() {
         let mut lines = Lines { count: 2, corners: 1, ..Lines::default() };
         lines.line_array[1] = Line { alpha_rad: -1.0, last: 7, ..Line::default() };
         lines.corner_array[0] = Corner { x_m: 2.0, second_line: 1, ..Corner::default() };
@@ -494,7 +494,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_that_contradict_themselves_are_refused() {
+    fn contradictory_lines_are_refused() {
         let mut lines = [0; 12 + 40 + 12];
         (lines[0], lines[1]) = (1, 1);
         assert!(Lines::room(&lines).is_some());
@@ -514,7 +514,7 @@ mod tests {
     }
 
     #[test]
-    fn a_motion_goes_there_and_back() {
+    fn motion_payload_round_trips() {
         let mut motion =
             Motion { x_m: -1.5, dyaw_rad: 0.25, method: 5, refused_steps: 3, ..Motion::default() };
         motion.pose_covariance[8] = 0.5;
@@ -553,7 +553,7 @@ mod tests {
     }
 
     #[test]
-    fn tilted_payloads_go_there_and_back() {
+    fn tilted_payloads_round_trip() {
         let tilt = Tilt { angle_rad: -0.5, rate_rad_s: 0.25 };
         check_round_trip(&tilt, &mut Tilt::default(), 16);
         assert!(Tilt::default().unpack(bytes_of(&Tilt::default())), "a rate need not be known");
@@ -564,7 +564,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_are_none_and_too_many_are_refused() {
+    fn tilted_nan_values_and_wrong_counts_are_refused() {
         for bad in [
             Tilt { angle_rad: f64::NAN, rate_rad_s: 0.0 },
             Tilt { angle_rad: 0.0, rate_rad_s: f64::INFINITY },
@@ -586,7 +586,7 @@ mod tests {
     }
 
     #[test]
-    fn a_topic_is_made_wider_for_a_longer_cloud() {
+    fn longer_cloud_widens_the_topic_limits() {
         let points = [CloudPoint::default(); 500];
         let mut limits = TopicLimits::default();
         Cloud::widen(&mut limits, Cloud::of(CloudHead::default(), &points).bytes());
@@ -606,7 +606,7 @@ mod tests {
     }
 
     #[test]
-    fn people_go_there_and_back() {
+    fn track_payloads_round_trip() {
         check_round_trip(&two_tracks(), &mut Tracks::default(), 8 + 2 * 80 + 2 * 72);
         check_round_trip(&Tracks::default(), &mut Tracks::default(), 8);
         let event = Event::new(EventKind::Door, 5, Some("hall")).with_door("left", "kitchen", "hall");
@@ -614,7 +614,7 @@ mod tests {
     }
 
     #[test]
-    fn tracks_that_contradict_themselves_are_refused() {
+    fn contradictory_tracks_are_refused() {
         let mut sound = [0; 8 + 2 * 80 + 2 * 72];
         assert_eq!(two_tracks().pack(&mut sound), Some(sound.len()));
         for (at, bytes) in [

@@ -459,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn each_array_is_where_it_was_written() {
+    fn scan_arrays_are_read_as_written() {
         let scan = revolution();
         assert_eq!((scan.bytes().len(), scan.beams()), (64 + 3 * 9, 3));
         assert_eq!((scan.range(0), scan.distance_mm(0)), (Some(4001), Some(1000)));
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn a_count_beyond_the_memory_is_cut() {
+    fn count_beyond_the_memory_is_cut() {
         let mut scan = revolution();
         scan.count = u16::MAX;
         // 32 bytes after the head, in whole words.

@@ -380,7 +380,7 @@ mod tests {
     use std::f64::consts::FRAC_PI_2;
 
     #[test]
-    fn states_stand_at_their_numbers() {
+    fn state_numbers_match_their_order() {
         for (number, state) in State::ALL.iter().enumerate() {
             assert_eq!(*state as usize, number);
         }
@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mode_without_reflector_bits_has_a_remedy() {
+    fn mode_without_reflector_bits_has_a_remedy() {
         let mut status = Status { mode: 0, ..Status::default() };
         status.set_port("/dev/ttyUSB0");
         let facts = |status: &Status| (status.has_reflector_bits(), status.missing_reflector_mode());
@@ -425,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scanner_has_a_family_and_a_model() {
+    fn scanner_has_a_family_and_a_model() {
         let mut status = Status::default();
         assert_eq!((status.family(), status.model()), (Some(Family::Lms), None));
         status.set_sensor_type("LMS200;301063;V02.30 ");
@@ -454,7 +454,7 @@ mod tests {
     }
 
     #[test]
-    fn counters_fit() {
+    fn all_counters_fit_into_a_status() {
         assert!(Counter::ALL.len() <= MAX_COUNTERS);
     }
 

@@ -206,7 +206,7 @@ mod tests {
     use crate::{Failure, Kind};
 
     #[test]
-    fn text_is_cut_at_a_character_and_the_rest_cleared() {
+    fn text_is_cut_at_a_character_boundary() {
         let mut field = [0xAA; 5];
         write(&mut field, "abcdé");
         assert_eq!(field, *b"abcd\0");
@@ -217,12 +217,12 @@ mod tests {
     }
 
     #[test]
-    fn bytes_that_are_not_text_end_it() {
+    fn text_ends_at_the_first_invalid_byte() {
         assert_eq!(read(b"ab\xFFcd"), "ab");
     }
 
     #[test]
-    fn a_terminal_gets_text_alone() {
+    fn control_characters_are_replaced_for_a_terminal() {
         let text = "é \x1b[2J\x07\u{9b}31m\r\x7f,\n  ok";
         assert_eq!(Printable(text).to_string(), "é ?[2J??31m??,\n  ok");
         let failure = Failure::new(Kind::Failed, "no \x1b]0;x\x07", "try \u{9d}y");

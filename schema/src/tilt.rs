@@ -350,7 +350,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn points_are_as_many_as_there_is_memory_for() {
+    fn point_count_is_limited_by_memory() {
         let point = CloudPoint { at: [1.0, -2.0, 0.5], beam: 7, point_class: 2, reserved: 0 };
         let head = CloudHead { sweep: 3, flags: Cloud::FIRST | Cloud::COMPLETE, ..CloudHead::default() };
         let mut cloud = Cloud::of(head, &[CloudPoint::default(), point]);
@@ -361,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_of_classes() {
+    fn point_class_numbers_match_their_order() {
         for (number, class) in PointClass::ALL.into_iter().enumerate() {
             assert_eq!(class as usize, number);
             assert_eq!(CloudPoint { point_class: number as u8, ..CloudPoint::default() }.class(), class);
@@ -382,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn sweeps_are_whole_or_left_out() {
+    fn incomplete_sweeps_are_dropped() {
         let (first, last) = (Cloud::FIRST, Cloud::LAST);
         let mut sweep = SweepPoints::default();
         // A program that starts in the middle of a sweep waits for the next one.
@@ -403,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn no_sweep_is_too_long() {
+    fn sweep_longer_than_the_maximum_is_dropped() {
         let mut samples: Vec<_> = (0..33).map(|number| (number, 0, 8192)).collect();
         samples[0].1 = Cloud::FIRST;
         samples.push((33, Cloud::LAST, 1));

@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn units() {
+    fn age_is_written_with_rounded_units() {
         let written = |seconds| Age(Duration::from_secs(seconds)).to_string();
         let all = [0, 119, 120, 7_199, 7_200, 172_799, 172_800].map(written);
         assert_eq!(all, ["0 s", "119 s", "2 min", "119 min", "2 h", "47 h", "2 days"]);

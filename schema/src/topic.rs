@@ -424,7 +424,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn service_names_go_there_and_back() {
+    fn service_names_round_trip() {
         assert_eq!(Topic::Scan.service("front"), "scanhub/v2/front/scan");
         for topic in Topic::ALL {
             assert_eq!(parse_service_name(&topic.service("rear")), Some(("rear", Some(topic))));
@@ -439,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_sensors() {
+    fn sensor_names_are_checked() {
         assert!(check_sensor("front_2-b").is_ok());
         for bad in ["", "Front", "a/b", "a b", "ä", ROBOT, &"a".repeat(25)] {
             assert_eq!(check_sensor(bad).map_err(|failure| failure.kind), Err(Kind::Configuration), "{bad}");
@@ -464,7 +464,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_is_all_that_a_topic_needs_here() {
+    fn table_row_defines_a_complete_topic() {
         use with_one_more::{SPECS, Topic};
         assert_eq!(Topic::ALL, [Topic::Telegram, Topic::Beat]);
         let row = &SPECS[Topic::Beat as usize];
@@ -491,7 +491,7 @@ mod tests {
     }
 
     #[test]
-    fn every_topic_has_one_maker() {
+    fn every_topic_has_one_publisher_kind() {
         let topics: Vec<Topic> =
             PublisherKind::ALL.into_iter().flat_map(|maker| maker.topics()).copied().collect();
         assert_eq!(topics, Topic::ALL);

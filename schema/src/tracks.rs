@@ -299,7 +299,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_and_states_of_a_sample() {
+    fn tracks_sample_has_names_and_states() {
         let mut tracks = Tracks::default();
         let pose = Pose { x_m: 1.5, y_m: -2.0, yaw_rad: 0.5, upside_down: 1, ..Pose::default() };
         for name in ["front", "kitchen.rear"] {

@@ -190,7 +190,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn verdicts_stand_at_their_numbers_and_the_worse_wins() {
+    fn verdicts_are_numbered_and_the_worse_one_wins() {
         for (number, verdict) in Verdict::ALL.into_iter().enumerate() {
             assert_eq!(verdict as usize, number);
             assert_eq!(verdict.worse(Verdict::Clear), verdict);

@@ -24,7 +24,7 @@ fn changed(datagram: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
 }
 
 #[test]
-fn values_are_these_bytes() {
+fn built_datagrams_match_golden_bytes() {
     let mut built = 0;
     for (name, head, pack) in values::GOLDEN_DATAGRAMS {
         let mut buffer = [0xAA; MTU_SAFE];
@@ -37,7 +37,7 @@ fn values_are_these_bytes() {
 }
 
 #[test]
-fn a_later_hub_appends() {
+fn datagrams_of_a_later_revision_match_golden_bytes() {
     let zones = Head { sequence: 5003, ..values::ZONES_HEAD };
     let datagram = sealed_datagram(zones, &vector("zones")[HEADER_LEN..]);
     let header = changed(&datagram, |bytes| {
@@ -52,7 +52,7 @@ fn a_later_hub_appends() {
 
 /// The MAC is the first 16 bytes of HMAC-SHA256 with the list's key, over the datagram before the MAC with a CRC of 0.
 #[test]
-fn the_mac_stands_behind_the_payload() {
+fn mac_follows_the_payload() {
     const KEY_BYTES: [u8; 16] =
         [0x1F, 0xA1, 0xF0, 0x6A, 0x94, 0xBD, 0x5B, 0x68, 0xBA, 0xC5, 0xCD, 0x71, 0xBC, 0x76, 0x3E, 0x48];
     let plain =
@@ -69,7 +69,7 @@ fn the_mac_stands_behind_the_payload() {
 
 /// A single part is not a valid payload. The crate `clients/network` tests that the parts together are one.
 #[test]
-fn parts_of_a_scan_are_these_bytes() {
+fn scan_parts_match_golden_bytes() {
     let scan = vector("scan");
     let whole = Datagram::read(&scan).unwrap();
     let parts: Vec<&[u8]> = whole.payload.chunks(MIN_MTU - HEADER_LEN).collect();
@@ -81,7 +81,7 @@ fn parts_of_a_scan_are_these_bytes() {
 }
 
 #[test]
-fn refusals_are_these_bytes() {
+fn invalid_datagrams_match_golden_bytes() {
     let zones = vector("zones");
     let numbered = |head: Head| sealed_datagram(head, &zones[HEADER_LEN..]);
     let expected = [
@@ -114,7 +114,7 @@ fn refusals_are_these_bytes() {
 
 /// `clients/network/tests/golden.rs` tests which valid datagrams a receiver refuses.
 #[test]
-fn these_bytes_are_values_or_refused() {
+fn golden_datagrams_are_decoded_or_refused_as_listed() {
     for Vector { name, bytes, description } in vectors() {
         let checked = Datagram::read(&bytes).and_then(|datagram| {
             datagram.check_payload()?;
@@ -137,7 +137,7 @@ fn these_bytes_are_values_or_refused() {
 }
 
 #[test]
-fn every_reason_has_its_datagram() {
+fn every_refusal_reason_has_a_golden_datagram() {
     let vectors = vectors();
     // The bytes of a datagram do not show that it was sent again.
     for reason in DatagramError::ALL.into_iter().filter(|reason| *reason != DatagramError::Untimely) {
@@ -151,7 +151,7 @@ fn every_reason_has_its_datagram() {
 
 /// Checks the facts on the page: header fields without gaps, sizes, an example, and the reasons in their order.
 #[test]
-fn the_page_shows_these_bytes() {
+fn page_matches_golden_datagrams() {
     let top = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let page = std::fs::read_to_string(top.join("docs/datagram.md")).unwrap();
     let section = |name: &str| {

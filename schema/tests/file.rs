@@ -41,7 +41,7 @@ fn recording() -> Vec<u8> {
 }
 
 #[test]
-fn values_are_these_bytes() {
+fn recording_matches_the_golden_file() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/vectors/recording/v2.mcap");
     if std::env::var_os("SCANHUB_WRITE").is_some() {
         std::fs::write(path, recording()).unwrap();
@@ -51,7 +51,7 @@ fn values_are_these_bytes() {
 }
 
 #[test]
-fn others_read_it() {
+fn recording_is_readable_by_other_mcap_readers() {
     let recording = recording();
     let messages: Vec<_> = mcap::MessageStream::new(&recording).unwrap().map(Result::unwrap).collect();
     let messages_read: Vec<_> = messages.iter().map(|m| (m.channel.topic.as_str(), m.sequence)).collect();
@@ -66,7 +66,7 @@ fn others_read_it() {
 
 /// A closed chunk can be read even if nothing follows it, for example because the process was killed.
 #[test]
-fn a_closed_chunk_outlives_its_writer() {
+fn closed_chunk_outlives_its_writer() {
     struct FullDisk<'a>(&'a mut Vec<u8>);
     impl std::io::Write for FullDisk<'_> {
         fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {

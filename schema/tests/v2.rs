@@ -31,7 +31,7 @@ fn read_vector(name: &str) -> Vec<u8> {
 }
 
 #[test]
-fn header_layout() {
+fn header_layout_is_unchanged() {
     assert_eq!((size_of::<Header>(), align_of::<Header>()), (64, 8));
     assert_eq!(offset_of!(Header, seq), 0);
     assert_eq!(offset_of!(Header, topic_seq), 8);
@@ -50,7 +50,7 @@ fn header_layout() {
 }
 
 #[test]
-fn header_bytes() {
+fn header_bytes_match_the_vector() {
     let header = Header {
         seq: 1,
         topic_seq: 2,
@@ -87,7 +87,7 @@ fn header_bytes() {
 }
 
 #[test]
-fn marks_layout() {
+fn marks_layout_is_unchanged() {
     assert_eq!((size_of::<Marks>(), align_of::<Marks>()), (1028, 4));
     assert_eq!((offset_of!(Marks, count), offset_of!(Marks, flags)), (0, 1));
     assert_eq!((offset_of!(Marks, reserved), offset_of!(Marks, mark_array)), (2, 4));
@@ -98,7 +98,7 @@ fn marks_layout() {
 }
 
 #[test]
-fn marks_bytes() {
+fn marks_bytes_match_the_vector() {
     let mut marks = Marks { count: 64, flags: Marks::OVERFLOW | Marks::UNAVAILABLE, ..Marks::default() };
     marks.mark_array[63] = Mark {
         angle_mdeg: -2,
@@ -115,7 +115,7 @@ fn marks_bytes() {
 }
 
 #[test]
-fn zones_layout() {
+fn zones_layout_is_unchanged() {
     assert_eq!((size_of::<Zones>(), align_of::<Zones>()), (76, 4));
     assert_eq!((offset_of!(Zones, verdict), offset_of!(Zones, count)), (0, 1));
     assert_eq!((offset_of!(Zones, nearest_beam), offset_of!(Zones, nearest_mm)), (2, 4));
@@ -127,7 +127,7 @@ fn zones_layout() {
 }
 
 #[test]
-fn zones_bytes() {
+fn zones_bytes_match_the_vector() {
     assert_eq!(bytemuck::bytes_of(&Zones::unknown()), golden(76, &[(0, &[3]), (2, &[0xFF; 6])]));
     let mut zones = Zones {
         verdict: 1,
@@ -146,7 +146,7 @@ fn zones_bytes() {
 }
 
 #[test]
-fn foreground_layout() {
+fn foreground_layout_is_unchanged() {
     assert_eq!((size_of::<ForegroundHead>(), align_of::<ForegroundHead>(), Foreground::HEAD), (24, 8, 24));
     assert_eq!((size_of::<ForegroundWord>(), align_of::<ForegroundWord>()), (8, 8));
     assert_eq!((offset_of!(ForegroundHead, generation), offset_of!(ForegroundHead, unit_um)), (0, 4));
@@ -161,7 +161,7 @@ fn foreground_layout() {
 }
 
 #[test]
-fn foreground_bytes() {
+fn foreground_bytes_match_the_vector() {
     let mut foreground = Foreground::of(401);
     let arrays = foreground.begin(ForegroundHead {
         generation: 0x0001_0203,
@@ -187,7 +187,7 @@ fn foreground_bytes() {
 }
 
 #[test]
-fn background_layout() {
+fn background_layout_is_unchanged() {
     assert_eq!((size_of::<BackgroundHead>(), align_of::<BackgroundHead>(), Background::HEAD), (32, 8, 32));
     assert_eq!((size_of::<BackgroundWord>(), align_of::<BackgroundWord>()), (8, 8));
     assert_eq!((offset_of!(BackgroundHead, first_angle), offset_of!(BackgroundHead, step)), (0, 8));
@@ -198,7 +198,7 @@ fn background_layout() {
 }
 
 #[test]
-fn background_bytes() {
+fn background_bytes_match_the_vector() {
     let head = BackgroundHead {
         first_angle: -0.25,
         step: -1.5,
@@ -226,7 +226,7 @@ fn background_bytes() {
 }
 
 #[test]
-fn status_layout() {
+fn status_layout_is_unchanged() {
     assert_eq!((size_of::<Status>(), align_of::<Status>()), (592, 8));
     assert_eq!((size_of::<Counters>(), MAX_COUNTERS), (224, 28));
     assert_eq!(offset_of!(Status, state), 0);
@@ -249,7 +249,7 @@ fn status_layout() {
 }
 
 #[test]
-fn status_bytes() {
+fn status_bytes_match_the_vector() {
     let mut status = Status {
         state: State::Streaming as u8,
         mode: 1,
@@ -292,7 +292,7 @@ fn status_bytes() {
 }
 
 #[test]
-fn counters_in_order() {
+fn counter_and_state_names_keep_their_order() {
     let names: Vec<_> = Counter::ALL.iter().map(|counter| counter.name()).collect();
     assert_eq!(
         names.join(" "),
@@ -306,7 +306,7 @@ fn counters_in_order() {
 }
 
 #[test]
-fn request_bytes() {
+fn request_bytes_match_the_vector() {
     let verbs: Vec<_> = Verb::all().map(|verb| (verb as u16, verb.name())).collect();
     let flow = [(1, "pause"), (2, "resume"), (3, "resync")];
     let background = [(16, "show"), (17, "reset"), (18, "freeze"), (19, "thaw"), (20, "load")];
@@ -331,7 +331,7 @@ fn request_bytes() {
 }
 
 #[test]
-fn response_bytes() {
+fn response_bytes_are_unchanged() {
     assert_eq!(Response(Ok(None)).encode(), [0, 0, 0, 0]);
     let head = BackgroundHead { step: 0.5, unit_um: 1000, known_beams: 1, ..BackgroundHead::default() };
     let model = Background::of(head, &[0x1234]);
@@ -346,7 +346,7 @@ fn response_bytes() {
 }
 
 #[test]
-fn scan_layout() {
+fn scan_layout_is_unchanged() {
     assert_eq!((size_of::<ScanHead>(), align_of::<ScanHead>(), Scan::HEAD, MAX_BEAMS), (64, 8, 64, 8192));
     assert_eq!((size_of::<ScanWord>(), align_of::<ScanWord>()), (8, 8));
     assert_eq!((offset_of!(ScanHead, first_angle), offset_of!(ScanHead, step)), (0, 8));
@@ -364,7 +364,7 @@ fn scan_layout() {
 }
 
 #[test]
-fn the_bytes_of_a_scan_of_the_lms() {
+fn lms_scan_bytes_match_the_vector() {
     let head = ScanHead { intensity_bits: 3, ..ScanHead::lms(401, -50_000, 250, 10, 13) };
     let mut scan = Scan::of(head, &[0; 401]);
     let arrays = scan.arrays();
@@ -392,7 +392,7 @@ fn the_bytes_of_a_scan_of_the_lms() {
 
 /// A clockwise scan with exact angles, a missing packet, and every kind of value.
 #[test]
-fn the_bytes_of_a_scan_of_a_turn() {
+fn revolution_scan_bytes_match_the_vector() {
     let head = ScanHead {
         first_angle: -0.25,
         step: -1.5,
@@ -436,7 +436,7 @@ fn the_bytes_of_a_scan_of_a_turn() {
 
 /// Meanings of the values above the ranges, for an LMS and for all other families.
 #[test]
-fn codes() {
+fn code_and_family_names_are_unchanged() {
     let word = |code: Option<Code>| code.map(Code::name);
     let lms =
         Scan::of(ScanHead::lms(9, 0, 1000, 10, 13), &[8191, 8190, 8189, 8188, 8187, 8186, 8185, 8184, 8183]);
@@ -458,7 +458,7 @@ fn codes() {
 }
 
 #[test]
-fn early_layout() {
+fn early_layout_is_unchanged() {
     assert_eq!((size_of::<Early>(), align_of::<Early>()), (12, 4));
     assert_eq!((offset_of!(Early, verdict), offset_of!(Early, flags), offset_of!(Early, beam)), (0, 1, 2));
     assert_eq!(
@@ -468,7 +468,7 @@ fn early_layout() {
 }
 
 #[test]
-fn early_bytes() {
+fn early_bytes_match_the_vector() {
     let early = Early {
         verdict: Verdict::Stop as u8,
         flags: Early::WITHDRAWN,
@@ -483,7 +483,7 @@ fn early_bytes() {
 }
 
 #[test]
-fn lines_layout() {
+fn lines_layout_is_unchanged() {
     assert_eq!((size_of::<Lines>(), align_of::<Lines>()), (3340, 4));
     assert_eq!((offset_of!(Lines, count), offset_of!(Lines, corners), offset_of!(Lines, flags)), (0, 1, 2));
     assert_eq!(
@@ -505,7 +505,7 @@ fn lines_layout() {
 }
 
 #[test]
-fn lines_bytes() {
+fn lines_bytes_match_the_vector() {
     let mut lines = Lines {
         count: 64,
         corners: 64,
@@ -542,7 +542,7 @@ fn lines_bytes() {
 }
 
 #[test]
-fn motion_layout() {
+fn motion_layout_is_unchanged() {
     assert_eq!((size_of::<Motion>(), align_of::<Motion>()), (120, 8));
     assert_eq!((offset_of!(Motion, x_m), offset_of!(Motion, y_m), offset_of!(Motion, yaw_rad)), (0, 8, 16));
     assert_eq!(
@@ -560,7 +560,7 @@ fn motion_layout() {
 }
 
 #[test]
-fn motion_bytes() {
+fn motion_bytes_match_the_vector() {
     let motion = Motion {
         x_m: 1.0,
         y_m: -2.0,
@@ -600,13 +600,13 @@ fn motion_bytes() {
 }
 
 #[test]
-fn tilt_layout() {
+fn tilt_layout_is_unchanged() {
     assert_eq!((size_of::<Tilt>(), align_of::<Tilt>()), (16, 8));
     assert_eq!((offset_of!(Tilt, angle_rad), offset_of!(Tilt, rate_rad_s)), (0, 8));
 }
 
 #[test]
-fn tilt_bytes() {
+fn tilt_bytes_match_the_vector() {
     let tilt = Tilt { angle_rad: -0.5, rate_rad_s: 2.0 };
     let expected = golden(16, &[(6, &[0xE0, 0xBF]), (15, &[0x40])]);
     assert_eq!(bytemuck::bytes_of(&tilt), expected);
@@ -614,7 +614,7 @@ fn tilt_bytes() {
 }
 
 #[test]
-fn cloud_layout() {
+fn cloud_layout_is_unchanged() {
     assert_eq!((size_of::<CloudHead>(), align_of::<CloudHead>(), Cloud::HEAD), (16, 4, 16));
     assert_eq!((size_of::<CloudWord>(), align_of::<CloudWord>()), (8, 8));
     assert_eq!((offset_of!(CloudHead, sweep), offset_of!(CloudHead, generation)), (0, 4));
@@ -627,7 +627,7 @@ fn cloud_layout() {
 }
 
 #[test]
-fn cloud_bytes() {
+fn cloud_bytes_match_the_vector() {
     let head = CloudHead {
         sweep: 0x0102_0304,
         generation: 0x0506_0708,
@@ -644,7 +644,7 @@ fn cloud_bytes() {
 }
 
 #[test]
-fn obstacles_layout() {
+fn obstacles_layout_is_unchanged() {
     assert_eq!((size_of::<Obstacles>(), align_of::<Obstacles>(), MAX_OBSTACLES), (3088, 4, 64));
     assert_eq!((offset_of!(Obstacles, sweep), offset_of!(Obstacles, generation)), (0, 4));
     assert_eq!((offset_of!(Obstacles, dropped), offset_of!(Obstacles, count)), (8, 12));
@@ -658,7 +658,7 @@ fn obstacles_layout() {
 }
 
 #[test]
-fn obstacles_bytes() {
+fn obstacles_bytes_match_the_vector() {
     let mut found = Obstacles {
         sweep: 0x0102_0304,
         generation: 0x0506_0708,
@@ -687,7 +687,7 @@ fn obstacles_bytes() {
 }
 
 #[test]
-fn tracks_layout() {
+fn tracks_layout_is_unchanged() {
     assert_eq!((size_of::<Tracks>(), align_of::<Tracks>(), MAX_TRACKS, MAX_TRACK_SENSORS), (7432, 8, 64, 32));
     assert_eq!(
         (offset_of!(Tracks, count), offset_of!(Tracks, sensors), offset_of!(Tracks, reserved)),
@@ -710,7 +710,7 @@ fn tracks_layout() {
 }
 
 #[test]
-fn event_layout() {
+fn event_layout_is_unchanged() {
     assert_eq!((size_of::<Event>(), align_of::<Event>()), (112, 8));
     assert_eq!((offset_of!(Event, id), offset_of!(Event, kind), offset_of!(Event, reserved)), (0, 8, 9));
     assert_eq!((offset_of!(Event, room_text), offset_of!(Event, door_text)), (16, 40));
@@ -718,7 +718,7 @@ fn event_layout() {
 }
 
 #[test]
-fn tracks_bytes() {
+fn tracks_bytes_match_the_vector() {
     let mut tracks = Tracks { count: 64, sensors: 31, ..Tracks::default() };
     let pose = Pose { x_m: 1.0, y_m: -1.0, yaw_rad: 0.5, upside_down: 1, ..Pose::default() };
     tracks.push_sensor(TrackSensor::new("kitchen.rear", &pose));
@@ -752,7 +752,7 @@ fn tracks_bytes() {
 }
 
 #[test]
-fn event_bytes() {
+fn event_bytes_match_the_vector() {
     let event = Event::new(EventKind::Door, 0x0102_0304_0506_0708, Some("kitchen"))
         .with_door("left", "hall", "kitchen");
     let fields = [

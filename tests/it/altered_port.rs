@@ -56,7 +56,7 @@ fn hub_restores_baud_rate_changed_by_another_process() {
 }
 
 #[test]
-fn a_program_that_is_known_to_change_ports_is_named() {
+fn message_names_a_program_that_changes_ports() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=41", "--baud=500000"]);
     let other = OtherProcess::open(&env.path("front"));
@@ -77,7 +77,7 @@ fn a_program_that_is_known_to_change_ports_is_named() {
 }
 
 #[test]
-fn other_settings_are_made_again_too() {
+fn hub_restores_port_settings_changed_by_others() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=42", "--baud=500000"]);
     let other = OtherProcess::open(&env.path("front"));

@@ -26,7 +26,7 @@ fn saved_scanner(env: &TestEnv) -> String {
 }
 
 #[test]
-fn scanners_of_every_family_are_found_and_remembered() {
+fn scanners_of_every_family_are_found_and_saved() {
     for (simulated, family, model, beams, rate) in [
         (LMS_FLAGS, "lms", "lms200", 361, "500000"),
         (LD19_FLAGS, "ld", "ld19", 450, "230400"),
@@ -144,7 +144,7 @@ fn unrecognized_bytes_are_reported_with_probe_command() {
 }
 
 #[test]
-fn a_recording_has_the_family_of_its_scanner() {
+fn recording_has_the_family_of_its_scanner() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], LD19_FLAGS);
     let live = hub(&env);
@@ -168,7 +168,7 @@ fn a_recording_has_the_family_of_its_scanner() {
 }
 
 #[test]
-fn a_number_of_beams_outlives_a_restart_of_the_hub() {
+fn number_of_beams_survives_a_hub_restart() {
     let env = TestEnv::new();
     let ld14p = env.simulator(&["front"], &["--family=ld", "--model=ld14p", "--world=room", "--seed=17"]);
     let counts = |outcome: &crate::testkit::Outcome| -> Vec<Value> {
@@ -209,7 +209,7 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
 /// A recording that starts during a stream contains no reply with the scanner's type. It contains a status with the
 /// type.
 #[test]
-fn a_recording_has_the_model_of_its_scanner() {
+fn recording_has_the_model_of_its_scanner() {
     for (simulated, model) in [(LMS_FLAGS, "lms200"), (LD19_FLAGS, "ld19"), (A1_FLAGS, "a1")] {
         let env = TestEnv::new();
         let simulator = env.simulator(&["front"], simulated);

@@ -143,7 +143,7 @@ fn hub_rejects_background_of_another_sensor() {
 }
 
 #[test]
-fn where_no_background_is_kept_the_key_is_named() {
+fn request_without_background_names_the_key() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front").as_str(), "--set=background.method=off"]);
     let outcome = run_background(&env, &["show"]);
@@ -153,7 +153,7 @@ fn where_no_background_is_kept_the_key_is_named() {
 }
 
 #[test]
-fn before_the_first_scan_there_is_nothing_to_save() {
+fn save_before_the_first_scan_is_an_error() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front")]);
     assert_eq!(background_line(&env, &["show"])["count"], 0);

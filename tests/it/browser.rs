@@ -175,7 +175,7 @@ impl Browser {
                 // The process of the test was stopped and continued, for example because its virtual machine was
                 // suspended.
                 Err(tungstenite::Error::Io(error)) if error.kind() == ErrorKind::Interrupted => continue,
-                told => told.unwrap_or_else(|error| panic!("{method}: {error}")),
+                result => result.unwrap_or_else(|error| panic!("{method}: {error}")),
             };
             let Message::Text(text) = response else { continue };
             let response: Value = serde_json::from_str(&text).expect("JSON");

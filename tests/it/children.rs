@@ -68,7 +68,7 @@ fn dropping_a_program_ends_its_daemons() {
 }
 
 #[test]
-fn outcome_names_leftover_processes() {
+fn outcome_lists_leftover_processes() {
     let mut script = Command::new("sh");
     script.args(["-c", "sleep 1000 > /dev/null 2>&1 & exit 0"]);
     let outcome = Program::start(script).wait();
@@ -137,7 +137,7 @@ fn first_child_ends_interrupted_runs() {
 }
 
 #[test]
-fn written_programs_start_at_once() {
+fn written_program_can_be_started_at_once() {
     let env = TestEnv::new();
     let is_over = AtomicBool::new(false);
     thread::scope(|scope| {

@@ -39,7 +39,7 @@ fn data(line: &Value) -> Vec<u8> {
 
 /// Compiles the header with every language standard that users have.
 #[test]
-fn the_header_has_the_layout_of_schema() {
+fn header_has_the_layout_of_schema() {
     if !is_installed("cc") {
         return;
     }
@@ -65,7 +65,7 @@ fn the_header_has_the_layout_of_schema() {
 
 /// A program may use the headers for datagrams and for topics together.
 #[test]
-fn both_headers_go_into_one_program() {
+fn program_can_include_both_c_headers() {
     if !is_installed("cc") {
         return;
     }
@@ -119,7 +119,7 @@ fn c_header_computes_the_same_values_as_schema() {
 /// Programs receive the same samples whether they wait by `doorbell`, `poll` or `event` or spin. The samples lie in the
 /// memory to which the hub wrote them.
 #[test]
-fn a_program_in_c_has_every_sample_in_shared_memory() {
+fn c_program_receives_every_sample_in_shared_memory() {
     let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let follow = installed.compile(&env, &source("follow.c"), &[]);
@@ -154,7 +154,7 @@ fn a_program_in_c_has_every_sample_in_shared_memory() {
 }
 
 #[test]
-fn a_program_in_c_outlives_its_hub() {
+fn c_program_continues_after_a_hub_restart() {
     let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let follow = installed.compile(&env, &source("follow.c"), &[]);
@@ -198,7 +198,7 @@ fn has_reason(reason: u64, text: &str) -> impl Fn(&Value) -> bool {
 }
 
 #[test]
-fn a_program_in_c_names_the_user_of_a_domain() {
+fn c_program_reports_a_domain_of_another_user() {
     if !rustix::process::getuid().is_root() {
         eprintln!("skipped: only root can create a directory of another user");
         return;
@@ -218,7 +218,7 @@ fn a_program_in_c_names_the_user_of_a_domain() {
 }
 
 #[test]
-fn a_program_in_c_learns_why_no_sample_arrives() {
+fn c_program_receives_the_reason_for_a_silence() {
     let [waiting, no_hub, unknown_sensor, paused] = [0, 1, 3, 6];
     let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
@@ -262,7 +262,7 @@ fn a_program_in_c_learns_why_no_sample_arrives() {
 
 /// A program that acts on zones does not need its own timeout: the library reports `unknown` when the hub is killed.
 #[test]
-fn zones_get_unknown_when_the_hub_is_killed() {
+fn c_zones_are_unknown_after_the_hub_is_killed() {
     let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let follow = installed.compile(&env, &source("follow.c"), &[]);
@@ -285,7 +285,7 @@ fn zones_get_unknown_when_the_hub_is_killed() {
 /// The combined verdict is the verdict of the worst sensor. The test first switches off one sensor and then kills the
 /// hub.
 #[test]
-fn a_robot_is_as_unknown_as_its_worst_sensor() {
+fn c_robot_has_the_verdict_of_its_worst_sensor() {
     let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let robot = installed.compile(&env, &source("robot.c"), &[]);
@@ -370,7 +370,7 @@ fn c_library_rejects_misuse() {
 
 /// Builds the examples in the ways that their page describes. Also builds a program that links the library statically.
 #[test]
-fn the_examples_build_and_run() {
+fn examples_build_and_run() {
     let Some(installed) = InstalledLibrary::installed() else { return };
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=35"]);
@@ -440,7 +440,7 @@ fn cpp_20_has_optional_samples_and_spans() {
 }
 
 #[test]
-fn install_script_says_how_programs_find_the_library() {
+fn install_script_prints_the_linker_flag() {
     let Some(installed) = InstalledLibrary::installed() else { return };
     let flag = format!("link programs with -Wl,-rpath,{}", installed.prefix.join("lib").display());
     assert!(installed.messages.trim_end().ends_with(&flag), "{}", installed.messages);

@@ -78,7 +78,7 @@ fn config_check_rejects_bad_configurations() {
 }
 
 #[test]
-fn values_stand_below_each_other_with_their_places() {
+fn config_show_aligns_values_and_sources() {
     let env = TestEnv::new();
     let file =
         env.file("scanhub.toml", "[[link]]\nname = \"a\"\nport = \"/dev/x\"\n[zones]\nradii = [2.0, 1.0]\n");
@@ -100,7 +100,7 @@ fn values_stand_below_each_other_with_their_places() {
 }
 
 #[test]
-fn typo_gets_a_tip_with_the_nearest_name() {
+fn mistyped_key_error_suggests_the_nearest_name() {
     let env = TestEnv::new();
     for (arguments, nearest) in [
         (&["ehco"][..], "'echo'"),

@@ -79,7 +79,7 @@ fn probe(env: &TestEnv, port: &str) -> Value {
 }
 
 #[test]
-fn a_person_says_yes_and_it_is_written_once() {
+fn confirmed_configuration_is_written_once() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=38400"]);
     let port = env.path_argument("front");
@@ -184,7 +184,7 @@ fn reports_command_that_restores_previous_settings() {
 }
 
 #[test]
-fn everything_else_than_yes_writes_nothing() {
+fn any_answer_but_yes_writes_nothing() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=500000"]);
     let port = env.path_argument("front");

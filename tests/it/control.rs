@@ -74,7 +74,7 @@ fn paused_sensor_stops_and_resumes_without_a_gap() {
 }
 
 #[test]
-fn a_resync_is_counted_and_ends_a_pause() {
+fn resync_is_counted_and_ends_a_pause() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=32", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
@@ -137,7 +137,7 @@ fn rejects_requests_to_missing_hub_sensor_or_session() {
 }
 
 #[test]
-fn many_ask_at_once_and_some_are_killed_while_they_do() {
+fn concurrent_and_killed_control_clients_are_handled() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=34", "--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);

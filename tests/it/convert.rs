@@ -7,7 +7,7 @@ use crate::testkit::{Child, TestEnv, spawn};
 use serde_json::json;
 
 #[test]
-fn a_stream_becomes_a_recording_that_plays() {
+fn stream_converts_to_a_playable_recording() {
     let env = TestEnv::new();
     let bytes = (0..20).flat_map(testkit::scan).collect::<Vec<u8>>();
     let stream = env.file("a.bin", &bytes);
@@ -94,7 +94,7 @@ fn reports_lines_dropped_from_a_log() {
 }
 
 #[test]
-fn rows_of_a_hub_have_meters_intensities_and_marks() {
+fn csv_of_a_recording_has_meters_and_marks() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--world=room", "--mode=0x01"]);
     let _hub = env.hub(&[env.link("front")]);

@@ -81,7 +81,7 @@ fn check_exit_code(outcome: &Outcome, lost: u64) {
 }
 
 #[test]
-fn of_another_family_or_of_all() {
+fn demo_runs_with_each_family() {
     for (family, names) in [
         ("ld", &["front", "rear"][..]),
         ("rplidar", &["front", "rear"]),
@@ -99,7 +99,7 @@ fn of_another_family_or_of_all() {
 }
 
 #[test]
-fn a_sensor_on_a_mount_sees_in_three_dimensions() {
+fn demo_with_a_mount_publishes_clouds() {
     let outcome = demo(&["--world", "tilt", "--headless", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
@@ -122,7 +122,7 @@ fn a_sensor_on_a_mount_sees_in_three_dimensions() {
 }
 
 #[test]
-fn headless_in_an_empty_environment() {
+fn headless_demo_runs_in_an_empty_environment() {
     let outcome = demo(&["--headless", "--for", "2s", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let (domain, root) =
@@ -146,7 +146,7 @@ fn headless_in_an_empty_environment() {
 }
 
 #[test]
-fn where_the_users_own_place_is_too_long_for_a_domain() {
+fn demo_runs_if_the_runtime_path_is_too_long() {
     let directory = tempfile::tempdir().expect("a directory");
     let place = directory.path().join("long".repeat(20));
     fs::create_dir(&place).expect("a directory");
@@ -193,7 +193,7 @@ fn run_in_demo(domain: &str, arguments: &[&str]) -> Program {
 }
 
 #[test]
-fn people_are_followed_from_room_to_room_in_the_house() {
+fn house_demo_tracks_people_between_rooms() {
     let outcome = demo(&["--world", "house", "--headless", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
@@ -226,7 +226,7 @@ fn people_are_followed_from_room_to_room_in_the_house() {
 }
 
 #[test]
-fn interrupted() {
+fn interrupted_demo_ends_all_its_processes() {
     // All processes of the demo end, too. SIGHUP is sent when a terminal is closed.
     for signal in [INT, HUP] {
         let outcome = demo(&["--headless", "--json"], |program| {
@@ -241,7 +241,7 @@ fn interrupted() {
 }
 
 #[test]
-fn second_interrupt_ends_at_once() {
+fn second_interrupt_ends_the_demo_at_once() {
     let outcome = demo(&["--headless", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
@@ -276,7 +276,7 @@ fn process_of(domain: &str, verb: &str) -> rustix::process::Pid {
 }
 
 #[test]
-fn the_page_outlives_its_viewers() {
+fn demo_page_keeps_running_without_viewers() {
     let outcome = demo(&[], |mut program| {
         let url = loop {
             if let Some(url) = program.next_text().strip_prefix("browser: http://") {
@@ -304,7 +304,7 @@ fn the_page_outlives_its_viewers() {
 }
 
 #[test]
-fn the_picture_into_a_pipe() {
+fn demo_output_to_a_pipe_has_no_control_sequences() {
     let outcome = demo(&["--for", "2s"], Program::wait);
     assert!([Some(0), Some(5)].contains(&outcome.exit_code), "{outcome}");
     let text = String::from_utf8_lossy(&outcome.stdout);

@@ -96,7 +96,7 @@ fn units_share_one_private_state_directory() {
 }
 
 #[test]
-fn units_leave_little_open() {
+fn systemd_units_have_low_exposure() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {
         let path = dist().join(unit);
         let analyze = |words: &[&str]| output(Command::new("systemd-analyze").args(words).arg(&path));

@@ -55,14 +55,14 @@ fn checks(outcome: Outcome, code: i32) -> (Vec<Value>, Outcome) {
 }
 
 #[test]
-fn the_page_has_a_line_for_each_check() {
+fn page_has_a_line_for_each_check() {
     let page = include_str!("../../docs/doctor.md");
     let lines = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
     assert_eq!(lines.collect::<Vec<_>>(), scanhub_tools::doctor::CHECKS);
 }
 
 #[test]
-fn a_set_up_that_works() {
+fn doctor_accepts_a_working_setup() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=38400", REAL_REPLY_TIME]);
     let port = env.path_argument("front");
@@ -117,7 +117,7 @@ fn reports_bad_settings_and_ports() {
 
 /// A port can have several names, and the hub may have been started in another directory.
 #[test]
-fn a_port_of_the_hub_is_found_by_any_of_its_names() {
+fn port_of_the_hub_is_found_by_any_of_its_names() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &[] as &[&str]);
     let (front, again, directory) = (env.path_argument("front"), env.path_argument("again"), env.path(""));
@@ -164,7 +164,7 @@ fn a_port_of_the_hub_is_found_by_any_of_its_names() {
 }
 
 #[test]
-fn a_sensor_that_is_not_well_is_no_good_set_up() {
+fn doctor_warns_of_an_unhealthy_scanner() {
     let env = TestEnv::new();
     let dirty = env.simulator(&["dirty"], &["--type=lms291", "--pollution=20"]);
     let port = env.path_argument("dirty");
@@ -224,7 +224,7 @@ fn queries_a_running_hub_and_reports_a_killed_one() {
 }
 
 #[test]
-fn a_hub_that_is_stopped_is_no_good_set_up() {
+fn doctor_fails_for_a_stopped_hub() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);

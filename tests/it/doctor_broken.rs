@@ -57,7 +57,7 @@ const BROKEN_SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
 ];
 
 #[test]
-fn finds_sensor_faults() {
+fn doctor_finds_sensor_faults() {
     run_concurrently(
         BROKEN_SENSORS.into_iter().enumerate(),
         |(number, (set_up, flags, name, state, remedy))| {
@@ -82,7 +82,7 @@ fn finds_sensor_faults() {
 }
 
 #[test]
-fn finds_port_faults() {
+fn doctor_finds_port_faults() {
     let env = TestEnv::new();
     let port = |name: &str| Findings::of(&env, &[&env.path_argument(name)]);
     // The ports in the remedy depend on this machine.

@@ -29,7 +29,7 @@ fn command_under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
 }
 
 #[test]
-fn a_set_up_that_is_well() {
+fn doctor_has_no_findings_on_a_healthy_machine() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &[] as &[&str]);
     let flags = [env.link("front"), "--set=gateway.interface=lo".to_owned()];
@@ -299,7 +299,7 @@ fn clean_keeps_the_domain_of_a_waiting_subscriber() {
 }
 
 #[test]
-fn files_without_a_domain_are_taken_away() {
+fn clean_removes_files_of_a_deleted_domain() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("absent")]);
     hub.end(KILL);
@@ -318,7 +318,7 @@ fn files_without_a_domain_are_taken_away() {
 }
 
 #[test]
-fn two_hubs_and_one_that_was_replaced() {
+fn finds_two_hubs_and_a_replaced_program() {
     let env = TestEnv::new();
     let link = env.link("absent");
     let program = env.path("scanhub");
@@ -352,8 +352,8 @@ fn two_hubs_and_one_that_was_replaced() {
 }
 
 #[test]
-fn no_way_to_the_network() {
-    in_a_network("doctor_machine::no_way_to_the_network", || {
+fn finds_missing_gateway_interface() {
+    in_a_network("doctor_machine::finds_missing_gateway_interface", || {
         let env = TestEnv::new();
         // No interface is configured, so nothing is sent to a network.
         assert_eq!(Findings::of(&env, &[]).state_and_text("multicast").0, "skipped");

@@ -13,7 +13,7 @@ use scanhub_schema::{Early, Header, Topic, Verdict, WakeEvent, Zones};
 use serde_json::Value;
 
 #[test]
-fn python_robot_subscribes_to_warnings_until_it_ends() {
+fn python_robot_subscribes_to_warnings_until_exit() {
     let env = TestEnv::new();
     let Some(mut command) = check_on(&env, "robot") else { return };
     command.args(["--early", "front"]);

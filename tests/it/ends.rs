@@ -19,7 +19,7 @@ fn hub(env: &TestEnv) -> Program {
 }
 
 #[test]
-fn a_hub_ends_by_both_signals_and_leaves_nothing() {
+fn hub_exits_on_sigint_and_sigterm_without_leftovers() {
     for signal in [INT, TERM] {
         let env = TestEnv::new();
         let simulator = env.simulator(&["front"], &["--baud=500000"]);
@@ -59,7 +59,7 @@ fn interrupted_echo_reports_its_sample_count() {
 }
 
 #[test]
-fn a_reader_that_has_enough_is_no_failure() {
+fn closed_output_pipe_is_no_failure() {
     let env = TestEnv::new();
     let _hub = hub(&env);
     for format in ["--json", "--csv"] {
@@ -97,7 +97,7 @@ fn every_line_is_one_write() {
 }
 
 #[test]
-fn a_killed_echo_leaves_whole_lines() {
+fn killed_echo_leaves_complete_lines() {
     let env = TestEnv::new();
     let _hub = hub(&env);
     for number in 0..5 {
@@ -119,7 +119,7 @@ fn a_killed_echo_leaves_whole_lines() {
 }
 
 #[test]
-fn a_simulator_takes_and_leaves_only_its_own_place() {
+fn simulator_replaces_only_its_own_symlinks() {
     let env = TestEnv::new();
     let (port, mine) = (env.path("front"), env.file("mine", "mine"));
     // A new simulator replaces the symlink that a killed one left.

@@ -63,7 +63,7 @@ fn run(env: &TestEnv, line: &str, file: &str) -> Outcome {
 }
 
 #[test]
-fn an_input_that_cannot_be_read_is_66() {
+fn unreadable_input_file_exits_with_66() {
     let env = TestEnv::new();
     let long = env.file("long", "# long\n".repeat(100_000));
     // A file with a key must not be readable by other users.
@@ -101,8 +101,8 @@ fn an_input_that_cannot_be_read_is_66() {
 }
 
 #[test]
-fn an_input_that_this_user_may_not_read_is_66() {
-    with_another_user("exit_codes::an_input_that_this_user_may_not_read_is_66", || {
+fn input_without_permission_exits_with_66() {
+    with_another_user("exit_codes::input_without_permission_exits_with_66", || {
         fs::write("/tmp/secret", "text").expect("a file");
         fs::set_permissions("/tmp/secret", Permissions::from_mode(0o600))
             .expect("the file belongs to this user");
@@ -117,7 +117,7 @@ fn an_input_that_this_user_may_not_read_is_66() {
 }
 
 #[test]
-fn a_wrong_value_in_a_file_that_could_be_read_is_78() {
+fn invalid_value_in_a_readable_file_exits_with_78() {
     let env = TestEnv::new();
     let file = env.file("wrong.toml", "[[link]]\nname = 7\n");
     for line in [
@@ -140,7 +140,7 @@ fn a_wrong_value_in_a_file_that_could_be_read_is_78() {
 }
 
 #[test]
-fn an_output_that_cannot_be_created_is_73() {
+fn output_that_cannot_be_created_exits_with_73() {
     let env = TestEnv::new();
     let scan = format!("FLASER 181{} 0 0 0 0 0 0 1.5 host 1.5\n", " 1.5".repeat(181));
     env.file("walk.log", scan);
@@ -181,7 +181,7 @@ fn an_output_that_cannot_be_created_is_73() {
 }
 
 #[test]
-fn an_existing_output_is_replaced_by_force() {
+fn force_replaces_existing_output() {
     let env = TestEnv::new();
     env.file("site.toml", SITE_FILE);
     let file = env.file("old.svg", "old");

@@ -52,7 +52,7 @@ fn receive(subscriber: &mut Program, sent: &[Vec<u8>]) -> u64 {
 }
 
 #[test]
-fn telegrams_in_a_flood_of_garbage() {
+fn hub_finds_telegrams_in_a_flood_of_garbage() {
     let env = TestEnv::new();
     let line = TestLine::create(&env.path("front"));
     let hub = env.hub(&[env.lms_link("front")]);
@@ -99,7 +99,7 @@ fn cpu_time(pid: u32) -> Duration {
 }
 
 #[test]
-fn a_serial_server_that_sends_garbage_at_full_speed() {
+fn garbage_from_a_serial_server_is_throttled() {
     let env = TestEnv::new();
     let listener = TcpListener::bind("127.0.0.1:0").expect("a TCP port is free");
     let link = format!(

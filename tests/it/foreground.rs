@@ -23,7 +23,7 @@ fn scores(frames: &[LabeledScan]) -> (Score, Score) {
 }
 
 #[test]
-fn multi_separates_people_from_rooms() {
+fn multi_method_separates_people_from_rooms() {
     // The limits are slightly below the average of ten runs, because a single run varies.
     for (name, world, unit, recall, precision, wrong_per_scan) in [
         ("the room of Fig. 8", "fig8", Unit::Mm, 0.98, 0.95, 0.1),
@@ -42,7 +42,7 @@ fn multi_separates_people_from_rooms() {
 }
 
 #[test]
-fn boxes_are_learned_and_forgotten() {
+fn placed_and_removed_boxes_become_background() {
     let scene = Scene { name: "the room of Fig. 8", world: "fig8", unit: Unit::Mm, mixed: true };
     let mut boxes = Boxes::default();
     boxes.add(|| hub_detector(Kind::Multi), &play(&scene, SCENE_SEED));
@@ -56,7 +56,7 @@ fn boxes_are_learned_and_forgotten() {
 /// A saved background has one range per beam. A model that starts with it reports no more wrong beams than a model that
 /// was not interrupted.
 #[test]
-fn a_model_taken_back_is_right_at_once() {
+fn reloaded_background_is_right_at_once() {
     for world in ["fig8", "faint"] {
         let frames = play(&Scene { name: world, world, unit: Unit::Mm, mixed: true }, SCENE_SEED);
         // Switch before a person enters, and while a person is present.

@@ -108,8 +108,8 @@ fn check_all_refuse(target: &Path, base: &[&str], words: &[&str]) {
 }
 
 #[test]
-fn the_fallback_directory_that_a_stranger_made() {
-    with_another_user("foreign_user::the_fallback_directory_that_a_stranger_made", || {
+fn fallback_directory_of_another_user_is_refused() {
+    with_another_user("foreign_user::fallback_directory_of_another_user_is_refused", || {
         let prey = create_victim_directory();
         run_as_other_user("mkdir /tmp/scanhub-0 && ln -s /tmp/prey /tmp/scanhub-0/scanhub");
         check_all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
@@ -123,8 +123,8 @@ fn the_fallback_directory_that_a_stranger_made() {
 }
 
 #[test]
-fn links_in_a_domain_and_on_the_way_to_it() {
-    with_another_user("foreign_user::links_in_a_domain_and_on_the_way_to_it", || {
+fn links_in_a_domain_and_its_parents_are_refused() {
+    with_another_user("foreign_user::links_in_a_domain_and_its_parents_are_refused", || {
         let prey = create_victim_directory();
         let base = Path::new("/tmp/base");
         fs::DirBuilder::new().mode(0o700).create(base).expect("the directory can be created");
@@ -177,8 +177,8 @@ fn allowed_attacks(path: &Path) -> Vec<String> {
 }
 
 #[test]
-fn shared_memory_of_strangers() {
-    with_another_user("foreign_user::shared_memory_of_strangers", || {
+fn foreign_shared_memory_does_not_disturb_the_hub() {
+    with_another_user("foreign_user::foreign_shared_memory_does_not_disturb_the_hub", || {
         // A domain without a random prefix would use this name.
         run_as_other_user("touch /dev/shm/sh_scanhub_front.bell");
         let env = TestEnv::new();

@@ -72,42 +72,42 @@ fn run(name: &str) {
 }
 
 #[test]
-fn framer() {
+fn fuzzing_framer_finds_no_failure() {
     run("framer");
 }
 
 #[test]
-fn replies() {
+fn fuzzing_replies_finds_no_failure() {
     run("replies");
 }
 
 #[test]
-fn session() {
+fn fuzzing_session_finds_no_failure() {
     run("session");
 }
 
 #[test]
-fn configuration() {
+fn fuzzing_configuration_finds_no_failure() {
     run("configuration");
 }
 
 #[test]
-fn processors() {
+fn fuzzing_processors_finds_no_failure() {
     run("processors");
 }
 
 #[test]
-fn surroundings() {
+fn fuzzing_surroundings_finds_no_failure() {
     run("surroundings");
 }
 
 #[test]
-fn lan() {
+fn fuzzing_lan_finds_no_failure() {
     run("lan");
 }
 
 #[test]
-fn recording() {
+fn fuzzing_recording_finds_no_failure() {
     run("recording");
 }
 

@@ -70,8 +70,8 @@ fn is_in_row(bytes: &[u8], sensor: u8, topic: u8) -> bool {
 }
 
 #[test]
-fn two_sensors_go_out_whole() {
-    in_a_network("gateway::two_sensors_go_out_whole", || {
+fn gateway_sends_all_samples_of_two_sensors() {
+    in_a_network("gateway::gateway_sends_all_samples_of_two_sensors", || {
         let env = TestEnv::new();
         let receiver = Receiver::new(LOOPBACK);
         let _simulator = env.simulator(&["front", "rear"], &STREAM_FLAGS);
@@ -162,8 +162,8 @@ fn is_unknown(datagram: &Datagram<'_>) -> bool {
 }
 
 #[test]
-fn bare_telegrams_are_those_of_the_line() {
-    in_a_network("gateway::bare_telegrams_are_those_of_the_line", || {
+fn bare_telegrams_equal_the_bytes_of_the_line() {
+    in_a_network("gateway::bare_telegrams_equal_the_bytes_of_the_line", || {
         let env = TestEnv::new();
         let (usual, front, rear) =
             (Receiver::new(LOOPBACK), Receiver::at(LOOPBACK, 22_201), Receiver::at(LOOPBACK, 22_202));
@@ -221,8 +221,8 @@ fn copies_are_equal_despite_an_unreachable_host() {
 }
 
 #[test]
-fn copies_go_over_ipv6_too() {
-    in_a_network("gateway::copies_go_over_ipv6_too", || {
+fn gateway_sends_copies_over_ipv6() {
+    in_a_network("gateway::gateway_sends_copies_over_ipv6", || {
         let Ok(copies) = UdpSocket::bind("[::1]:30000") else {
             skip("ipv6", "this network has no IPv6");
             return;
@@ -247,8 +247,8 @@ fn copies_go_over_ipv6_too() {
 }
 
 #[test]
-fn hubs_and_gateways_are_replaced() {
-    in_a_network("gateway::hubs_and_gateways_are_replaced", || {
+fn replaced_hub_and_gateway_change_boot_and_epoch() {
+    in_a_network("gateway::replaced_hub_and_gateway_change_boot_and_epoch", || {
         let env = TestEnv::new();
         let receiver = Receiver::new(LOOPBACK);
         let mut first = env.gateway(&["--interface=lo"]);
@@ -363,8 +363,8 @@ fn samples_sent_in_parts_are_reassembled() {
 }
 
 #[test]
-fn without_an_interface_nothing_goes_to_groups() {
-    in_a_network("gateway::without_an_interface_nothing_goes_to_groups", || {
+fn gateway_without_interface_sends_no_multicast() {
+    in_a_network("gateway::gateway_without_interface_sends_no_multicast", || {
         let env = TestEnv::new();
         let groups = Receiver::new(LOOPBACK);
         let _simulator = env.simulator(&["front"], &STREAM_FLAGS);

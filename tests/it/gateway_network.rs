@@ -75,8 +75,8 @@ fn check_gap_free(received: &[Vec<u8>], outcome: &Outcome) {
 }
 
 #[test]
-fn a_link_that_goes_and_comes() {
-    in_a_network("gateway_network::a_link_that_goes_and_comes", || {
+fn gateway_survives_link_down_and_up() {
+    in_a_network("gateway_network::gateway_survives_link_down_and_up", || {
         let env = TestEnv::new();
         create_interface();
         let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
@@ -143,8 +143,8 @@ fn datagrams_dropped_by_a_full_queue_are_counted() {
 }
 
 #[test]
-fn a_reader_that_does_not_read_delays_nothing() {
-    in_a_network("gateway_network::a_reader_that_does_not_read_delays_nothing", || {
+fn unread_output_does_not_delay_the_gateway() {
+    in_a_network("gateway_network::unread_output_does_not_delay_the_gateway", || {
         let env = TestEnv::new();
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
         let _simulator = env.simulator(&["front"], &STREAM_FLAGS);

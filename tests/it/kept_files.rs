@@ -55,7 +55,7 @@ fn search(env: &TestEnv, line: &TestLine, link: String) -> Outcome {
 }
 
 #[test]
-fn where_nothing_can_be_kept_the_hub_streams() {
+fn hub_streams_without_a_writable_state_directory() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=4"]);
     let mut command = env.command(&["run", "--json", &env.link("front")]);

@@ -100,7 +100,7 @@ fn listener_with_key_accepts_only_its_gateway() {
 }
 
 #[test]
-fn a_key_file_that_others_can_use_is_refused() {
+fn key_file_that_others_can_use_is_refused() {
     let env = TestEnv::new();
     let made = env.run(&["key", "new", &env.path_argument("key")]);
     assert!(made.exit_code == Some(0) && String::from_utf8_lossy(&made.stdout).contains(": key "), "{made}");

@@ -27,7 +27,7 @@ fn count(line: &Value, span: &str) -> u64 {
 }
 
 #[test]
-fn ages_of_a_stream_are_split_and_judged() {
+fn splits_ages_of_a_stream_and_checks_the_limit() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=71", "--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);

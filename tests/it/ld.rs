@@ -46,7 +46,7 @@ fn check_scan(scan: &Value, beams: usize) {
 }
 
 #[test]
-fn a_scanner_that_turns_is_published_like_any_other() {
+fn rotating_scanner_is_published_with_all_topics() {
     let env = TestEnv::new();
     let hub = hub(&env, &["model=ld19"]);
     let mut scans = env.echo(&["front/scan"]);
@@ -91,7 +91,7 @@ fn a_scanner_that_turns_is_published_like_any_other() {
 }
 
 #[test]
-fn a_model_is_found_out() {
+fn model_of_an_ld19_is_detected() {
     let env = TestEnv::new();
     let _simulator = ld19(&env);
     let _hub = hub(&env, &[]);
@@ -101,7 +101,7 @@ fn a_model_is_found_out() {
 }
 
 #[test]
-fn beams_are_as_many_as_are_asked_for() {
+fn configured_number_of_beams_is_published() {
     let env = TestEnv::new();
     let _simulator = ld19(&env);
     let _hub = hub(&env, &["model=ld19", "beams=300"]);
@@ -112,7 +112,7 @@ fn beams_are_as_many_as_are_asked_for() {
 }
 
 #[test]
-fn a_scanner_that_goes_and_comes_back() {
+fn reconnects_to_a_returning_ld19() {
     let env = TestEnv::new();
     let simulator = ld19(&env);
     let hub = hub(&env, &["model=ld19"]);
@@ -134,7 +134,7 @@ fn a_scanner_that_goes_and_comes_back() {
 }
 
 #[test]
-fn marks_need_a_level() {
+fn ld_marks_need_a_configured_level() {
     let env = TestEnv::new();
     let _simulator = ld19(&env);
     let without = hub(&env, &["model=ld19"]);

@@ -154,7 +154,7 @@ fn unusable_or_unwanted_background_is_not_loaded() {
 }
 
 #[test]
-fn where_nothing_is_kept_nothing_is_written() {
+fn background_is_not_saved_unless_configured() {
     let env = TestEnv::new();
     let simulator = simulator(&env, ROOM_WORLD);
     let is_known = || testkit::wait_until("the room is learned", || known_beams(&env) > 350);

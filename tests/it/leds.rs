@@ -188,7 +188,7 @@ fn reports_unplugged_led_and_drives_the_others() {
 }
 
 #[test]
-fn the_robot_is_red_for_the_sensor_that_is_worst_off() {
+fn leds_of_a_robot_show_its_worst_sensor() {
     let env = TestEnv::new();
     let open = world(&env, "open", "");
     let _front = simulator(&env, &open);
@@ -292,7 +292,7 @@ fn rejects_unknown_leds_and_sensors() {
 }
 
 #[test]
-fn on_a_terminal_one_line_is_drawn_over_itself() {
+fn leds_update_a_single_line_on_a_terminal() {
     for (no_color, colour) in [(None, "\x1b[1;31m● red\x1b[0m"), (Some("1"), "  ● red  ")] {
         let env = TestEnv::new();
         let (mut keys, screen) = terminal();

@@ -40,7 +40,7 @@ fn assert_out_of_descriptors(outcome: &Outcome) {
 }
 
 #[test]
-fn a_hub_starts_or_says_how_many_it_needs() {
+fn hub_starts_or_reports_the_needed_descriptors() {
     let env = TestEnv::new();
     let run = ["run", "--json", &env.link("front")];
     for limit in [6, 8, 12, 16, 24, 32, 40, 48] {
@@ -54,7 +54,7 @@ fn a_hub_starts_or_says_how_many_it_needs() {
 }
 
 #[test]
-fn a_client_works_or_says_how_many_it_needs() {
+fn client_works_or_reports_the_needed_descriptors() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "absent");
@@ -126,8 +126,8 @@ fn hub_out_of_descriptors_keeps_serving_subscribers() {
 }
 
 #[test]
-fn a_listener_that_runs_out_of_them_listens_on() {
-    in_a_network("limits_descriptors::a_listener_that_runs_out_of_them_listens_on", || {
+fn listener_continues_after_descriptor_shortage() {
+    in_a_network("limits_descriptors::listener_continues_after_descriptor_shortage", || {
         let env = TestEnv::new();
         let mut listener = env.start(&["listen", "--json", "--interface=lo"]).ready();
         let pid = Pid::from_raw(listener.pid() as i32);

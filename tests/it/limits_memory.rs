@@ -180,7 +180,7 @@ fn concurrent_clients_end_cleanly_with_little_memory() {
 }
 
 #[test]
-fn a_bus_error_has_a_last_line() {
+fn bus_error_ends_with_an_error_line() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=42", "--baud=500000"]);
     let hub = env.hub(&[env.lms_link("front")]);

@@ -30,7 +30,7 @@ fn second_hub_waits_for_the_port_and_names_its_holder() {
 }
 
 #[test]
-fn two_links_at_one_port_are_refused() {
+fn two_links_with_one_port_are_refused() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--baud=500000"]);
     symlink(env.path("front"), env.path("stable")).expect("a symlink");

@@ -55,8 +55,8 @@ fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
 }
 
 #[test]
-fn forty_subscribers_miss_nothing() {
-    in_own_process("limits_subscribers::forty_subscribers_miss_nothing", || {
+fn forty_subscribers_miss_no_sample() {
+    in_own_process("limits_subscribers::forty_subscribers_miss_no_sample", || {
         let env = TestEnv::new();
         let hub = streaming(&env, 100, &["--set=limits.subscribers=41"]);
         let mut echo = env.echo(&["front/scan"]);

@@ -7,7 +7,7 @@ use crate::testkit::{INT, TERM, TestEnv, is_class, number, wait_until};
 const BURST_FAULTS: &str = "--fault=loss=0.00135,burst=1.89";
 
 #[test]
-fn a_line_that_loses_is_seen_everywhere() {
+fn line_loss_is_reported_by_all_programs() {
     let env = TestEnv::new();
     let flags = ["--baud=500000", "--state=streaming", "--seed=5", BURST_FAULTS];
     let simulator = env.simulator(&["front"], &flags);
@@ -65,7 +65,7 @@ fn a_line_that_loses_is_seen_everywhere() {
 }
 
 #[test]
-fn a_line_that_is_well_says_so_from_the_first_second() {
+fn healthy_line_is_reported_as_lossless_at_once() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=9600", "--seed=5"]);
     let hub = env.hub(&[env.link("front")]);
@@ -83,7 +83,7 @@ fn a_line_that_is_well_says_so_from_the_first_second() {
 
 /// Replies arrive now and then. Hardly any scan arrives.
 #[test]
-fn line_that_damages_all_scans_is_reported() {
+fn line_that_damages_nearly_all_scans_is_reported() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=5", "--fault=loss=0.02,burst=1"]);
     let hub = env.hub(&[format!("{},family=lms", env.link("front"))]);

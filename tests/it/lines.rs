@@ -50,7 +50,7 @@ fn lines_are_published_with_settings_of_each_link() {
 }
 
 #[test]
-fn a_scanner_that_turns_has_lines_too() {
+fn rotating_scanner_has_line_features() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room", "--seed=7"]);
     let _hub = env.hub(&[env.link("front"), "--set=link.front.family=ld".to_owned()]);

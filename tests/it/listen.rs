@@ -48,8 +48,8 @@ fn refusals(outcome: &Outcome) -> Value {
 }
 
 #[test]
-fn every_topic_is_a_line() {
-    in_a_network("listen::every_topic_is_a_line", || {
+fn listen_prints_samples_of_every_topic() {
+    in_a_network("listen::listen_prints_samples_of_every_topic", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &[]);
         let mut sender = TestGateway::new(HUB_ID, 7, 2, "front");
@@ -121,8 +121,8 @@ fn every_topic_is_a_line() {
 }
 
 #[test]
-fn people_read_lines_too() {
-    in_a_network("listen::people_read_lines_too", || {
+fn listen_prints_readable_text_without_json() {
+    in_a_network("listen::listen_prints_readable_text_without_json", || {
         let env = TestEnv::new();
         let words = ["listen", "--interface=lo", "--topic=zones", "--name=robot1=5f3a12bc00d1e2f3", "-n2"];
         let program = env.start(&words);
@@ -173,8 +173,8 @@ fn ip(words: &str) -> bool {
 }
 
 #[test]
-fn on_a_terminal_the_account_is_drawn_over_itself() {
-    in_a_network("listen::on_a_terminal_the_account_is_drawn_over_itself", || {
+fn statistics_are_redrawn_in_place_on_a_terminal() {
+    in_a_network("listen::statistics_are_redrawn_in_place_on_a_terminal", || {
         let env = TestEnv::new();
         let (mut keys, screen) = terminal();
         let mut command = env.command(&["listen", "--stats", "--interface=lo"]);
@@ -200,8 +200,8 @@ fn on_a_terminal_the_account_is_drawn_over_itself() {
 }
 
 #[test]
-fn groups_are_joined_where_a_link_comes_or_comes_back() {
-    in_a_network("listen::groups_are_joined_where_a_link_comes_or_comes_back", || {
+fn groups_are_joined_on_new_and_returning_interfaces() {
+    in_a_network("listen::groups_are_joined_on_new_and_returning_interfaces", || {
         let make = || ip("link add scan0 type veth peer name far0") && ip("addr add 10.9.0.1/24 dev scan0");
         if !make() {
             skip("veth", "the kernel cannot create a pair of interfaces");
@@ -225,8 +225,8 @@ fn groups_are_joined_where_a_link_comes_or_comes_back() {
 }
 
 #[test]
-fn the_account_is_exact() {
-    in_a_network("listen::the_account_is_exact", || {
+fn counts_lost_late_and_duplicate_samples_exactly() {
+    in_a_network("listen::counts_lost_late_and_duplicate_samples_exactly", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones", "--topic=scan"]);
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
@@ -332,8 +332,8 @@ fn counts_90_gateway_runs_in_a_bounded_table() {
 }
 
 #[test]
-fn each_refusal_has_its_reason() {
-    in_a_network("listen::each_refusal_has_its_reason", || {
+fn each_refused_datagram_is_counted_by_reason() {
+    in_a_network("listen::each_refused_datagram_is_counted_by_reason", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones"]);
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");

@@ -27,8 +27,8 @@ fn values_of_scan(line: &Value) -> Vec<Value> {
 }
 
 #[test]
-fn turns_of_any_length_come_whole() {
-    in_a_network("listen_beams::turns_of_any_length_come_whole", || {
+fn revolutions_of_any_length_arrive_complete() {
+    in_a_network("listen_beams::revolutions_of_any_length_arrive_complete", || {
         let env = TestEnv::new();
         let simulator = |name: &str, model: &str, seed: u64| -> Program {
             let port = format!("--port={}", env.path(name).display());

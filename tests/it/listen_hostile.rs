@@ -31,8 +31,8 @@ fn valid_datagrams(sender: &mut TestGateway) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn nothing_damaged_is_accepted_and_memory_stays_flat() {
-    in_a_network("listen_hostile::nothing_damaged_is_accepted_and_memory_stays_flat", || {
+fn damaged_datagrams_are_refused_in_constant_memory() {
+    in_a_network("listen_hostile::damaged_datagrams_are_refused_in_constant_memory", || {
         let env = TestEnv::new();
         let mut program = env.start(&["listen", "--json", "--topic=zones"]).ready();
         let mut sender = TestGateway::new(0xabcd, 7, 0, "front");
@@ -85,8 +85,8 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
 
 /// A hostile sender can compute a right checksum for senseless content.
 #[test]
-fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
-    in_a_network("listen_hostile::sealed_nonsense_neither_ends_it_nor_fills_memory", || {
+fn listener_survives_valid_datagrams_with_bad_content() {
+    in_a_network("listen_hostile::listener_survives_valid_datagrams_with_bad_content", || {
         let env = TestEnv::new();
         let words = ["listen", "--json", "--publish", "--timeout=20s"];
         let mut program = env.start(&words).ready();
@@ -151,7 +151,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
 }
 
 #[test]
-fn words_that_make_no_sense_have_a_remedy() {
+fn invalid_arguments_are_refused_with_a_remedy() {
     let env = TestEnv::new();
     for (words, code, kind, hint) in [
         (&["--interface=none0"][..], 78, "configuration", "there are "),

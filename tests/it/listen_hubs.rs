@@ -21,8 +21,8 @@ fn crowd() {
 }
 
 #[test]
-fn receives_named_hubs_in_a_crowd() {
-    in_a_network("listen_hubs::receives_named_hubs_in_a_crowd", || {
+fn receives_selected_hubs_in_a_crowd() {
+    in_a_network("listen_hubs::receives_selected_hubs_in_a_crowd", || {
         let env = TestEnv::new();
         let name = "--name=robot1=5f3a12bc00d1e2f3";
         let words = ["listen", "--json", "--topic=zones", name, "--hub=robot1", "--hub=00000000000000ab"];
@@ -49,8 +49,8 @@ fn receives_named_hubs_in_a_crowd() {
 }
 
 #[test]
-fn hubs_that_are_not_named_are_not_published() {
-    in_a_network("listen_hubs::hubs_that_are_not_named_are_not_published", || {
+fn unselected_hubs_are_not_published() {
+    in_a_network("listen_hubs::unselected_hubs_are_not_published", || {
         let env = TestEnv::new();
         let words = ["listen", "--json", "--publish", "--hub=5f3a12bc00d1e2f3"];
         let mut program = env.start(&words).ready();
@@ -65,8 +65,8 @@ fn hubs_that_are_not_named_are_not_published() {
 }
 
 #[test]
-fn gateway_on_another_machine_is_not_marked_as_here() {
-    in_a_network("listen_hubs::gateway_on_another_machine_is_not_marked_as_here", || {
+fn remote_gateway_is_not_marked_as_local() {
+    in_a_network("listen_hubs::remote_gateway_is_not_marked_as_local", || {
         let robot = Robot::new(&["front"]);
         let env = TestEnv::new();
         let mut listener = env.start(&["listen", "--json", "--publish"]).ready();
@@ -79,8 +79,8 @@ fn gateway_on_another_machine_is_not_marked_as_here() {
 }
 
 #[test]
-fn a_signal_asks_for_the_account_so_far() {
-    in_a_network("listen_hubs::a_signal_asks_for_the_account_so_far", || {
+fn sigusr1_prints_statistics_of_the_listener() {
+    in_a_network("listen_hubs::sigusr1_prints_statistics_of_the_listener", || {
         let env = TestEnv::new();
         let mut program = env.start(&["listen", "--json"]).ready();
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");

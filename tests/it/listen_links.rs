@@ -53,8 +53,8 @@ fn message(packet: &[u8]) -> Option<(u8, u8)> {
 }
 
 #[test]
-fn a_link_that_is_away_for_a_moment_is_joined_again() {
-    in_a_network("listen_links::a_link_that_is_away_for_a_moment_is_joined_again", || {
+fn rejoins_groups_after_a_short_link_failure() {
+    in_a_network("listen_links::rejoins_groups_after_a_short_link_failure", || {
         let machine = Machine::new(1);
         if !force_igmp_version_2(&machine, "eth0") {
             return;

@@ -117,8 +117,8 @@ fn unproven_gateways_take_no_shared_memory() {
 }
 
 #[test]
-fn memory_for_less_than_a_sensor_is_refused() {
-    in_a_network("listen_memory::memory_for_less_than_a_sensor_is_refused", || {
+fn memory_limit_below_one_sensor_is_refused() {
+    in_a_network("listen_memory::memory_limit_below_one_sensor_is_refused", || {
         let env = TestEnv::new();
         let outcome = env.run(&["listen", "--json", "--publish", "--memory=2"]);
         let error = &outcome.of_class("error")[0];

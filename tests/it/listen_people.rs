@@ -5,8 +5,8 @@ use scanhub_schema::{Event, EventKind, Pose, PublisherKind, Topic, Track, TrackS
 use serde_json::json;
 
 #[test]
-fn people_of_another_machine_are_lines() {
-    in_a_network("listen_people::people_of_another_machine_are_lines", || {
+fn listen_prints_tracks_and_events_of_a_remote_hub() {
+    in_a_network("listen_people::listen_prints_tracks_and_events_of_a_remote_hub", || {
         let env = TestEnv::new();
         let mut program = env.start(&["listen", "--json"]).ready();
         let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 200, "house");

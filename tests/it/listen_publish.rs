@@ -38,8 +38,8 @@ fn zones(verdict: Verdict) -> Zones {
 }
 
 #[test]
-fn a_remote_sensor_is_as_a_local_one() {
-    in_a_network("listen_publish::a_remote_sensor_is_as_a_local_one", || {
+fn remote_sensor_is_published_as_local_topics() {
+    in_a_network("listen_publish::remote_sensor_is_published_as_local_topics", || {
         let env = TestEnv::new();
         let mut sender = TestGateway::new(HUB_ID, 7, 3, "front");
         let program = start_and_publish(&env, &mut sender);
@@ -135,8 +135,8 @@ fn subscribers_survive_a_killed_listener() {
 }
 
 #[test]
-fn gateways_and_hubs_that_start_again_are_followed() {
-    in_a_network("listen_publish::gateways_and_hubs_that_start_again_are_followed", || {
+fn follows_restarted_gateways_and_hubs() {
+    in_a_network("listen_publish::follows_restarted_gateways_and_hubs", || {
         let env = TestEnv::new();
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         let program = start_and_publish(&env, &mut sender);
@@ -169,8 +169,8 @@ fn gateways_and_hubs_that_start_again_are_followed() {
 }
 
 #[test]
-fn a_hub_and_two_remote_ones_live_in_one_domain() {
-    in_a_network("listen_publish::a_hub_and_two_remote_ones_live_in_one_domain", || {
+fn one_domain_has_a_hub_and_two_remote_hubs() {
+    in_a_network("listen_publish::one_domain_has_a_hub_and_two_remote_hubs", || {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &["--seed=61", "--baud=500000"]);
         let mut one = TestGateway::new(HUB_ID, 7, 0, "front");
@@ -261,8 +261,8 @@ fn gateway_does_not_send_remote_sensors_again() {
 }
 
 #[test]
-fn a_number_that_another_sensor_has_is_its_own() {
-    in_a_network("listen_publish::a_number_that_another_sensor_has_is_its_own", || {
+fn reused_sensor_number_is_a_separate_sensor() {
+    in_a_network("listen_publish::reused_sensor_number_is_a_separate_sensor", || {
         let env = TestEnv::new();
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         let mut program = start_and_publish(&env, &mut sender);
@@ -386,8 +386,8 @@ fn samples_without_topic_are_counted_by_cause() {
 }
 
 #[test]
-fn there_is_room_for_sixteen_sensors() {
-    in_a_network("listen_publish::there_is_room_for_sixteen_sensors", || {
+fn publishes_at_most_16_remote_sensors() {
+    in_a_network("listen_publish::publishes_at_most_16_remote_sensors", || {
         let env = TestEnv::new();
         let mut program = publisher(&env);
         let mut senders: Vec<_> =

@@ -53,8 +53,8 @@ fn beam_counts(outcome: &Outcome) -> Vec<usize> {
 }
 
 #[test]
-fn reports_two_machines_with_one_id_and_mixes_nothing() {
-    in_a_network("listen_twins::reports_two_machines_with_one_id_and_mixes_nothing", || {
+fn reports_two_machines_with_one_id_without_mixing() {
+    in_a_network("listen_twins::reports_two_machines_with_one_id_without_mixing", || {
         let (one, other) = (Robot::new(1, 361), Robot::new(2, 181));
         // The environment of the test is connected to both machines.
         let env = TestEnv::new();

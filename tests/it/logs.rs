@@ -26,7 +26,7 @@ fn replay_and_echo(env: &TestEnv, file: &str) -> (Outcome, Outcome) {
 }
 
 #[test]
-fn a_log_is_read_as_it_reaches_and_says_so_first() {
+fn log_encoding_is_chosen_by_range_and_reported() {
     for (ranges, unit_mm, bits, units, codes) in [
         (
             ["20.00", "81.90", "81.83", "81.82"],

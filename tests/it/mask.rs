@@ -35,7 +35,7 @@ fn await_verdict(env: &TestEnv, verdict: &str) {
 }
 
 #[test]
-fn no_time_at_all_is_refused() {
+fn mask_with_zero_duration_is_refused() {
     let outcome = TestEnv::new().run(&["zones", "front", "mask", "--for=0s", "--json"]);
     assert_eq!(outcome.exit_code, Some(78), "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["message"], "--for 0s measures nothing");
@@ -122,7 +122,7 @@ fn suggests_a_larger_within_for_a_distant_body() {
 }
 
 #[test]
-fn too_little_to_learn_from_is_refused() {
+fn mask_without_enough_scans_is_refused() {
     let env = TestEnv::new();
     let mask = |more: &[&str]| env.run(&[&["zones", "front", "mask", "--json"], more].concat());
     assert_eq!(mask(&["--for=1s"]).exit_code, Some(3), "no hub");

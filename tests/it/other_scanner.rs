@@ -72,7 +72,7 @@ fn reports_byte_rate_of_a_scanner_of_another_family() {
 }
 
 #[test]
-fn a_silent_line_may_have_another_scanner() {
+fn silent_line_error_suggests_probe() {
     check_each_scanner(&IDLE_SCANNERS, |simulated, family| {
         let message = match family {
             "lms" => "no reply at 9600, 19200, 38400 or 500000 baud",

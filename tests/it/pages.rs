@@ -203,7 +203,7 @@ fn failures(blocks: &[Block], scenes: &[ExampleScene]) -> Vec<String> {
 
 /// Examples with mistakes that pages once had, each with the expected error.
 #[test]
-fn a_program_that_takes_codes_for_distances_is_found() {
+fn page_program_that_misuses_codes_is_detected() {
     let block = |language: &str, text: &str| Block {
         location: format!("planted.md:{}", text.len()),
         language: language.to_owned(),

@@ -3,13 +3,13 @@
 
 #[cfg(not(target_arch = "x86_64"))]
 #[test]
-fn a_telegram_costs_no_more_than_before() {
+fn telegram_costs_no_more_than_before() {
     crate::testkit::skip("ptrace", "single steps are implemented for x86-64 only");
 }
 
 #[cfg(target_arch = "x86_64")]
 #[test]
-fn a_telegram_costs_no_more_than_before() {
+fn telegram_costs_no_more_than_before() {
     use crate::testkit::steps::{Stepper, TelegramCost, link_thread};
     use crate::testkit::{TERM, TestEnv, is_class, skip, wait_until};
     use std::time::Duration;

@@ -158,7 +158,7 @@ fn ready_text_names_ports_the_hub_waits_for() {
 
 /// A server that accepts the connection at once is not listed in `waiting`.
 #[test]
-fn ready_names_no_serial_server_that_is_connected() {
+fn ready_line_omits_connected_serial_servers() {
     let env = TestEnv::new();
     let server = TcpListener::bind("127.0.0.1:0").expect("a port");
     let link = format!("--link=front=tcp:{}", server.local_addr().expect("an address"));

@@ -75,7 +75,7 @@ fn printed_link_and_section_start_a_hub() {
 }
 
 #[test]
-fn a_section_needs_a_port() {
+fn probe_toml_requires_a_port() {
     let env = TestEnv::new();
     let outcome = env.run(&["probe", "--toml"]);
     assert_eq!((outcome.exit_code, outcome.stdout.len()), (Some(2), 0), "{outcome}");
@@ -220,7 +220,7 @@ fn finds_streaming_scanner_with_search_requests_only() {
 
 /// `probe` would receive only a part of the bytes and report the line as damaged.
 #[test]
-fn another_process_that_reads_the_port_is_named() {
+fn error_names_another_reader_of_the_port() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room"]);
     let port = env.path_argument("front");
@@ -238,7 +238,7 @@ fn another_process_that_reads_the_port_is_named() {
 }
 
 #[test]
-fn an_interrupt_ends_it() {
+fn interrupt_ends_the_probe() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
     let mut probe = env.command(&["probe", &env.path_argument("front"), "--json"]);
@@ -257,7 +257,7 @@ fn an_interrupt_ends_it() {
 }
 
 #[test]
-fn without_a_port_the_candidates_are_listed() {
+fn probe_without_a_port_lists_candidates() {
     let env = TestEnv::new();
     let outcome = env.run(&["probe", "--json"]);
     match outcome.exit_code {

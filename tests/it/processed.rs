@@ -86,7 +86,7 @@ fn await_silence_sample(env: &TestEnv) -> Value {
 }
 
 #[test]
-fn silence_is_published_once_also_for_late_joiners() {
+fn silence_is_published_once_and_to_late_joiners() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &STREAM_FLAGS);
     let _hub = env.hub(&[env.link("front")]);
@@ -199,7 +199,7 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
 }
 
 #[test]
-fn a_background_with_every_scan_or_none_at_all() {
+fn background_is_published_with_every_scan_or_never() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front", "rear"], &STREAM_FLAGS);
     let set = ["--set=link.front.background.publish=every-scan", "--set=link.rear.background.method=off"];
@@ -246,7 +246,7 @@ fn recording_has_zones_and_a_controllable_background() {
 }
 
 #[test]
-fn the_scans_of_a_slow_recording_follow_each_other() {
+fn slow_recording_has_no_false_silence() {
     let env = TestEnv::new();
     let ranges = vec!["2.0"; 181].join(" ");
     // Ten scans per second and one pause of 0.9 s. A live sensor would be silent after a twentieth of this pause.

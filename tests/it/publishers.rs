@@ -130,7 +130,7 @@ fn angles_arrive_with_their_stamps_and_wake_waiters() {
 }
 
 #[test]
-fn a_name_has_one_publisher_in_all_languages() {
+fn second_publisher_of_a_name_is_refused() {
     let env = TestEnv::new();
     let hub = env.hub(&[&env.link("front"), &env.link("rear")]);
     let starts = languages(&env);
@@ -183,7 +183,7 @@ fn a_name_has_one_publisher_in_all_languages() {
 /// While a publisher joins, it holds the lock for the prefix of shared memory. A publisher that leaves at the same time
 /// therefore sees the other publisher and does not remove the prefix.
 #[test]
-fn publisher_is_visible_while_another_one_leaves() {
+fn publisher_is_visible_while_another_exits() {
     let env = TestEnv::new();
     let domain = env.domain();
     std::thread::scope(|scope| {

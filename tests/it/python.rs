@@ -48,7 +48,7 @@ fn streaming(env: &TestEnv) -> (Program, Program) {
 }
 
 #[test]
-fn samples_of_golden_bytes_are_read() {
+fn python_reads_golden_samples() {
     let Some(mut command) = check("samples") else { return };
     command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/v2"));
     assert_success(command);
@@ -63,7 +63,7 @@ fn arrays_are_views_of_shared_memory() {
 }
 
 #[test]
-fn tasks_wait_in_a_loop_of_uvloop() {
+fn python_tasks_run_in_uvloop() {
     let env = TestEnv::new();
     let Some(mut command) = check_on(&env, "views") else { return };
     if python_for("uvloop", "uvloop").is_none() {
@@ -90,7 +90,7 @@ fn hub_without_sensors(env: &TestEnv) -> (HubLock, Node, WakeSender) {
 }
 
 #[test]
-fn hub_with_another_layout_is_a_mismatch() {
+fn python_reports_a_layout_mismatch() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "mismatch") else { return };
     let (lock, node, _waker) = hub_without_sensors(&env);
@@ -101,7 +101,7 @@ fn hub_with_another_layout_is_a_mismatch() {
 }
 
 #[test]
-fn notice_that_raises_loses_no_sample() {
+fn raising_notice_handler_loses_no_sample() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "notices") else { return };
     let (lock, node, _waker) = hub_without_sensors(&env);
@@ -127,7 +127,7 @@ fn notice_that_raises_loses_no_sample() {
 }
 
 #[test]
-fn names_of_their_own_come_and_go() {
+fn python_publishes_and_releases_own_names() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "own_names") else { return };
     assert_success(command);
@@ -184,7 +184,7 @@ fn wheel_installs_without_compiler_and_network() {
 
 /// The stubs have all names and types of the module. The examples use these names and types correctly.
 #[test]
-fn types_are_those_of_the_stubs() {
+fn python_types_match_the_stubs() {
     if python("mypy").is_none() || client_python().is_none() {
         return;
     }
@@ -206,7 +206,7 @@ fn types_are_those_of_the_stubs() {
 }
 
 #[test]
-fn models_and_the_flow_of_data_on_request() {
+fn python_controls_background_and_streaming() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "models") else { return };
     let _running = streaming(&env);
@@ -270,7 +270,7 @@ fn different_keys<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
 }
 
 #[test]
-fn one_subscription_follows_several_sensors() {
+fn subscription_receives_several_sensors() {
     let env = TestEnv::new();
     let Some(mut command) = check_on(&env, "follow") else { return };
     command.args(["front/scan", "rear/scan", "rear/status"]);
@@ -284,7 +284,7 @@ fn one_subscription_follows_several_sensors() {
 }
 
 #[test]
-fn a_subscription_outlives_several_hubs() {
+fn python_subscription_survives_hub_restarts() {
     let env = TestEnv::new();
     let Some(mut command) = check_on(&env, "follow") else { return };
     command.args(["front/scan", "front/telegram", "front/zones"]);
@@ -328,7 +328,7 @@ fn a_subscription_outlives_several_hubs() {
 
 /// The combined verdict never stays clear without data. The test first switches off one sensor and then kills the hub.
 #[test]
-fn a_robot_is_as_unknown_as_its_worst_sensor() {
+fn python_robot_has_the_verdict_of_its_worst_sensor() {
     let env = TestEnv::new();
     let Some(mut named) = check_on(&env, "robot") else { return };
     named.args(["front", "rear"]);

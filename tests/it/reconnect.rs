@@ -8,7 +8,7 @@ use rustix::fs::{FlockOperation, flock};
 use serde_json::Value;
 
 #[test]
-fn a_sensor_that_goes_and_comes_back() {
+fn reconnects_to_a_returning_scanner() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=22", REAL_REPLY_TIME]);
     let hub = env.hub(&[env.lms_link("front")]);
@@ -71,7 +71,7 @@ fn reopens_a_port_by_name_on_each_new_device() {
 }
 
 #[test]
-fn a_name_that_moves_while_its_old_device_lives() {
+fn follows_a_port_name_that_moves_to_another_device() {
     let env = TestEnv::new();
     let port = env.path("front");
     let old = TestLine::create(&port);
@@ -88,7 +88,7 @@ fn a_name_that_moves_while_its_old_device_lives() {
 }
 
 #[test]
-fn a_port_that_comes_back_in_other_hands() {
+fn waits_for_a_returned_port_that_is_in_use() {
     let env = TestEnv::new();
     let port = env.path("front");
     let hub = env.hub(&[env.lms_link("front")]);

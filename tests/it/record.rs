@@ -91,7 +91,7 @@ fn records_each_sample_exactly_once() {
 }
 
 #[test]
-fn whatever_ends_it_the_file_is_finished() {
+fn recording_is_complete_after_every_signal() {
     let env = TestEnv::new();
     let _others = sensors(&env, &[]);
     for signal in [INT, TERM, HUP] {

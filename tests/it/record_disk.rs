@@ -133,7 +133,7 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
 }
 
 #[test]
-fn a_file_that_may_not_grow_is_followed_by_another() {
+fn file_at_its_size_limit_starts_the_next_file() {
     let env = TestEnv::new();
     let _others = sensor(&env);
     // 128 blocks of 512 or 1024 bytes.
@@ -151,7 +151,7 @@ fn a_file_that_may_not_grow_is_followed_by_another() {
 }
 
 #[test]
-fn a_directory_that_vanishes_is_waited_for() {
+fn recorder_waits_for_a_missing_directory() {
     let env = TestEnv::new();
     let _others = sensor(&env);
     let place = env.path("usb");
@@ -175,7 +175,7 @@ fn a_directory_that_vanishes_is_waited_for() {
 }
 
 #[test]
-fn a_full_disk_is_waited_for() {
+fn recorder_waits_while_the_disk_is_full() {
     let env = TestEnv::new();
     let place = env.path("small");
     fs::create_dir(&place).unwrap();
@@ -250,7 +250,7 @@ fn counts_samples_dropped_because_of_a_slow_output() {
 }
 
 #[test]
-fn signals_that_come_together_are_one() {
+fn simultaneous_signals_count_as_one_stop_request() {
     let env = TestEnv::new();
     let _others = sensor(&env);
     // The pipe is so small that the recorder waits for its reader, even when the recorder ends.
@@ -323,7 +323,7 @@ fn recorder_fails_if_its_reader_closes_the_pipe() {
 }
 
 #[test]
-fn samples_of_a_file_that_was_removed_are_not_counted() {
+fn samples_of_a_removed_file_are_not_counted() {
     let env = TestEnv::new();
     let _others = sensor(&env);
     let file = env.path_argument("walk.mcap");
@@ -353,7 +353,7 @@ fn samples_of_a_file_that_was_removed_are_not_counted() {
 }
 
 #[test]
-fn two_recorders_do_not_write_one_file() {
+fn second_recorder_of_a_file_is_refused() {
     let env = TestEnv::new();
     let _others = sensor(&env);
     let file = env.path_argument("walk.mcap");

@@ -128,7 +128,7 @@ fn subscriber_at_start_gets_the_whole_recording() {
 }
 
 #[test]
-fn a_file_without_a_telegram_does_not_stream() {
+fn file_without_a_telegram_does_not_stream() {
     let env = TestEnv::new();
     let hub = env.hub(&[&format!("--link=a=file:{},family=lms", env.file("noise", vec![0x42; 4000]))]);
     let info = await_end(&env);
@@ -139,7 +139,7 @@ fn a_file_without_a_telegram_does_not_stream() {
 }
 
 #[test]
-fn the_reflectors_of_a_recording_are_marks() {
+fn reflectors_of_a_recording_are_marks() {
     let Some(data) = data() else { return };
     let recording = data.join("captures/reflector_levels_cm_18s.bin");
     let env = TestEnv::new();
@@ -152,7 +152,7 @@ fn the_reflectors_of_a_recording_are_marks() {
 }
 
 #[test]
-fn as_fast_as_it_can_be_read() {
+fn plays_a_recording_at_maximum_rate() {
     let env = TestEnv::new();
     // Use no more samples than a subscriber's buffer holds, because the hub does not wait for subscribers.
     let (bytes, whole) = stream(14);
@@ -165,7 +165,7 @@ fn as_fast_as_it_can_be_read() {
 }
 
 #[test]
-fn in_the_pace_of_the_sensor() {
+fn plays_a_recording_at_the_scanners_rate() {
     let env = TestEnv::new();
     let (bytes, whole) = stream(60);
     let file = env.file("recording", &bytes);
@@ -188,7 +188,7 @@ fn in_the_pace_of_the_sensor() {
 }
 
 #[test]
-fn a_carmen_log() {
+fn plays_a_carmen_log() {
     let env = TestEnv::new();
     let metres = |scan: usize, beam: usize| 1.0 + 0.25 * scan as f64 + 0.01 * beam as f64;
     let line = |scan: usize| {
@@ -232,7 +232,7 @@ fn counters_of(data: &std::path::Path, name: &str) -> Value {
 }
 
 #[test]
-fn recordings_of_real_sensors() {
+fn hub_plays_recordings_of_real_scanners() {
     let Some(data) = data() else { return };
     for (name, telegrams) in [
         ("captures/lms200_38400.bin", Some(427)),

@@ -78,7 +78,7 @@ fn rejects_invalid_command_lines() {
 }
 
 #[test]
-fn formats_that_do_not_go_with_their_topics() {
+fn rejects_formats_unsuitable_for_the_topics() {
     let env = TestEnv::new();
     for (arguments, word) in [
         (["echo", "front/telegram", "--csv"], "--csv takes one topic"),
@@ -93,7 +93,7 @@ fn formats_that_do_not_go_with_their_topics() {
 }
 
 #[test]
-fn configuration_that_cannot_be() {
+fn rejects_invalid_configurations() {
     let env = TestEnv::new();
     let file = env.file("hub.toml", "[[link]]\nname = \"front\"\nport = \"/dev/x\"\nbaud = 115200\n");
     let unknown = env.file("key.toml", "[[link]]\nname = \"front\"\nprot = \"/dev/x\"\n");
@@ -245,7 +245,7 @@ fn unwritable_or_existing_output_exits_with_73() {
 }
 
 #[test]
-fn no_such_sensor_or_hub() {
+fn reports_a_missing_sensor_or_hub() {
     let env = TestEnv::new();
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
     let verbs = [
@@ -308,7 +308,7 @@ fn reports_a_full_disk() {
 }
 
 #[test]
-fn domains_that_cannot_be() {
+fn rejects_invalid_domains() {
     let at = |domain: &str, root: &str| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
         command.args(["list", "--json", "--domain", domain, "--root", root]);
@@ -380,7 +380,7 @@ fn reports_unknown_sensors_and_timeouts() {
 }
 
 #[test]
-fn ports_that_cannot_be_used() {
+fn rejects_unusable_ports() {
     let env = TestEnv::new();
     let file = env.file("file", "not a tty");
     assert_refused(&env, &["run", "--link=front=/dev/null"], 4, "port_not_tty", &["/dev/null", "name a tty"]);
@@ -402,7 +402,7 @@ fn ports_that_cannot_be_used() {
 }
 
 #[test]
-fn a_second_hub_in_the_domain() {
+fn second_hub_in_a_domain_is_refused() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("front")]);
     let pid = format!("pid {}", hub.pid());

@@ -32,7 +32,7 @@ fn has_radii(expected: &'static [u64]) -> impl Fn(&Value) -> bool {
 }
 
 #[test]
-fn circles_change_in_a_stream_without_a_gap() {
+fn reload_changes_circles_without_a_stream_gap() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &STREAM_FLAGS);
     let mut supervisor = env.supervisor();

@@ -59,7 +59,7 @@ fn plays_whole_recording_with_its_times_after_resume() {
 }
 
 #[test]
-fn from_here_to_there_faster() {
+fn replay_plays_a_time_range_faster() {
     let env = TestEnv::new();
     let player = start(&env, &[&log(&env, 60, 100), "--paused", "--start=2s", "--end=4s", "--rate=4"]);
     let mut subscriber = env.echo(&["front/scan", "front/status"]);
@@ -231,7 +231,7 @@ fn missing_scans_are_not_reported_as_silence() {
 }
 
 #[test]
-fn replay_has_no_scans_before_their_mode_was_known() {
+fn replay_has_no_scans_while_the_mode_is_unknown() {
     // In each case, one of the two runs had the encoding at its start, from an earlier run.
     for understood in [[0, 6], [6, 0]] {
         let env = TestEnv::new();
@@ -282,7 +282,7 @@ fn refuses_bad_ranges_rates_and_sensors() {
 }
 
 #[test]
-fn keys() {
+fn keys_control_the_replay() {
     let env = TestEnv::new();
     let words = ["replay", "--no-system-config", "--paused", &log(&env, 300, 100)];
     let mut sitting = TerminalSession::start(&env.command(&words), (100, 30));
@@ -308,7 +308,7 @@ fn keys() {
 }
 
 #[test]
-fn a_signal_gives_the_terminal_back() {
+fn signal_restores_the_terminal() {
     for signal in [INT, TERM] {
         let env = TestEnv::new();
         let words = ["replay", "--no-system-config", &log(&env, 300, 100)];
@@ -321,7 +321,7 @@ fn a_signal_gives_the_terminal_back() {
 }
 
 #[test]
-fn it_ends_with_its_terminal() {
+fn replay_ends_when_its_terminal_closes() {
     let env = TestEnv::new();
     let words = ["replay", "--no-system-config", "--loop", "--paused", &log(&env, 300, 100)];
     let errors = env.path("errors");

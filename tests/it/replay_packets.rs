@@ -99,7 +99,7 @@ fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
 }
 
 #[test]
-fn scans_are_those_that_were_recorded() {
+fn replayed_scans_equal_recorded_scans() {
     let env = TestEnv::new();
     record(&env, "ld19", &[], 45);
     let recorded = samples(&env.path("all.mcap"), "front/scan");
@@ -138,7 +138,7 @@ fn scans_are_those_that_were_recorded() {
 }
 
 #[test]
-fn beams_are_those_that_were_recorded() {
+fn replay_uses_the_recorded_number_of_beams() {
     let env = TestEnv::new();
     record(&env, "stl27l", &["model=stl27l", "beams=1000"], 25);
     let recorded = samples(&env.path("all.mcap"), "front/scan");
@@ -151,7 +151,7 @@ fn beams_are_those_that_were_recorded() {
 }
 
 #[test]
-fn a_part_of_it_and_again() {
+fn replays_a_part_and_in_a_loop() {
     let env = TestEnv::new();
     record(&env, "ld19", &[], 30);
     let recorded = samples(&env.path("all.mcap"), "front/scan");
@@ -275,7 +275,7 @@ fn refuses_recordings_of_another_family() {
 }
 
 #[test]
-fn other_programs_get_the_same_scans_of_packets() {
+fn convert_and_replay_give_the_same_scans() {
     let env = TestEnv::new();
     record(&env, "ld19", &[], 30);
     let rows = |name: &str| -> Vec<Vec<String>> {

@@ -9,7 +9,7 @@ use crate::testkit::{
 use serde_json::Value;
 
 #[test]
-fn subscribers_outlive_several_hubs() {
+fn subscribers_survive_several_hub_restarts() {
     // A hub without CPU time makes topics stale, but no client reports the hub as gone.
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=21"]);

@@ -65,7 +65,7 @@ fn dead_sensor_or_hub_makes_the_robot_unknown() {
 }
 
 #[test]
-fn a_program_that_follows_the_robot() {
+fn robot_subscriber_receives_each_verdict_change() {
     let env = TestEnv::new();
     let mut robot =
         RobotSubscriber::builder(&["front", "rear"]).in_domain(&env.domain()).open().expect("valid names");

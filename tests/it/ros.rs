@@ -129,7 +129,7 @@ fn check_transforms(messages: &[Value]) {
 }
 
 #[test]
-fn others_read_every_message_made_live_and_later() {
+fn ros_decoders_read_live_and_converted_messages() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front", "rear"], &["--world=room", "--seed=5", "--mode=0x01"]);
     let _hub = env.hub(&[link(&env, "front", &FRONT_POSE), link(&env, "rear", &REAR_POSE)].concat());
@@ -204,7 +204,7 @@ fn others_read_every_message_made_live_and_later() {
 }
 
 #[test]
-fn a_scan_is_also_written_as_points() {
+fn scan_is_also_written_as_points() {
     let env = TestEnv::new();
     let words: [u16; 361] =
         std::array::from_fn(|beam| if beam % 3 == 0 { 0x1FFF } else { 500 + beam as u16 });

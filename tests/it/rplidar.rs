@@ -53,7 +53,7 @@ fn identifies_scanner_and_publishes_its_revolutions() {
 }
 
 #[test]
-fn a_mode_and_a_model_may_be_named() {
+fn configured_model_and_mode_are_used() {
     let env = TestEnv::new();
     let _simulator = simulator(&env, "s1", &[]);
     let _hub = hub(&env, &["model=s1", "mode=standard", "beams=500"]);
@@ -120,7 +120,7 @@ fn probe_identifies_scanner_and_checks_its_line() {
 
 /// Tests a model ID that this version does not know.
 #[test]
-fn a_model_that_is_not_known_is_shown_with_its_number() {
+fn unknown_model_is_shown_with_its_id() {
     let env = TestEnv::new();
     let _simulator = simulator(&env, "s2", &["--fault=id=0x95"]);
     let probed = env.search(&["probe", &env.path_argument("front"), "--json"]);
@@ -149,7 +149,7 @@ fn a_model_that_is_not_known_is_shown_with_its_number() {
 /// A recorder that attaches to a running stream misses the replies that the scanner sent before. A converted stream
 /// file has these replies.
 #[test]
-fn a_stream_file_has_the_scans_that_were_recorded() {
+fn stream_file_has_the_recorded_scans() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("front")]);
     let mut echo = env.echo(&["front/scan"]);

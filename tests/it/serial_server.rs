@@ -87,7 +87,7 @@ fn forward(line: &std::fs::File, socket: &TcpStream, is_over: &dyn Fn() -> bool)
 }
 
 #[test]
-fn a_sensor_behind_a_serial_server() {
+fn reconnects_to_a_scanner_behind_a_serial_server() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
     let server = Server::new(&env, "line", 38_400);
@@ -167,7 +167,7 @@ fn scans_buffered_for_a_stopped_hub_give_no_verdict() {
 }
 
 #[test]
-fn a_serial_server_that_is_set_to_another_rate() {
+fn wrong_rate_of_a_serial_server_is_reported() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["line"], &["--baud=9600"]);
     let server = Server::new(&env, "line", 38_400);
@@ -178,7 +178,7 @@ fn a_serial_server_that_is_set_to_another_rate() {
 }
 
 #[test]
-fn a_serial_server_that_is_not_there() {
+fn unreachable_serial_server_is_reported() {
     let env = TestEnv::new();
     // This port was free a moment ago.
     let address = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
@@ -197,7 +197,7 @@ fn a_serial_server_that_is_not_there() {
 }
 
 #[test]
-fn a_want_of_descriptors_is_not_the_servers_fault() {
+fn descriptor_shortage_is_not_a_network_error() {
     let env = TestEnv::new();
     let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
     let port = format!("tcp:localhost:{}", free.port());
@@ -255,7 +255,7 @@ fn busy_serial_server_is_reported_once() {
 }
 
 #[test]
-fn probe_and_doctor_ask_there_too() {
+fn probe_and_doctor_work_behind_a_serial_server() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["sensor"], &["--baud=38400"]);
     let server = Server::new(&env, "sensor", 38_400);
@@ -296,7 +296,7 @@ fn run_and_confirm(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
 }
 
 #[test]
-fn a_sensor_there_can_be_configured() {
+fn scanner_behind_a_serial_server_is_configurable() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=38400"]);
     let server = Server::new(&env, "front", 38_400);

@@ -206,7 +206,7 @@ fn renamed_link_takes_over_its_stored_port() {
 }
 
 #[test]
-fn the_watchdog_is_fed_while_links_work() {
+fn watchdog_is_fed_while_links_work() {
     let env = TestEnv::new();
     let mut supervisor = env.supervisor();
     // A link whose port is missing does not hang.

@@ -244,7 +244,7 @@ fn reports_the_user_of_a_running_hub() {
 
 /// The configuration of the service on the page is valid for a gateway.
 #[test]
-fn the_page_s_configuration_is_one() {
+fn configuration_on_the_page_is_valid() {
     let block =
         SHARING_PAGE.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("a block");
     let env = testkit::TestEnv::new();
@@ -263,8 +263,8 @@ fn the_page_s_configuration_is_one() {
 
 /// Runs the three commands of docs/tilt.md in the order of the page: the mount publishes before a hub runs.
 #[test]
-fn mount_and_hub_find_each_other_in_either_order() {
-    in_namespace("sharing::mount_and_hub_find_each_other_in_either_order", || {
+fn mount_and_hub_share_a_domain_in_either_order() {
+    in_namespace("sharing::mount_and_hub_share_a_domain_in_either_order", || {
         fs::create_dir("/run/user").expect("an empty /run");
         for user in [0, OTHER_UID] {
             create_directory_of(user, &format!("/run/user/{user}"));

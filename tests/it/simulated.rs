@@ -33,7 +33,7 @@ fn simulator_flags_appear_in_the_probe_result() {
 }
 
 #[test]
-fn faults_are_named_in_the_truth() {
+fn truth_file_names_the_fault_of_each_telegram() {
     let env = TestEnv::new();
     let fault = "--fault=truncate=0.3,length=0.3";
     let simulator = env.simulator(&["front"], &["--baud=500000", "--state=streaming", fault]);
@@ -114,7 +114,7 @@ fn rplidar_streams_in_the_requested_mode_and_replies() {
 }
 
 #[test]
-fn a_hub_reads_sensors_behind_tcp() {
+fn hub_reads_sensors_behind_tcp() {
     let env = TestEnv::new();
     let server = |flags: &[&str]| {
         let mut simulator = env.start(&[&["simulate", "--json", "--tcp=127.0.0.1:0"], flags].concat());
@@ -139,7 +139,7 @@ fn a_hub_reads_sensors_behind_tcp() {
 }
 
 #[test]
-fn packets_that_a_hub_recorded_are_sent_again() {
+fn simulator_sends_recorded_packets_again() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19"]);
     let hub = env.hub(&[&env.link("front"), "--set=link.front.family=ld"]);

@@ -25,14 +25,14 @@ fn required_tool_may_not_be_skipped() {
 }
 
 #[test]
-fn a_test_that_is_left_out_says_so_or_fails() {
+fn skipped_test_is_reported_or_fails() {
     if std::env::var_os(RERUN_VARIABLE).is_some() {
         return skip("tmux", "as if there were none");
     }
     let again = |required: &str| -> Output {
         let mut command = Command::new(own_program());
         // Without `--nocapture`, the harness hides the output of passed tests.
-        command.args(&single_test_args("skips::a_test_that_is_left_out_says_so_or_fails")[..2]);
+        command.args(&single_test_args("skips::skipped_test_is_reported_or_fails")[..2]);
         command.env(RERUN_VARIABLE, "1").env("SCANHUB_REQUIRE", required).env_remove("RUST_TEST_NOCAPTURE");
         output(command).expect("the output of the program")
     };

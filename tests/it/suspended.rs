@@ -10,7 +10,7 @@ use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
 #[test]
-fn a_hub_that_was_stopped() {
+fn resumed_hub_delivers_backlog_with_right_stamps() {
     let env = TestEnv::new();
     let simulator = env.simulator_on_real_lines(&["front"], &["--seed=31", "--baud=500000"]);
     let hub = env.hub(&[env.lms_link("front")]);

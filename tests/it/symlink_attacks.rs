@@ -40,8 +40,8 @@ fn outputs(file: &str) -> [Vec<&str>; 10] {
 }
 
 #[test]
-fn links_at_the_name_of_an_output_are_refused() {
-    with_another_user("symlink_attacks::links_at_the_name_of_an_output_are_refused", || {
+fn symlinked_outputs_are_refused() {
+    with_another_user("symlink_attacks::symlinked_outputs_are_refused", || {
         prepare();
         run_as_other_user(
             "ln -s /mnt/victim /tmp/out.mcap && ln -s /mnt /tmp/way && ln -s /mnt/new /tmp/dangling.mcap",
@@ -68,8 +68,8 @@ fn links_at_the_name_of_an_output_are_refused() {
 }
 
 #[test]
-fn directories_are_not_created_behind_links_of_others() {
-    with_another_user("symlink_attacks::directories_are_not_created_behind_links_of_others", || {
+fn directories_are_not_created_through_foreign_links() {
+    with_another_user("symlink_attacks::directories_are_not_created_through_foreign_links", || {
         fs::create_dir("/mnt/prey").expect("a directory");
         run_as_other_user("ln -s /mnt/prey /tmp/way && ln -s /mnt/new /tmp/dangling");
         for directory in ["way", "way/new", "way/new/deep", "dangling", "dangling/deep"] {
@@ -92,8 +92,8 @@ fn directories_are_not_created_behind_links_of_others() {
 
 /// Another user could plant a name that contains the process ID before the process starts.
 #[test]
-fn names_of_temporary_files_cannot_be_guessed() {
-    with_another_user("symlink_attacks::names_of_temporary_files_cannot_be_guessed", || {
+fn temporary_file_names_cannot_be_guessed() {
+    with_another_user("symlink_attacks::temporary_file_names_cannot_be_guessed", || {
         prepare();
         // The program replaces the shell and therefore has its process ID.
         let planted = |name: &str, words: &str| {
@@ -118,8 +118,8 @@ fn names_of_temporary_files_cannot_be_guessed() {
 
 /// After `sudo -E`, the environment of another user may name the directory.
 #[test]
-fn a_state_directory_of_another_user_is_not_used() {
-    with_another_user("symlink_attacks::a_state_directory_of_another_user_is_not_used", || {
+fn state_directory_of_another_user_is_not_used() {
+    with_another_user("symlink_attacks::state_directory_of_another_user_is_not_used", || {
         prepare();
         fs::create_dir("/mnt/prey").expect("a directory");
         // Links at each of the levels that a program would open.

@@ -31,7 +31,7 @@ fn assert_refused(outcome: &Outcome, message: &str) {
 }
 
 #[test]
-fn link_waits_for_the_name_that_a_program_has() {
+fn link_waits_for_a_name_in_use() {
     for signal in [INT, KILL] {
         let env = TestEnv::new();
         let holder = start_mount(&env, "front").ready();

@@ -172,7 +172,7 @@ fn every_telegram_is_explained() {
 }
 
 #[test]
-fn text_and_bytes_are_the_same() {
+fn hexadecimal_text_and_bytes_decode_equally() {
     let request = Request::Status.encode(0);
     let of_text = telegram(&["decode"], b"02 00 01 00 31 15 12\n");
     let of_bytes = telegram(&["decode", "-"], request.bytes());
@@ -185,7 +185,7 @@ fn text_and_bytes_are_the_same() {
 }
 
 #[test]
-fn bytes_between_telegrams_are_listed() {
+fn lists_bytes_between_telegrams() {
     let mut bytes = vec![0x55, 0x55];
     bytes.extend(Request::Stop.encode(0).bytes());
     bytes.push(0x06);
@@ -202,7 +202,7 @@ fn bytes_between_telegrams_are_listed() {
 }
 
 #[test]
-fn values_are_read_as_the_telegrams_tell() {
+fn preceding_telegrams_determine_decoded_values() {
     let mut bytes = measured::encode(0, Unit::Mm, &[0x83E8, 200], STATUS_OK).bytes().to_vec();
     let unknown = lines(&telegram(&["decode", "--json"], &bytes));
     let values = |line: &Value| line["fields"].as_array().expect("fields")[5].clone();
@@ -220,7 +220,7 @@ fn values_are_read_as_the_telegrams_tell() {
 }
 
 #[test]
-fn the_telegrams_inside_a_recording_are_decoded() {
+fn telegrams_inside_a_recording_are_decoded() {
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
     let bytes = std::fs::read(golden).expect("a golden recording");
     let output = telegram(&["decode", "--json", golden], &[]);

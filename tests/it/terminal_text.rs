@@ -18,7 +18,7 @@ fn assert_printable(outcome: &Outcome) {
 }
 
 #[test]
-fn a_configuration_commands_no_terminal() {
+fn configuration_text_has_no_control_characters() {
     let env = TestEnv::new();
     let quoted: String = CONTROL_CHARACTERS.chars().map(|c| format!("\\u{:04x}", c as u32)).collect();
     let port = format!("/dev/{quoted}");
@@ -67,7 +67,7 @@ fn a_configuration_commands_no_terminal() {
 }
 
 #[test]
-fn a_line_commands_no_terminal() {
+fn scanner_text_has_no_control_characters() {
     let env = TestEnv::new();
     let bytes = Writer::new(0x80, 0xBA).slice(CONTROL_CHARACTERS.as_bytes()).byte(0x10).finish();
     let file = env.file("type.bin", bytes.bytes());

@@ -58,8 +58,8 @@ fn run_check(env: &TestEnv, flags: &[&str]) -> (Option<i32>, Vec<(String, String
 }
 
 #[test]
-fn two_rooms_are_watched_from_a_third_machine() {
-    in_a_network("three_machines::two_rooms_are_watched_from_a_third_machine", || {
+fn third_machine_receives_two_rooms() {
+    in_a_network("three_machines::third_machine_receives_two_rooms", || {
         if bridge_program().is_none() {
             return;
         }

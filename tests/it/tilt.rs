@@ -147,7 +147,7 @@ fn points_match_the_hall_and_the_post_is_an_obstacle() {
 }
 
 #[test]
-fn the_programs_of_the_page_say_how_a_mount_stands() {
+fn page_programs_publish_mount_angles() {
     let page = TestEnv::new();
     for example in examples_on("docs/tilt.md", "mount", &page) {
         // An interrupted program leaves its topic in its domain until the next program replaces it.
@@ -210,7 +210,7 @@ pub(crate) fn end_cleanly(hall: TiltHub) {
 }
 
 #[test]
-fn the_page_leads_to_an_obstacle() {
+fn commands_of_the_page_find_an_obstacle() {
     let hall = TiltHub::new();
     let lines = commands_on("docs/tilt.md", &["scanhub tilt front --angles", "scanhub echo hall/"]);
     // The third command, with `--check`, has its own test.
@@ -225,7 +225,7 @@ fn the_page_leads_to_an_obstacle() {
 }
 
 #[test]
-fn a_recording_has_three_dimensions() {
+fn tilt_processes_a_replayed_recording() {
     let env = TestEnv::new();
     let file = recorded_world(&env, &World::of_toml("hall", TILT_WORLD).expect("a world"), &["front"], 12);
     let player = env.start(&["replay", &file, "--paused", "--json", "--no-system-config"]).ready();
@@ -255,7 +255,7 @@ fn a_recording_has_three_dimensions() {
 }
 
 #[test]
-fn a_check_reports_a_wrong_level() {
+fn check_reports_a_wrong_level() {
     let env = TestEnv::new();
     let world = TILT_WORLD.replace("to_deg = 24", "to_deg = 36").replace("deg_s = 12", "deg_s = 36");
     let player = replay_tilt(&env, &world);

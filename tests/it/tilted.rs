@@ -129,7 +129,7 @@ fn assert_same_lines(first: &Outcome, other: &Outcome, class: &str, keys: &[&str
 }
 
 #[test]
-fn echo_python_and_a_recording_say_the_same() {
+fn echo_python_and_recording_have_equal_samples() {
     let env = TestEnv::new();
     let _hub = hub(&env);
     let mut made = TiltedPublisher::start_publisher(&env);
@@ -183,8 +183,8 @@ fn echo_python_and_a_recording_say_the_same() {
 
 /// Tests clouds that take several datagrams. `listen --publish` publishes the same values as the other machine.
 #[test]
-fn another_machine_says_the_same() {
-    in_a_network("tilted::another_machine_says_the_same", || {
+fn remote_machine_receives_equal_tilted_samples() {
+    in_a_network("tilted::remote_machine_receives_equal_tilted_samples", || {
         let (env, there) = (TestEnv::new(), TestEnv::new());
         let _hub = hub(&env);
         let mut made = TiltedPublisher::start_publisher(&env);

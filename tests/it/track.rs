@@ -311,7 +311,7 @@ fn rejects_unknown_doors_sites_and_sensors() {
 }
 
 #[test]
-fn a_plan_is_checked_and_drawn_once() {
+fn site_check_draws_a_valid_plan_once() {
     let env = TestEnv::new();
     let (site, svg) = (env.file("site.toml", SITE_FILE), env.path_argument("site.svg"));
     let checked = env.run(&["site", "check", &site, "--svg", &svg, "--json"]);

@@ -134,19 +134,19 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
         wait_until("all sent datagrams", || relay.received().len() as u64 == sent.values().sum::<u64>());
         let (log, names) = (relay.forwarded(), announced_names(&relay.forwarded()));
         let (early, late) = (early.end(INT), late.end(INT));
-        let said_early = reported_counters(&early, &names);
-        assert_eq!(said_early, expected_counters(&log));
+        let early_counters = reported_counters(&early, &names);
+        assert_eq!(early_counters, expected_counters(&log));
         assert_eq!(
             reported_counters(&late, &names),
             expected_counters(&log[before_late..]),
             "losses must be counted from the first datagram"
         );
         // A listener that ran from the start can account for all that was sent.
-        assert_eq!(said_early.len(), sent.len());
-        for (stream, [received, lost, ..]) in &said_early {
+        assert_eq!(early_counters.len(), sent.len());
+        for (stream, [received, lost, ..]) in &early_counters {
             assert_eq!(received + lost, sent[stream], "{stream:?}");
         }
-        let sum = |at: usize| said_early.values().map(|numbers| numbers[at]).sum::<u64>();
+        let sum = |at: usize| early_counters.values().map(|numbers| numbers[at]).sum::<u64>();
         let [received, lost, duplicate, reordered] = std::array::from_fn(sum);
         eprintln!("{received} received, {lost} lost, {duplicate} duplicate, {reordered} reordered");
         assert!(

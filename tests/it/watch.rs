@@ -27,7 +27,7 @@ fn is_braille(character: char) -> bool {
 }
 
 #[test]
-fn files_and_pipes_are_refused() {
+fn watch_refuses_files_and_pipes() {
     let env = TestEnv::new();
     let outcome = env.run(&["watch", "front"]);
     assert_eq!((outcome.exit_code, &outcome.stdout[..]), (Some(2), &b""[..]), "{outcome}");
@@ -41,7 +41,7 @@ fn files_and_pipes_are_refused() {
 }
 
 #[test]
-fn it_follows_the_hub_the_keys_and_the_window() {
+fn watch_reacts_to_hub_keys_and_window_size() {
     if !can_open_terminal() {
         return;
     }
@@ -122,7 +122,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
 }
 
 #[test]
-fn the_terminal_is_given_back_however_it_ends() {
+fn watch_restores_the_terminal_after_every_exit() {
     if !can_open_terminal() {
         return;
     }
@@ -153,7 +153,7 @@ fn the_terminal_is_given_back_however_it_ends() {
 }
 
 #[test]
-fn without_colours_nothing_is_coloured() {
+fn no_color_disables_all_colors() {
     if !can_open_terminal() {
         return;
     }
@@ -173,7 +173,7 @@ fn without_colours_nothing_is_coloured() {
 }
 
 #[test]
-fn a_demonstration_shows_it() {
+fn demo_shows_watch_on_a_terminal() {
     if !can_open_terminal() {
         return;
     }
@@ -196,7 +196,7 @@ fn a_demonstration_shows_it() {
 }
 
 #[test]
-fn a_terminal_that_is_closed_is_a_quiet_end() {
+fn closed_terminal_ends_watch_without_error() {
     if !can_open_terminal() {
         return;
     }

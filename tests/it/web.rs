@@ -100,7 +100,7 @@ pub(crate) fn subscribe(viewer: &mut WebSocket<TcpStream>, requested: &[(u32, &V
 }
 
 #[test]
-fn strangers_stay_outside() {
+fn foreign_hosts_and_origins_are_refused() {
     let env = TestEnv::new();
     let (_open, host) = web(&env, &[]);
     let get = |host: &str, name: &str, more: &str| {
@@ -188,7 +188,7 @@ fn viewer_gets_foxglove_messages_despite_hostile_one() {
 }
 
 #[test]
-fn as_many_come_in_as_there_is_room_for() {
+fn viewers_beyond_the_limit_are_refused() {
     let env = TestEnv::new();
     let (server, host) = web(&env, &[]);
     let mut viewers: Vec<_> =
@@ -204,7 +204,7 @@ fn as_many_come_in_as_there_is_room_for() {
 }
 
 #[test]
-fn a_port_that_is_taken_is_not_the_end() {
+fn web_uses_the_next_port_if_one_is_in_use() {
     let env = TestEnv::new();
     let (_first, host) = web(&env, &[]);
     let mut second = env.start(&["web", "--json", "--listen", &host]);

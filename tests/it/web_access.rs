@@ -25,7 +25,7 @@ const FOCUSED_ELEMENT: &str = "(document.activeElement === document.body ? 'BODY
                       document.activeElement.tagName).trim()";
 
 #[test]
-fn the_keyboard_alone_is_enough() {
+fn page_is_usable_with_the_keyboard_alone() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
     // Tab must reach every element that can be pressed, and each must show the focus.

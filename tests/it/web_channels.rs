@@ -276,8 +276,8 @@ fn are_same_lines(message: &Value, line: &Value) -> bool {
     };
     let expected: Vec<_> =
         list(line, "lines").flat_map(|one| [end(one, "x1_m", "y1_m"), end(one, "x2_m", "y2_m")]).collect();
-    let said_corners: Vec<_> = list(line, "corners").map(|one| end(one, "x_m", "y_m")).collect();
-    are_same(&ends, &expected) && are_same(&corners, &said_corners)
+    let expected_corners: Vec<_> = list(line, "corners").map(|one| end(one, "x_m", "y_m")).collect();
+    are_same(&ends, &expected) && are_same(&corners, &expected_corners)
 }
 
 fn are_same_zones(message: &Value, line: &Value) -> bool {
@@ -365,12 +365,12 @@ fn compare(viewer: &Viewer, outcome: &Outcome) {
         |update| !all(update, "cylinders").is_empty(),
         are_same_zones,
     );
-    let is_heard = |update: &Value| update["state"] != "no status";
+    let has_status = |update: &Value| update["state"] != "no status";
     check_each_equals_some_line(
         "status",
         viewer.messages_of("/front/status"),
         outcome,
-        is_heard,
+        has_status,
         is_same_status,
     );
     let models = outcome.of_class("background");

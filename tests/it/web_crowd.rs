@@ -194,7 +194,7 @@ fn new_viewer_waits_while_descriptors_are_short() {
 }
 
 #[test]
-fn lack_of_descriptors_for_a_topic_spares_the_others() {
+fn descriptor_shortage_of_a_topic_spares_others() {
     let env = TestEnv::new();
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
@@ -223,7 +223,7 @@ fn lack_of_descriptors_for_a_topic_spares_the_others() {
 }
 
 #[test]
-fn where_there_are_no_descriptors_the_server_ends() {
+fn server_exits_without_descriptors() {
     let env = TestEnv::new();
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);

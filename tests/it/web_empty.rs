@@ -13,7 +13,7 @@ use crate::web_page::browse;
 fn color(page: &mut Browser, name: &str) -> Value {
     page.ask(&format!(
         "(() => {{ const probe = document.createElement('i'); document.body.append(probe); \
-         probe.style.color = 'var(--{name})'; const told = getComputedStyle(probe).color; probe.remove(); return told; }})()"
+         probe.style.color = 'var(--{name})'; const computed = getComputedStyle(probe).color; probe.remove(); return computed; }})()"
     ))
 }
 
@@ -59,8 +59,8 @@ fn page_reports_missing_remote_sensors() {
 }
 
 #[test]
-fn the_hub_of_another_user_is_named() {
-    with_another_user("web_empty::the_hub_of_another_user_is_named", || {
+fn hub_of_another_user_is_named() {
+    with_another_user("web_empty::hub_of_another_user_is_named", || {
         let env = TestEnv::new();
         let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
         run_as_other_user("mkdir -m 755 /tmp/theirs");

@@ -43,7 +43,7 @@ fn measured_points(scan: &Value, pose: &Pose) -> Vec<(f64, f64)> {
 }
 
 #[test]
-fn every_form_is_drawn_where_it_sees() {
+fn scans_of_every_family_are_drawn_in_place() {
     let env = TestEnv::new();
     let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
     let world = format!("--world={}", env.file("world", HALL_WORLD));

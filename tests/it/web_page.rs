@@ -230,10 +230,10 @@ fn curve(name: &str) -> String {
 }
 
 /// Checks the page in the states that the pictures of the documents show. `SCANHUB_PICTURES=docs cargo test --test it
-/// the_picture_of_the_documents` creates these pictures again, each after a minute. They show a recording, because a
+/// page_shows_documented_states` creates these pictures again, each after a minute. They show a recording, because a
 /// simulator on a busy machine loses bytes.
 #[test]
-fn the_picture_of_the_documents() {
+fn page_shows_documented_states() {
     let env = TestEnv::new();
     let directory = std::env::var_os("SCANHUB_PICTURES");
     let world: World = "demo".parse().expect("a world");

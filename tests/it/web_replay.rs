@@ -28,7 +28,7 @@ fn log(env: &TestEnv, scans: u64) -> String {
 }
 
 #[test]
-fn the_keys_of_a_player_are_on_the_page() {
+fn page_has_controls_of_the_player() {
     let env = TestEnv::new();
     let Some(mut page) = browse(&env, Appearance::LAPTOP) else { return };
     let (server, url) = start_web(&env, &log(&env, SCAN_COUNT), &[]);

@@ -232,7 +232,7 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
 
 /// The demo with a mount prints the address of its page, which shows sweeps.
 #[test]
-fn the_page_of_the_demonstration_has_sweeps() {
+fn demo_page_shows_sweeps() {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     let home = tempfile::tempdir().expect("a directory");
     command.args(["demo", "--world", "tilt"]).env_clear().env("XDG_STATE_HOME", home.path());
@@ -256,7 +256,7 @@ fn the_page_of_the_demonstration_has_sweeps() {
 /// Checks the page as in the picture of `docs/tilt.md`: its hall with all obstacles. The command in `web_page` that
 /// creates the pictures creates this one too.
 #[test]
-fn the_picture_of_the_documents_from_the_side() {
+fn page_shows_documented_states_from_the_side() {
     let env = TestEnv::new();
     let directory = std::env::var_os("SCANHUB_PICTURES");
     let look = Appearance { width: 1200, height: 440, ..Appearance::LAPTOP };

@@ -34,7 +34,7 @@ def header(header):
     }
 
 
-def told(topic, log_time, message):
+def content(topic, log_time, message):
     """Returns the content of a ROS 2 message as a dictionary, the same for every reader."""
     line = {"topic": topic, "log_time": log_time}
     if topic == "/tf_static":
@@ -63,7 +63,7 @@ def mcap_ros2(path):
     """Returns all messages, as mcap-ros2-support reads them."""
     from mcap_ros2.reader import read_ros2_messages
 
-    return [told(found.channel.topic, found.log_time_ns, found.ros_msg) for found in read_ros2_messages(path)]
+    return [content(found.channel.topic, found.log_time_ns, found.ros_msg) for found in read_ros2_messages(path)]
 
 
 def rosbags(path):
@@ -74,7 +74,7 @@ def rosbags(path):
 
     with AnyReader([Path(path)]) as reader:
         return [
-            told(connection.topic, log_time, reader.deserialize(data, connection.msgtype))
+            content(connection.topic, log_time, reader.deserialize(data, connection.msgtype))
             | {"durability": connection.ext.offered_qos_profiles[0].durability.name}
             for connection, log_time, data in reader.messages()
         ]

@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn clocks_and_versions_are_judged_hub_by_hub() {
+    fn clocks_and_versions_are_checked_per_hub() {
         const SECOND: i64 = 1_000_000_000;
         let of = |hubs: &[(u64, Result<i64, DatagramError>)]| check_hubs(&hubs.iter().copied().collect());
         let well = of(&[(1, Ok(SECOND)), (2, Ok(-4 * SECOND))]);

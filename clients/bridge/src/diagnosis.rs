@@ -108,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_of_zenoh_have_a_remedy() {
+    fn known_zenoh_errors_have_a_remedy() {
         for (words, finding, remedy) in [
             ("Unable to connect to tls/r:1! invalid peer certificate: Expired", "has expired", "renew"),
             ("Unable to connect to tls/r:1! invalid peer certificate: NotValidYet", "not valid yet", "clock"),

@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn the_flag_that_is_wrong_is_named() {
+    fn error_names_the_invalid_flag() {
         for (flag, value) in [("--namespace", "/robot1/"), ("--topic-prefix", "a b"), ("--frame", "front=1a")]
         {
             let failure = parse(&["--root", "/tmp", "--ros2", flag, value]).options().unwrap_err();

@@ -101,13 +101,13 @@ def main():
     deadline = time.monotonic() + 20
     while len(topics := graph()) < 6 + 5 * (len(echoes) - 1) + 1 and time.monotonic() < deadline:
         time.sleep(0.2)
-    heard = {name: [] for name in topics}
+    received = {name: [] for name in topics}
     attached = []
     subscribers = [
         ROS2Subscriber(
             name,
             topic["type"],
-            heard[name].append,
+            received[name].append,
             msg_definition=text(topic["type"]),
             type_hash=topic["hash"],
             qos=":1:,1:,:,:,," if topic["durability"] == "TRANSIENT_LOCAL" else None,
@@ -124,10 +124,10 @@ def main():
     for subscriber in subscribers:
         subscriber.close()
     time.sleep(0.5)
-    result = {"topics": topics, "heard": {name: len(messages) for name, messages in heard.items()}, "scans": {}}
+    result = {"topics": topics, "received": {name: len(messages) for name, messages in received.items()}, "scans": {}}
     for path, name in zip(echoes, scans):
         known = list(published(path).values())
-        messages = heard[name]
+        messages = received[name]
         # A message has the stamp of its first beam, and an echo that of the telegram's start. Their difference is the
         # same for every scan of a sensor. It is taken from the first message with the ranges of a scan.
         lag = next((scan["wall_ns"] - stamp_ns(m.header) for m in messages for scan in known if apart(m, scan)[1]), 0)
@@ -155,14 +155,14 @@ def main():
         "gids": len({Attachment.from_bytes(bytes_).gid for bytes_ in attached}),
         "length": sorted({len(bytes_) for bytes_ in attached}),
     }
-    for name, messages in heard.items():
+    for name, messages in received.items():
         if name.endswith("/verdict"):
             result.setdefault("verdicts", {})[name] = sorted({message.data for message in messages})
         if name.endswith("/tf_static") and messages:
             result["frames"] = [[t.header.frame_id, t.child_frame_id] for t in messages[-1].transforms]
         if name.endswith("/diagnostics"):
-            said = [status for message in messages for status in message.status]
-            result["diagnostics"] = sorted({(status.name, int(status.level), status.message) for status in said})
+            statuses = [status for message in messages for status in message.status]
+            result["diagnostics"] = sorted({(status.name, int(status.level), status.message) for status in statuses})
         if name.endswith("/zones"):
             result.setdefault("zones", {})[name] = sorted({len(message.markers) for message in messages})
     print(json.dumps(result))

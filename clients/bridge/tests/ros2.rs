@@ -85,7 +85,7 @@ fn free_port() -> u16 {
 }
 
 #[test]
-fn others_find_every_topic_and_decode_every_message() {
+fn ros2_client_discovers_and_decodes_every_topic() {
     let Some(python) = python() else {
         return skip("python-packages", "there is no zenoh-ros2-sdk: .ci/run installs it");
     };
@@ -165,7 +165,7 @@ fn check_scans(report: &Value, sensor: &str) {
 
 /// Checks that every other topic had messages, and checks the contents of the messages.
 fn check_others(report: &Value) {
-    for (name, count) in report["heard"].as_object().expect("counts") {
+    for (name, count) in report["received"].as_object().expect("counts") {
         assert!(count.as_u64() > Some(0), "{name}: {report:#}");
     }
     let attachments = &report["attachments"];
@@ -184,7 +184,7 @@ fn check_others(report: &Value) {
 /// Runs the bridge commands of the page on a port of this machine. The first bridge listens, and the others connect to
 /// it.
 #[test]
-fn the_examples_of_the_page_run() {
+fn examples_of_the_page_run() {
     let page =
         fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/ros2.md")).expect("the page");
     let lines: Vec<_> = page.lines().filter_map(|line| line.strip_prefix("scanhub bridge ")).collect();

@@ -173,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_error_is_a_failure_with_the_same_texts_and_back() {
+    fn error_and_failure_convert_without_loss() {
         for kind in [Kind::Failed, Kind::Configuration, Kind::NoHub, Kind::NameHeld, Kind::ResourceExhausted]
         {
             let failure = Failure::new(kind, "no \x1b port", "try \x07 another");
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn kinds_are_those_that_a_client_can_meet() {
+    fn failure_kinds_map_to_public_error_kinds() {
         let kind = |kind| Error::new(kind, "", "").kind();
         assert_eq!(kind(Kind::Configuration), ErrorKind::InvalidInput);
         assert_eq!(kind(Kind::Usage), ErrorKind::InvalidInput);
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn the_source_is_the_error_of_the_system() {
+    fn error_source_is_the_os_error() {
         let error = Error::new(Kind::ResourceExhausted, "no descriptor", "");
         assert!(error.source().is_none());
         let error = error.with_source(io::Error::from_raw_os_error(24));

@@ -300,7 +300,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn hub_is_checked_only_after_it_stops_sending() {
+    fn hub_is_checked_only_while_it_is_silent() {
         let domain = Domain::at("presence", std::path::Path::new("/tmp/presence")).unwrap();
         let mut finder = HubFinder::new(vec![domain.clone()]);
         finder.hub = Some(HolderProcess { domain, pid: 1, kind: DomainHolder::Hub });
@@ -314,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_hub_the_hubs_of_others_are_named() {
+    fn missing_hub_error_lists_hubs_of_other_users() {
         let hubs = |processes: &[(u32, u32, &str)]| {
             let root = tempfile::tempdir().unwrap();
             let put = |path: &str, text: &str| {
@@ -384,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn a_listener_does_not_come_because_a_hub_goes() {
+    fn exit_of_a_hub_does_not_count_as_listener_start() {
         let domain = Domain::at("presence", std::path::Path::new("/tmp/presence")).unwrap();
         let holder = |pid, who| Some(HolderProcess { domain: domain.clone(), pid, kind: who });
         let (hub, other, listener) =

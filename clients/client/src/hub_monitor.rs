@@ -285,7 +285,7 @@ mod tests {
     const NO_WAIT: Timespec = Timespec { tv_sec: 0, tv_nsec: 0 };
 
     #[test]
-    fn each_directory_on_the_way_to_a_hub_is_a_change() {
+    fn creation_of_each_parent_directory_is_a_change() {
         let base = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
         let locations = [Domain::at("lab", &base.path().join("a/b")).unwrap()];
         let mut monitor = monitor();
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn files_of_others_make_it_pause() {
+    fn unrelated_files_pause_the_directory_watch() {
         let base = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
         let locations = [Domain::at("lab", base.path()).unwrap()];
         let mut monitor = monitor();
@@ -349,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_a_hub_is_a_change_once() {
+    fn exit_of_a_hub_is_reported_once() {
         let mut monitor = monitor();
         let mut hub = Command::new("sleep").arg("600").spawn().unwrap();
         assert!(!monitor.watch_hub(hub.id()) && !becomes_readable(&monitor, NO_WAIT));

@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_of_two_runs_are_no_pair() {
+    fn samples_of_different_hub_runs_are_not_paired() {
         let mut join = Join::default();
         assert_eq!(join.first(&header(1, 7), 'a', 0), None);
         assert_eq!(join.first(&header(2, 0), 'c', 0), None);

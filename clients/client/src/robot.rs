@@ -375,7 +375,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn remote_sensors_without_number_are_one_unknown_part() {
+    fn surplus_remote_sensors_are_one_unknown_part() {
         let mut source = RobotSource::new(&[]);
         source.origin = SensorOrigin::All(Some(DomainHolder::Listener));
         for n in 0..1000 {
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn remote_sensors_yield_to_a_hub_but_not_vice_versa() {
+    fn robot_switches_from_remote_sensors_to_a_hub() {
         let mut source = RobotSource::new(&[]);
         assert!(!source.switch_to_hub(Some(DomainHolder::Hub)), "there is no sensor yet");
         source.origin = SensorOrigin::All(Some(DomainHolder::Listener));

@@ -357,7 +357,7 @@ mod tests {
     const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 
     #[test]
-    fn the_time_makes_it_readable_once() {
+    fn timer_makes_poll_descriptor_readable_once() {
         let poll_descriptor = PollDescriptor::new().unwrap();
         assert!(is_readable(&poll_descriptor, TEST_TIMEOUT), "it was not checked yet");
         poll_descriptor.set_timer(Some(TEST_TIMEOUT)).unwrap();
@@ -375,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn events_come_and_go() {
+    fn closed_descriptor_leaves_the_poll_set() {
         let poll_descriptor = PollDescriptor::new().unwrap();
         poll_descriptor.set_timer(Some(TEST_TIMEOUT)).unwrap();
         let (read, mut write) = pipe().unwrap();

@@ -287,7 +287,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_status_shows_the_reason() {
+    fn status_gives_the_reason_for_a_silence() {
         let of = |state: State, error: &str| {
             let mut status = Status { state: state as u8, ..Status::default() };
             status.set_last_error(error);
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_exist_are_the_remedy() {
+    fn remedy_lists_available_sensors_and_topics() {
         let published = |names: &[(&str, Topic)]| {
             names.iter().map(|(sensor, topic)| ((*sensor).to_owned(), *topic)).collect::<Vec<_>>()
         };

@@ -228,7 +228,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gaps_count_and_another_hub_begins_at_0() {
+    fn counts_gaps_and_expects_0_after_a_hub_restart() {
         let mut numbers = SequenceTracker::default();
         let mut note = |boot, topic_seq, flags| {
             let SequenceGap { missed, restarted } =

@@ -339,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn each_way_wakes_for_every_sensor() {
+    fn each_wait_method_wakes_for_every_sensor() {
         for (wait, name) in [(Wait::Doorbell, "bell"), (Wait::Event, "event"), (Wait::Spin, "spin")] {
             SUBSCRIBED_TOPICS.into_iter().for_each(|topics| wakes_for_every_sensor(wait, name, topics));
         }
@@ -366,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bell_of_a_hub_that_ended_is_exchanged() {
+    fn doorbell_of_an_exited_hub_is_replaced() {
         let domain = TestDomain::new("ended");
         let hub = scanhub_shm::hub_node(&domain.1).unwrap();
         let node = scanhub_shm::join(&domain.1, Role::Subscriber).unwrap();
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn an_event_that_is_made_later_is_listened_to() {
+    fn listener_attaches_to_an_event_created_later() {
         let domain = TestDomain::new("later");
         let hub = scanhub_shm::hub_node(&domain.1).unwrap();
         let node = scanhub_shm::join(&domain.1, Role::Subscriber).unwrap();
@@ -430,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn where_words_cannot_be_waited_for_the_event_wakes() {
+    fn event_wakes_if_doorbell_is_unsupported() {
         let domain = TestDomain::new("turn");
         let hub = scanhub_shm::hub_node(&domain.1).unwrap();
         let node = scanhub_shm::join(&domain.1, Role::Subscriber).unwrap();

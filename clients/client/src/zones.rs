@@ -25,9 +25,9 @@ use crate::topic_reader::TopicReader;
 /// fn main() -> Result<(), Error> {
 ///     let mut front = zones("front")?;
 ///     loop {
-///         let heard = front.next()?;
+///         let update = front.next()?;
 ///         // An unknown verdict counts as a stop.
-///         let may_go = matches!(heard.zones.verdict(), Verdict::Clear | Verdict::Slow);
+///         let may_go = matches!(update.zones.verdict(), Verdict::Clear | Verdict::Slow);
 ///         println!("may go: {may_go}");
 ///     }
 /// }
@@ -409,7 +409,7 @@ mod tests {
     const PERIOD_US: u32 = 26_640;
 
     #[test]
-    fn one_word_per_silence() {
+    fn silence_is_reported_once() {
         let mut freshness = StalenessTimer::new(at(0));
         freshness.update(&header(100, PERIOD_US), Verdict::Clear, at(100));
         assert_eq!(freshness.time_left(at(100)), Some(Duration::from_micros(93_280)));
@@ -443,7 +443,7 @@ mod tests {
     }
 
     #[test]
-    fn time_passes_while_the_machine_is_suspended() {
+    fn time_of_suspension_makes_a_verdict_stale() {
         let mut freshness = StalenessTimer::new(at(0));
         freshness.update(&header(100, PERIOD_US), Verdict::Clear, at(100));
         let resumed = Timestamp { boottime_ns: 3_600_000 * MS, ..at(110) };
@@ -452,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn a_network_has_half_a_second_at_least() {
+    fn remote_verdict_is_valid_for_at_least_500_ms() {
         let mut freshness = StalenessTimer::new(at(0));
         for (period_us, limit_ms) in [(0, 500), (PERIOD_US, 500), (230_000, 500), (1_000_000, 2040)] {
             let remote = Header { flags: Flags::REMOTE, ..header(100, period_us) };
@@ -462,7 +462,7 @@ mod tests {
     }
 
     #[test]
-    fn headers_that_say_nonsense() {
+    fn invalid_header_times_do_not_overflow() {
         let mut freshness = StalenessTimer::new(at(0));
         freshness.update(&header(100, 0), Verdict::Clear, at(100));
         assert!(!freshness.silence(at(599)) && freshness.silence(at(600)));
@@ -536,7 +536,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_beam_is_that_of_the_nearest_point() {
+    fn nearest_beam_and_range_are_of_the_nearest_point() {
         let mut warned = EarlyState::new();
         warned.update(&zones(0), Some(&scan_header("1:7")));
         let stop = warned.warn(&STOP, &scan_header("1:8")).expect("a warning");
@@ -546,7 +546,7 @@ mod tests {
     }
 
     #[test]
-    fn a_warning_never_makes_it_better() {
+    fn warning_never_improves_the_verdict() {
         let mut warned = EarlyState::new();
         let slow = Early { verdict: Verdict::Slow as u8, ..STOP };
         for verdict in Verdict::ALL {

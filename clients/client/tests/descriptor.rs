@@ -86,7 +86,7 @@ fn idle_hub_rarely_wakes_the_subscriber() {
 }
 
 #[test]
-fn history_for_a_late_joiner_makes_it_readable() {
+fn history_makes_late_joiner_readable() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     hub.front_sensor().publish_status(|status| status.baud = 500_000);
@@ -100,7 +100,7 @@ fn history_for_a_late_joiner_makes_it_readable() {
 }
 
 #[test]
-fn a_verdict_that_gets_too_old_makes_it_readable() {
+fn stale_verdict_makes_descriptor_readable() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap();
@@ -143,7 +143,7 @@ fn pollable_robot_is_readable_on_a_verdict_change() {
 }
 
 #[test]
-fn it_is_closed_on_exec() {
+fn descriptor_is_closed_on_exec() {
     let test_domain = TestDomain::new();
     let scans = scans(&test_domain);
     let flags = rustix::io::fcntl_getfd(&scans).unwrap();
@@ -167,7 +167,7 @@ fn samples_are_taken_while_the_descriptor_is_borrowed() {
 }
 
 #[test]
-fn a_pollable_subscriber_can_wait_too() {
+fn pollable_subscriber_can_wait_too() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut scans = scans(&test_domain);
@@ -202,7 +202,7 @@ fn without_a_hub_poll_times_out() {
 }
 
 #[test]
-fn files_of_others_wake_it_at_most_once_a_second() {
+fn unrelated_files_wake_at_most_once_per_second() {
     let test_domain = TestDomain::new();
     let scans = scans(&test_domain);
     assert!(scans.try_next().unwrap().is_none());
@@ -224,7 +224,7 @@ fn files_of_others_wake_it_at_most_once_a_second() {
 }
 
 #[test]
-fn a_hub_that_starts_makes_it_readable() {
+fn hub_start_makes_descriptor_readable() {
     let test_domain = TestDomain::new();
     let scans = scans(&test_domain);
     assert!(scans.try_next().unwrap().is_none() && !is_readable(&scans, Duration::ZERO));
@@ -252,7 +252,7 @@ fn unknown_sensor_rarely_wakes_the_subscriber() {
 }
 
 #[test]
-fn a_silence_is_measured_from_the_last_sample() {
+fn silence_is_measured_from_the_last_sample() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let scans = scans(&test_domain);

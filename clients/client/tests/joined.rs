@@ -53,7 +53,7 @@ fn samples_of_one_telegram_are_a_pair_in_any_order() {
 }
 
 #[test]
-fn a_sample_without_a_partner_is_dropped_and_counted() {
+fn sample_without_a_partner_is_dropped_and_counted() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut pairs = attach(&test_domain, &mut hub);
@@ -71,7 +71,7 @@ fn a_sample_without_a_partner_is_dropped_and_counted() {
 }
 
 #[test]
-fn pairs_that_the_program_was_too_slow_for_are_missed() {
+fn pairs_beyond_the_queue_count_as_missed() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut pairs = attach(&test_domain, &mut hub);
@@ -94,7 +94,7 @@ fn pairs_that_the_program_was_too_slow_for_are_missed() {
 }
 
 #[test]
-fn a_sample_waits_for_one_period() {
+fn unpaired_sample_is_kept_for_one_period() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut pairs = attach(&test_domain, &mut hub);

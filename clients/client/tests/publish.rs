@@ -86,7 +86,7 @@ fn samples_that_are_sent_together_wake_once() {
 }
 
 #[test]
-fn another_life_begins_again() {
+fn reopened_publisher_restarts_its_numbers() {
     let test_domain = TestDomain::new();
     let open = || {
         PublishSession::open(&test_domain.domain, &[Topic::Marks], TopicLimits::default())
@@ -128,7 +128,7 @@ fn refused_duplicate_topic_does_not_break_wakeups() {
 }
 
 #[test]
-fn telegrams_have_the_length_that_they_have() {
+fn telegrams_have_variable_length_up_to_the_limit() {
     let test_domain = TestDomain::new();
     let session = PublishSession::open(&test_domain.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
     let mut bytes = session.sensor("tracker.near").unwrap().topic::<[u8]>().unwrap();

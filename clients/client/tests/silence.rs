@@ -32,7 +32,7 @@ fn await_reason(scans: &mut Subscriber<Scan>, is_expected: impl Fn(&Silence) -> 
 }
 
 #[test]
-fn without_a_hub_it_says_so() {
+fn missing_hub_is_the_reason_for_a_silence() {
     let test_domain = TestDomain::new();
     let mut scans = scans(&test_domain, "front");
     let silence = scans.why_silent();
@@ -55,7 +55,7 @@ fn mistyped_sensor_is_unknown_and_remedy_lists_names() {
 }
 
 #[test]
-fn the_state_of_the_link_is_the_reason() {
+fn state_of_the_link_is_the_reason() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut scans = scans(&test_domain, "front");
@@ -88,7 +88,7 @@ fn the_state_of_the_link_is_the_reason() {
 }
 
 #[test]
-fn a_robot_has_the_reason_of_its_first_unknown_sensor() {
+fn robot_has_the_reason_of_its_first_unknown_sensor() {
     let test_domain = TestDomain::new();
     let robot =
         |sensors: &[&str]| RobotSubscriber::builder(sensors).in_domain(&test_domain.domain).open().unwrap();
@@ -118,7 +118,7 @@ fn a_robot_has_the_reason_of_its_first_unknown_sensor() {
 }
 
 #[test]
-fn a_robot_of_a_hub_without_zones_says_so() {
+fn missing_zones_are_the_reason_for_robot_silence() {
     let test_domain = TestDomain::new();
     let mut robot = RobotSubscriber::builder(&[]).in_domain(&test_domain.domain).open().unwrap();
     let lock = scanhub_shm::HubLock::acquire(test_domain.domain.root()).unwrap();
@@ -138,7 +138,7 @@ fn a_robot_of_a_hub_without_zones_says_so() {
 }
 
 #[test]
-fn a_topic_that_the_hub_does_not_publish_is_unknown() {
+fn topic_that_the_hub_does_not_publish_is_unknown() {
     let test_domain = TestDomain::new();
     let lock = scanhub_shm::HubLock::acquire(test_domain.domain.root()).unwrap();
     let node = scanhub_shm::hub_node(&test_domain.domain).unwrap();
@@ -154,7 +154,7 @@ fn a_topic_that_the_hub_does_not_publish_is_unknown() {
 }
 
 #[test]
-fn a_restarted_hub_without_the_sensor_is_the_reason() {
+fn restarted_hub_without_the_sensor_is_the_reason() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut scans = scans(&test_domain, "front");
@@ -180,7 +180,7 @@ fn a_restarted_hub_without_the_sensor_is_the_reason() {
 }
 
 #[test]
-fn the_state_of_the_last_hub_is_not_the_reason() {
+fn state_of_the_last_hub_is_not_the_reason() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut scans = scans(&test_domain, "front");
@@ -205,7 +205,7 @@ fn the_state_of_the_last_hub_is_not_the_reason() {
 }
 
 #[test]
-fn a_topic_without_a_place_is_full() {
+fn missing_subscriber_slot_is_the_reason() {
     let test_domain = TestDomain::new();
     let lock = scanhub_shm::HubLock::acquire(test_domain.domain.root()).unwrap();
     let node = scanhub_shm::hub_node(&test_domain.domain).unwrap();
@@ -229,7 +229,7 @@ fn a_topic_without_a_place_is_full() {
 }
 
 #[test]
-fn a_domain_of_another_user_is_named() {
+fn domain_of_another_user_is_named() {
     if !rustix::process::getuid().is_root() {
         eprintln!("skipped: only root can make a directory of another user");
         return;
@@ -249,7 +249,7 @@ fn a_domain_of_another_user_is_named() {
 }
 
 #[test]
-fn it_is_cheap_enough_for_once_a_second() {
+fn why_silent_takes_less_than_200_ms() {
     let test_domain = TestDomain::new();
     let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let [mut known, mut unknown] = ["front", "frnot"].map(|sensor| scans(&test_domain, sensor));

@@ -12,7 +12,7 @@ use scanhub_schema::limits::MAX_BORROWED_SAMPLES;
 const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 
 #[test]
-fn a_builder_finds_the_hub_by_domain_and_root() {
+fn builder_finds_the_hub_by_domain_and_root() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     for wait in [Wait::Doorbell, Wait::Event, Wait::Spin] {
@@ -28,14 +28,14 @@ fn a_builder_finds_the_hub_by_domain_and_root() {
 }
 
 #[test]
-fn a_builder_refuses_impossible_names() {
+fn builder_refuses_impossible_names() {
     let kind = |builder: SubscriberBuilder<Scan>| builder.open().map(drop).unwrap_err().kind();
     assert_eq!(kind(Subscriber::builder("front/scan")), ErrorKind::InvalidInput);
     assert_eq!(kind(Subscriber::builder("front").domain("a b")), ErrorKind::InvalidInput);
 }
 
 #[test]
-fn telegrams_are_bytes() {
+fn telegram_sample_has_the_published_bytes() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let builder = Subscriber::<Telegram>::builder("front").in_domain(&test_domain.domain);
@@ -73,7 +73,7 @@ fn four_samples_can_be_held_and_the_fifth_is_refused() {
 }
 
 #[test]
-fn a_held_sample_stays_valid_after_the_hub_has_ended() {
+fn held_sample_stays_valid_after_the_hub_has_ended() {
     let test_domain = TestDomain::new();
     let mut scans = Subscriber::<Scan>::builder("front")
         .in_domain(&test_domain.domain)
@@ -96,7 +96,7 @@ fn a_held_sample_stays_valid_after_the_hub_has_ended() {
 }
 
 #[test]
-fn an_iterator_ends_after_a_silence_and_continues() {
+fn iterator_ends_after_a_silence_and_continues() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let builder = Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain);

@@ -20,7 +20,7 @@ const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 fn is_send<T: Send>() {}
 
 #[test]
-fn all_types_of_the_interface_are_send() {
+fn all_public_types_are_send() {
     is_send::<Subscriber<Scan>>();
     is_send::<Subscriber<Telegram>>();
     is_send::<Received<Scan>>();
@@ -42,7 +42,7 @@ fn attach<S: Service>(test_domain: &TestDomain) -> (scanhub_shm::Node<S>, scanhu
 }
 
 #[test]
-fn both_kinds_of_service_attach_to_one_hub() {
+fn local_and_thread_safe_services_attach_to_a_hub() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let local = attach::<LocalService>(&test_domain);
@@ -61,7 +61,7 @@ fn both_kinds_of_service_attach_to_one_hub() {
 }
 
 #[test]
-fn a_subscriber_and_its_samples_move_between_threads() {
+fn subscriber_and_its_samples_move_between_threads() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut scans = Subscriber::<Scan>::builder("front")
@@ -90,7 +90,7 @@ fn a_subscriber_and_its_samples_move_between_threads() {
 }
 
 #[test]
-fn a_publication_moves_to_another_thread() {
+fn publication_moves_to_another_thread() {
     let test_domain = TestDomain::new();
     let mut near = Publication::<Marks>::in_domain(&test_domain.domain, "tracker.near").unwrap();
     let mut marks = Subscriber::<Marks>::builder("tracker.near")

@@ -30,7 +30,7 @@ fn scans(test_domain: &TestDomain) -> PollableSubscriber<Scan> {
 
 /// Another thread sends scans while the waits are canceled: before a scan, while it is sent, and after it.
 #[test]
-fn a_thousand_cancelled_waits_lose_no_sample() {
+fn thousand_cancelled_waits_lose_no_sample() {
     let test_domain = TestDomain::new();
     let (is_done, received) = (AtomicBool::new(false), AtomicU64::new(0));
     let mut scans = scans(&test_domain);
@@ -74,7 +74,7 @@ fn a_thousand_cancelled_waits_lose_no_sample() {
 }
 
 #[tokio::test]
-async fn a_stream_in_another_task_wakes_for_each_sample() {
+async fn stream_in_another_task_wakes_for_each_sample() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut scans = scans(&test_domain);
@@ -123,7 +123,7 @@ async fn receives_while_an_async_fd_borrows_the_subscriber() {
 }
 
 #[tokio::test]
-async fn zones_are_a_stream_with_silences() {
+async fn zones_stream_reports_silences() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap();
@@ -142,7 +142,7 @@ async fn zones_are_a_stream_with_silences() {
 }
 
 #[test]
-fn a_stream_moves_to_another_runtime() {
+fn stream_moves_to_another_runtime() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let mut scans = scans(&test_domain);
@@ -161,7 +161,7 @@ fn a_stream_moves_to_another_runtime() {
 }
 
 #[test]
-fn a_stream_without_a_runtime_says_so() {
+fn stream_without_a_tokio_runtime_is_an_error() {
     let test_domain = TestDomain::new();
     let mut scans = scans(&test_domain);
     let waker = std::task::Waker::noop();
@@ -174,7 +174,7 @@ fn a_stream_without_a_runtime_says_so() {
 const EXAMPLE_VARIABLE: &str = "SCANHUB_TEST_EXAMPLE";
 
 #[test]
-fn the_example_runs_until_ctrl_c() {
+fn example_runs_until_ctrl_c() {
     if std::env::var_os(EXAMPLE_VARIABLE).is_some() {
         return example::main().unwrap();
     }
@@ -184,7 +184,7 @@ fn the_example_runs_until_ctrl_c() {
     let domain = Domain::at(test_domain.domain.name(), &base).unwrap();
     let mut hub = FakeHub::new(&domain, &["front", "rear"], 1);
     let mut child = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "the_example_runs_until_ctrl_c", "--nocapture"])
+        .args(["--exact", "example_runs_until_ctrl_c", "--nocapture"])
         .envs([(EXAMPLE_VARIABLE, Path::new("1")), ("SCANHUB_DOMAIN", Path::new(domain.name()))])
         .envs([("XDG_RUNTIME_DIR", &test_domain.base)])
         .stdout(Stdio::piped())

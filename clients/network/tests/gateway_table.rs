@@ -298,7 +298,7 @@ impl SimulatedNetwork {
 }
 
 #[test]
-fn table_agrees_with_a_model_that_keeps_everything() {
+fn table_agrees_with_an_unbounded_model() {
     let (mut refused, mut full, mut evicted, mut evicted_active) = (BTreeMap::new(), 0, 0, 0);
     for seed in 0..20 {
         let mut world = SimulatedNetwork::new(seed);

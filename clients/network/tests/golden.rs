@@ -10,7 +10,7 @@ use scanhub_schema::datagram::{Datagram, DatagramError, HEADER_LEN, Head, MTU_SA
 use vectors::{Vector, bytes, vectors};
 
 #[test]
-fn receiver_accepts_or_refuses_them() {
+fn receiver_treats_golden_datagrams_as_listed() {
     let zones = bytes("zones");
     let zones = Datagram::read(&zones).unwrap();
     for Vector { name, bytes: datagram, description } in vectors() {

@@ -243,7 +243,7 @@ fn scan() -> Vec<u8> {
 }
 
 #[test]
-fn values_are_these_bytes() {
+fn keyed_datagrams_match_golden_bytes() {
     let (built, golden) = (vector_list(), text());
     for (number, (built, golden)) in built.lines().zip(golden.lines()).enumerate() {
         assert_eq!(built, golden, "line {number}");
@@ -252,7 +252,7 @@ fn values_are_these_bytes() {
 }
 
 #[test]
-fn receiver_handles_them_as_listed() {
+fn receiver_handles_keyed_datagrams_as_listed() {
     let keyed = read_vectors();
     let key = Key::new(&unhex(&keyed.key).try_into().expect("the length of a key"));
     let mut incoming = Incoming::with_key(&Topic::ALL, key.clone(), Default::default());

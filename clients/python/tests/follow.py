@@ -11,7 +11,7 @@ import scanhub
 
 
 def stamp(sample: scanhub.Sample) -> dict:
-    said = {
+    line = {
         "class": sample.topic,
         "sensor": sample.sensor,
         "seq": sample.seq,
@@ -22,8 +22,8 @@ def stamp(sample: scanhub.Sample) -> dict:
         "quality": sample.quality,
     }
     if sample.reasons:
-        said["reasons"] = list(sample.reasons)
-    return said
+        line["reasons"] = list(sample.reasons)
+    return line
 
 
 def flags(sample: scanhub.Sample) -> dict:
@@ -33,9 +33,9 @@ def flags(sample: scanhub.Sample) -> dict:
 
 def telegram(sample: scanhub.Telegram) -> dict:
     if sample.family != "lms":
-        said = {"family": sample.family, "kind": "data", "checked": True, "packets": sample.packets}
+        line = {"family": sample.family, "kind": "data", "checked": True, "packets": sample.packets}
         assert sample.address is sample.command is sample.length is None
-        return {**said, "length": len(sample.data), "data": sample.data.tobytes().hex()}
+        return {**line, "length": len(sample.data), "data": sample.data.tobytes().hex()}
     fields = ("address", "command", "length")
     return {**{name: getattr(sample, name) for name in fields}, "data": sample.data.tobytes().hex()}
 
@@ -45,17 +45,17 @@ def in_degrees(angle: "float | None") -> "float | None":
 
 
 def scan(sample: scanhub.Scan) -> dict:
-    said = {name: getattr(sample, name) for name in ("family", "unit_um", "count", "beam_time_ns")}
-    said["first_angle_deg"], said["step_deg"] = in_degrees(sample.first_angle), in_degrees(sample.step)
-    said["ranges"] = [int(range) if valid else None for range, valid in zip(sample.ranges, sample.valid)]
-    said["codes"] = [[beam, word] for beam, word in sample.codes if word != "not_measured"]
+    line = {name: getattr(sample, name) for name in ("family", "unit_um", "count", "beam_time_ns")}
+    line["first_angle_deg"], line["step_deg"] = in_degrees(sample.first_angle), in_degrees(sample.step)
+    line["ranges"] = [int(range) if valid else None for range, valid in zip(sample.ranges, sample.valid)]
+    line["codes"] = [[beam, word] for beam, word in sample.codes if word != "not_measured"]
     if sample.intensities is not None:
-        said["intensities"] = sample.intensities.tolist()
+        line["intensities"] = sample.intensities.tolist()
     if sample.exact_angles is not None:
         pairs = zip(sample.angles, sample.valid)
-        said["angles_deg"] = [round(math.degrees(angle), 4) if valid else None for angle, valid in pairs]
-        said["collisions"] = sample.collisions
-    return {**said, **({"incomplete": True} if sample.incomplete else {})}
+        line["angles_deg"] = [round(math.degrees(angle), 4) if valid else None for angle, valid in pairs]
+        line["collisions"] = sample.collisions
+    return {**line, **({"incomplete": True} if sample.incomplete else {})}
 
 
 def marks(sample: scanhub.Marks) -> dict:
@@ -68,8 +68,8 @@ def lines(sample: scanhub.Lines) -> dict:
         # Rounds halves away from 0, as Rust does.
         return math.copysign(math.floor(abs(value) * 1e6 + 0.5), value) / 1e6
 
-    said = {"readings": sample.readings, "points": sample.on_lines, "noise_m": metres(sample.noise_m)}
-    said["overflow"] = sample.overflow
+    fields = {"readings": sample.readings, "points": sample.on_lines, "noise_m": metres(sample.noise_m)}
+    fields["overflow"] = sample.overflow
     found = []
     for line in sample.lines:
         of = {name: metres(getattr(line, name)) for name in ("x1_m", "y1_m", "x2_m", "y2_m", "r_m", "sd_r_m")}
@@ -80,37 +80,37 @@ def lines(sample: scanhub.Lines) -> dict:
         {"x_m": metres(at.x_m), "y_m": metres(at.y_m), "first": at.first_line, "second": at.second_line}
         for at in sample.corners
     ]
-    return {**said, "lines": found, "corners": corners}
+    return {**fields, "lines": found, "corners": corners}
 
 
 def motion(sample: scanhub.Motion) -> dict:
     def millionths(value: float | None) -> float | None:
         return None if value is None else math.copysign(math.floor(abs(value) * 1e6 + 0.5), value) / 1e6
 
-    said = {name: getattr(sample, name) for name in ("method", "valid", "degenerate", "refused_steps")}
+    line = {name: getattr(sample, name) for name in ("method", "valid", "degenerate", "refused_steps")}
     step, place = sample.step or (None,) * 3, sample.place or (None,) * 3
-    said["dx_m"], said["dy_m"], said["dyaw_deg"] = millionths(step[0]), millionths(step[1]), in_degrees(step[2])
-    said["x_m"], said["y_m"], said["yaw_deg"] = millionths(place[0]), millionths(place[1]), in_degrees(place[2])
-    said["overlap"] = millionths(sample.overlap)
+    line["dx_m"], line["dy_m"], line["dyaw_deg"] = millionths(step[0]), millionths(step[1]), in_degrees(step[2])
+    line["x_m"], line["y_m"], line["yaw_deg"] = millionths(place[0]), millionths(place[1]), in_degrees(place[2])
+    line["overlap"] = millionths(sample.overlap)
     for name in ("covariance", "pose_covariance"):
         covariance = getattr(sample, name)
         # The shortest decimal number that rounds to this 32-bit value.
-        said[name] = None if covariance is None else [float(str(value)) for value in covariance.flat]
-    return said
+        line[name] = None if covariance is None else [float(str(value)) for value in covariance.flat]
+    return line
 
 
 def tracks(sample: scanhub.Tracks) -> dict:
     def track(of: scanhub.Track) -> dict:
-        said = of._asdict()
-        said.update({name: rounded(said[name], 3) for name in ("x_m", "y_m", "vx_m_s", "vy_m_s", "score")})
-        return {**said, "cov": [rounded(value, 6) for value in of.cov], "sensors": list(of.sensors)}
+        line = of._asdict()
+        line.update({name: rounded(line[name], 3) for name in ("x_m", "y_m", "vx_m_s", "vy_m_s", "score")})
+        return {**line, "cov": [rounded(value, 6) for value in of.cov], "sensors": list(of.sensors)}
 
     return {"tracks": [track(of) for of in sample.tracks]}
 
 
 def events(sample: scanhub.Event) -> dict:
-    said = {"class": "event", "kind": sample.kind, "id": sample.id, "room": sample.room}
-    return said if sample.door is None else {**said, "from": sample.from_room, "to": sample.to_room, "door": sample.door}
+    line = {"class": "event", "kind": sample.kind, "id": sample.id, "room": sample.room}
+    return line if sample.door is None else {**line, "from": sample.from_room, "to": sample.to_room, "door": sample.door}
 
 
 def rounded(value: float, digits: int) -> float:
@@ -120,8 +120,8 @@ def rounded(value: float, digits: int) -> float:
 
 def tilt(sample: scanhub.Tilt) -> dict:
     rate = sample.rate_rad_s
-    said = {"angle_deg": rounded(math.degrees(sample.angle_rad), 4)}
-    return {**said, "rate_deg_s": None if rate is None else rounded(math.degrees(rate), 4)}
+    line = {"angle_deg": rounded(math.degrees(sample.angle_rad), 4)}
+    return {**line, "rate_deg_s": None if rate is None else rounded(math.degrees(rate), 4)}
 
 
 def swept(sample: scanhub.Cloud | scanhub.Obstacles) -> dict:
@@ -129,47 +129,47 @@ def swept(sample: scanhub.Cloud | scanhub.Obstacles) -> dict:
 
 
 def cloud(sample: scanhub.Cloud) -> dict:
-    said = {**swept(sample), "first": sample.first, "last": sample.last}
+    line = {**swept(sample), "first": sample.first, "last": sample.last}
     points = [[rounded(float(value), 3) for value in point] for point in sample.points]
-    return {**said, "points": points, "beams": sample.beams.tolist(), "classes": sample.classes.tolist()}
+    return {**line, "points": points, "beams": sample.beams.tolist(), "classes": sample.classes.tolist()}
 
 
 def obstacles(sample: scanhub.Obstacles) -> dict:
     def obstacle(of: scanhub.Obstacle) -> dict:
-        said = of._asdict()
-        said.update({name: rounded(said[name], 3) for name in ("x_m", "y_m", "z_m", "distance_m")})
-        said.update({name: [rounded(value, 3) for value in said[name]] for name in ("low_m", "high_m")})
-        return said
+        line = of._asdict()
+        line.update({name: rounded(line[name], 3) for name in ("x_m", "y_m", "z_m", "distance_m")})
+        line.update({name: [rounded(value, 3) for value in line[name]] for name in ("low_m", "high_m")})
+        return line
 
-    said = {**swept(sample), "dropped": sample.dropped}
-    return {**said, "obstacles": [obstacle(of) for of in sample.obstacles]}
+    line = {**swept(sample), "dropped": sample.dropped}
+    return {**line, "obstacles": [obstacle(of) for of in sample.obstacles]}
 
 
 def zones(sample: scanhub.Zones) -> dict:
-    said = {name: getattr(sample, name) for name in ("verdict", "nearest_mm", "nearest_beam", "invalid_beams")}
-    said["zones"] = [zone._asdict() for zone in sample.zones]
-    said.update({name: True for name in ("provisional", "stale") if getattr(sample, name)})
-    return said
+    line = {name: getattr(sample, name) for name in ("verdict", "nearest_mm", "nearest_beam", "invalid_beams")}
+    line["zones"] = [zone._asdict() for zone in sample.zones]
+    line.update({name: True for name in ("provisional", "stale") if getattr(sample, name)})
+    return line
 
 
 def foreground(sample: scanhub.Foreground) -> dict:
-    said = {name: getattr(sample, name) for name in ("generation", "unit_mm", "dropped")}
-    said["beams"], said["ranges"] = sample.beams.tolist(), sample.ranges.tolist()
-    return {**said, "segments": [segment._asdict() for segment in sample.segments]}
+    line = {name: getattr(sample, name) for name in ("generation", "unit_mm", "dropped")}
+    line["beams"], line["ranges"] = sample.beams.tolist(), sample.ranges.tolist()
+    return {**line, "segments": [segment._asdict() for segment in sample.segments]}
 
 
 def background(sample: scanhub.Background) -> dict:
-    said = {name: getattr(sample, name) for name in ("generation", "known_beams", "unit_mm", "count", "frozen")}
-    said["first_angle_deg"], said["step_deg"] = in_degrees(sample.first_angle), in_degrees(sample.step)
-    said["ranges"] = [None if range in (0, 65535) else int(range) for range in sample.ranges]
-    said["far"] = [beam for beam, range in enumerate(sample.ranges) if range == 65535]
-    return said
+    line = {name: getattr(sample, name) for name in ("generation", "known_beams", "unit_mm", "count", "frozen")}
+    line["first_angle_deg"], line["step_deg"] = in_degrees(sample.first_angle), in_degrees(sample.step)
+    line["ranges"] = [None if range in (0, 65535) else int(range) for range in sample.ranges]
+    line["far"] = [beam for beam, range in enumerate(sample.ranges) if range == 65535]
+    return line
 
 
 def status(sample: scanhub.Status) -> dict:
     names = ("state", "family", "model", "baud", "mode", "type", "unit_mm", "angle_deg", "step_deg", "hz", "port", "since_ns")
-    said = {name: getattr(sample, name) for name in (*names, "counters", "last_error", "damaged", "lost_on_line")}
-    return {**said, "pose": sample.pose._asdict()}
+    line = {name: getattr(sample, name) for name in (*names, "counters", "last_error", "damaged", "lost_on_line")}
+    return {**line, "pose": sample.pose._asdict()}
 
 
 def say(line: dict) -> None:

@@ -36,18 +36,18 @@ def who_comes_while_another_goes_has_a_place() -> None:
 
 
 def a_child_does_not_keep_the_name_of_one_that_is_killed() -> None:
-    (said, say), (lives, ends) = os.pipe(), os.pipe()
+    (ready_read, ready_write), (lives, ends) = os.pipe(), os.pipe()
     parent = os.fork()
     if parent == 0:
         os.close(ends)
         mount = publish()
         if os.fork() == 0:
-            os.write(say, b"!")
+            os.write(ready_write, b"!")
             # Until the test ends it.
             os.read(lives, 1)
             os._exit(0)
         signal.pause()
-    assert os.read(said, 1) == b"!"
+    assert os.read(ready_read, 1) == b"!"
     os.kill(parent, signal.SIGKILL)
     assert os.waitpid(parent, 0)[1] == signal.SIGKILL
     publish().close()

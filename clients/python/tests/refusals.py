@@ -36,16 +36,16 @@ def names_that_are_none() -> None:
     refusal(scanhub.NoTopic, scanhub.subscribe)
     for name in ("", "A", "a_b", "a/b", "a" * 17):
         refusal(scanhub.Impossible, lambda: scanhub.subscribe("front/scan", domain=name))
-    said = refusal(scanhub.Impossible, lambda: scanhub.subscribe("front/scan", root="/" + "b" * 60))
-    assert "too long" in said.message
+    failure = refusal(scanhub.Impossible, lambda: scanhub.subscribe("front/scan", root="/" + "b" * 60))
+    assert "too long" in failure.message
     refusal(scanhub.Impossible, lambda: scanhub.background("front", "paint"))
     refusal(scanhub.Impossible, lambda: scanhub.control("front", "show"))
 
 
 def no_hub() -> None:
     begin = time.monotonic()
-    said = refusal(scanhub.NoHub, lambda: follow("front/scan", timeout=0.3))
-    assert "scanhub run" in said.remedy and root in said.remedy and time.monotonic() - begin < 10
+    failure = refusal(scanhub.NoHub, lambda: follow("front/scan", timeout=0.3))
+    assert "scanhub run" in failure.remedy and root in failure.remedy and time.monotonic() - begin < 10
     for ask in (scanhub.sensors, scanhub.topics, lambda **place: scanhub.background("front", **place)):
         refusal(scanhub.NoHub, lambda: ask(domain=domain, root=root))
 
@@ -61,7 +61,7 @@ def somebody_elses_domain() -> None:
         os.setresuid(65534, 65534, 65534)
         refused = [refusal(scanhub.Denied, what) for what in (lambda: follow("front/scan"), publish)]
         words = "belongs to user 0 (root) with mode 0755, this is user 65534"
-        os._exit(0 if all(words in said.message for said in refused) else 1)
+        os._exit(0 if all(words in failure.message for failure in refused) else 1)
     assert os.waitpid(child, 0)[1] == 0
 
 
@@ -78,15 +78,15 @@ def silence() -> None:
     lock = hub_without_topics()
     with publish("other"):
         assert scanhub.topics(domain=domain, root=root) == [("other", "tilt")]
-        said = refusal(scanhub.Silent, lambda: follow("front/marks", "rear/scan", timeout=0.3))
-        assert "front/marks, rear/scan in 0.3 s: the hub has no sensor front; the hub has no sensor rear" in said.message, said
-        assert said.remedy == "the sensors are other", said
-        said = refusal(scanhub.Silent, lambda: follow("other/scan", timeout=0.3))
-        assert "does not publish other/scan" in said.message and "the topics are tilt" in said.remedy, said
-        said = refusal(scanhub.Silent, lambda: follow("other/tilt", timeout=0.3))
-        assert said.message == "nothing of other/tilt in 0.3 s" and "scanhub info other" in said.remedy, said
-        said = refusal(scanhub.NoHub, lambda: scanhub.background("front", domain=domain, root=root))
-        assert "takes no requests" in said.message, said
+        failure = refusal(scanhub.Silent, lambda: follow("front/marks", "rear/scan", timeout=0.3))
+        assert "front/marks, rear/scan in 0.3 s: the hub has no sensor front; the hub has no sensor rear" in failure.message, failure
+        assert failure.remedy == "the sensors are other", failure
+        failure = refusal(scanhub.Silent, lambda: follow("other/scan", timeout=0.3))
+        assert "does not publish other/scan" in failure.message and "the topics are tilt" in failure.remedy, failure
+        failure = refusal(scanhub.Silent, lambda: follow("other/tilt", timeout=0.3))
+        assert failure.message == "nothing of other/tilt in 0.3 s" and "scanhub info other" in failure.remedy, failure
+        failure = refusal(scanhub.NoHub, lambda: scanhub.background("front", domain=domain, root=root))
+        assert "takes no requests" in failure.message, failure
     os.close(lock)
 
 
@@ -101,9 +101,9 @@ def reasons_of_a_silence() -> None:
             assert time.monotonic() - begin >= 4
         (warning,) = caught
         assert warning.category is scanhub.SilenceWarning and warning.filename == __file__, warning
-        said = str(warning.message)
+        text = str(warning.message)
         words = ("no sensor othr", "the sensors are other") if other_domain == domain else ("nothing yet: no hub", "scanhub run")
-        assert all(word in said for word in words), said
+        assert all(word in text for word in words), text
     os.close(lock)
 
 
@@ -181,8 +181,8 @@ def warnings_in_asyncio() -> None:
 
     for ask in (lambda **place: scanhub.subscribe("front/scan", **place), scanhub.robot):
         silent = ask(domain="nowhere", root=root)
-        said = warning(lambda: asyncio.run(asyncio.wait_for(follow(silent), 20)))
-        assert "scanhub run" in said, said
+        text = warning(lambda: asyncio.run(asyncio.wait_for(follow(silent), 20)))
+        assert "scanhub run" in text, text
 
 
 def warnings_of_a_robot() -> None:
@@ -200,11 +200,11 @@ def warnings_of_a_robot() -> None:
     with publish("other"):
         for what in (follow, ask):
             silent = scanhub.robot("othr", domain=domain, root=root)
-            said = warning(what)
-            assert "no sensor othr" in said and "the sensors are other" in said, said
+            text = warning(what)
+            assert "no sensor othr" in text and "the sensors are other" in text, text
             silent = scanhub.robot(domain=domain, root=root)
-            said = warning(what)
-            assert "no sensor with zones" in said and "the sensors are other" in said, said
+            text = warning(what)
+            assert "no sensor with zones" in text and "the sensors are other" in text, text
     os.close(lock)
 
 
@@ -221,8 +221,8 @@ def duration_of_a_silence() -> None:
         assert tilts.silent_for() <= time.monotonic() - begin
         time.sleep(0.05)
         assert tilts.silent_for() >= 0.05
-    said = refusal(scanhub.Failure, tilts.silent_for)
-    assert "closed" in said.message, said
+    failure = refusal(scanhub.Failure, tilts.silent_for)
+    assert "closed" in failure.message, failure
     with scanhub.robot(domain=domain, root=root) as robot:
         time.sleep(0.02)
         assert robot.silent_for() >= 0.02
@@ -238,23 +238,23 @@ def finds_resource_shortages() -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 6, before[1]))
     refused = [refusal(scanhub.Short, lambda: next(subscription)), refusal(scanhub.Short, publish)]
     resource.setrlimit(resource.RLIMIT_NOFILE, before)
-    for said in refused:
-        assert "ulimit -n" in said.remedy, said
+    for failure in refused:
+        assert "ulimit -n" in failure.remedy, failure
     # A refused program has released the name.
     publish().close()
     follower = scanhub.subscribe("other/tilt", domain=domain, root=root, timeout=1)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
-    said = refusal(scanhub.Short, lambda: next(follower))
+    failure = refusal(scanhub.Short, lambda: next(follower))
     resource.setrlimit(resource.RLIMIT_NOFILE, before)
-    assert "ulimit -n" in said.remedy, said
+    assert "ulimit -n" in failure.remedy, failure
     mount.close()
     os.close(lock)
 
 
 def a_taken_name() -> None:
     with publish("other"):
-        said = refusal(scanhub.Taken, lambda: publish("other"))
-        assert "the name other is published by" in said.message, said
+        failure = refusal(scanhub.Taken, lambda: publish("other"))
+        assert "the name other is published by" in failure.message, failure
 
 
 domain, root = sys.argv[1:]

@@ -83,8 +83,8 @@ def a_view_keeps_its_sample(scans: scanhub.Subscriber) -> None:
 
 def four_may_be_kept_and_no_more(scans: scanhub.Subscriber) -> None:
     kept = [next(scans).ranges for _ in range(4)]
-    said = refuses(scanhub.Held, lambda: next(scans))
-    assert "front/scan" in said and "copy()" in said, said
+    text = refuses(scanhub.Held, lambda: next(scans))
+    assert "front/scan" in text and "copy()" in text, text
     kept.pop()
     gc.collect()
     assert next(scans).topic_seq > 0
@@ -139,8 +139,8 @@ def what_is_closed_ends(scans: scanhub.Subscriber) -> None:
 
 def copies_can_be_pickled_and_views_cannot(scans: scanhub.Subscriber) -> None:
     scan = next(scans)
-    said = refuses(TypeError, lambda: pickle.dumps(scan))
-    assert "copy()" in said, said
+    text = refuses(TypeError, lambda: pickle.dumps(scan))
+    assert "copy()" in text, text
     copy = pickle.loads(pickle.dumps(scan.copy()))
     assert type(copy) is scanhub.Scan and repr(copy) == repr(scan) and copy.stamp_ns == scan.stamp_ns
     assert np.array_equal(copy.ranges, scan.ranges) and copy.codes == scan.codes and copy.flags == scan.flags
@@ -197,10 +197,10 @@ def two_threads_at_a_time_are_refused(scans: scanhub.Subscriber) -> None:
     thread = threading.Thread(target=lambda: refused.append(refuses(scanhub.Silent, lambda: next(nothing))))
     thread.start()
     waits.wait()
-    said = refuses(scanhub.Failure, lambda: next(nothing))
+    text = refuses(scanhub.Failure, lambda: next(nothing))
     may_continue.set()
     thread.join()
-    assert "another thread" in said and "nobody" in refused[0], (said, refused)
+    assert "another thread" in text and "nobody" in refused[0], (text, refused)
     # Threads may use the object one after the other.
     next(scans)
     thread = threading.Thread(target=lambda: refused.append(next(scans).sensor))
@@ -244,8 +244,8 @@ def asyncio_waits_without_a_thread(_: scanhub.Subscriber) -> None:
         try:
             await silent.__anext__()
             raise AssertionError("there is no such sensor")
-        except scanhub.Silent as said:
-            assert "nobody/scan" in said.message
+        except scanhub.Silent as failure:
+            assert "nobody/scan" in failure.message
         closed = scanhub.subscribe("front/scan", domain=domain, root=root)
         closed.close()
         assert [scan async for scan in closed] == []
@@ -269,8 +269,8 @@ def a_close_ends_the_wait_of_a_task(_: scanhub.Subscriber) -> None:
                 try:
                     await wait.__anext__()
                     raise AssertionError("two tasks waited")
-                except scanhub.Failure as said:
-                    assert "another task" in said.message
+                except scanhub.Failure as failure:
+                    assert "another task" in failure.message
                 if in_thread:
                     await asyncio.get_running_loop().run_in_executor(None, wait.close)
                 else:
@@ -291,8 +291,8 @@ def a_subscription_has_one_kind_of_loop(scans: scanhub.Subscriber) -> None:
         async for _ in scans:
             raise AssertionError("it was used by `for` before")
 
-    said = refuses(scanhub.Failure, lambda: run(follow()))
-    assert "async for" in said, said
+    text = refuses(scanhub.Failure, lambda: run(follow()))
+    assert "async for" in text, text
 
 
 def a_child_of_multiprocessing_takes_nothing(scans: scanhub.Subscriber) -> None:
@@ -313,9 +313,9 @@ def a_child_is_refused(scans: scanhub.Subscriber) -> None:
     next(scans)
     child = os.fork()
     if child == 0:
-        said = refuses(scanhub.Failure, lambda: next(scans))
+        text = refuses(scanhub.Failure, lambda: next(scans))
         scans.close()
-        os._exit(0 if "parent" in said else 1)
+        os._exit(0 if "parent" in text else 1)
     assert os.waitpid(child, 0)[1] == 0
     next(scans)
 

@@ -198,13 +198,13 @@ mod tests {
     }
 
     #[test]
-    fn it_is_called_soon_and_then_again_and_again() {
+    fn discovery_interval_grows_to_10_s() {
         let due: Vec<u64> = (0..6).map(|calls| due_after(calls).as_secs()).collect();
         assert_eq!(due, [0, 0, 1, 5, 15, 25]);
     }
 
     #[test]
-    fn services_that_did_not_change_are_not_listed_again() {
+    fn unchanged_services_are_not_listed_again() {
         let place = tempfile::tempdir().unwrap();
         let domain = Domain::at("answers", place.path()).unwrap();
         let services = domain.root().join(SERVICES_DIRECTORY);

@@ -329,7 +329,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rate_of_a_window() {
+    fn window_has_rate_jitter_and_extremes() {
         let start = Instant::now();
         let mut window = Window::new(Duration::from_secs(1));
         assert_eq!(window.rate(), None);

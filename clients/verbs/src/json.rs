@@ -409,7 +409,7 @@ mod tests {
     const BEGIN: &str = r#"{"class":"scan","sensor":"front","seq":7,"topic_seq":6,"stamp_ns":1000000000,"wall_ns":1700000000000000000,"boot":"00000000000000ab","quality":"#;
 
     #[test]
-    fn of_an_lms() {
+    fn lms_scan_is_written_as_json() {
         let mut scan = Scan::of(ScanHead::lms(5, -90_000, 500, 10, 13), &[1000, 0x1FFF, 0x1FFE, 0x1FF7, 7]);
         let before = r#""clean","family":"lms","unit_um":10000,"count":5,"first_angle_deg":-90.0,"step_deg":0.5,"beam_time_ns":18500,"#;
         let measured =
@@ -425,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn of_points_with_angles_of_their_own() {
+    fn scan_with_exact_angles_is_written_as_json() {
         let head = ScanHead {
             step: -90_f64.to_radians(),
             beam_time_ns: 62_500,

@@ -526,7 +526,7 @@ mod tests {
     }
 
     #[test]
-    fn one_of_three_lights_is_on_and_the_fourth_by_itself() {
+    fn verdict_lights_one_led_and_marks_light_another() {
         for (verdict, light) in [
             (Verdict::Clear, Light::Green),
             (Verdict::Slow, Light::Yellow),
@@ -545,7 +545,7 @@ mod tests {
     }
 
     #[test]
-    fn lines() {
+    fn line_shows_lights_verdict_and_reason() {
         let text = |states: &LightStates, colors| {
             let mut line = Vec::new();
             states.line(&mut line, "front", None, colors).unwrap();
@@ -595,7 +595,7 @@ mod tests {
     }
 
     #[test]
-    fn it_gets_better_by_steps() {
+    fn verdict_improves_step_by_step() {
         let steps =
             [(0, Some(Stop)), (10, Some(Slow)), (110, Some(Clear)), (309, None), (310, None), (409, None)];
         assert_eq!(shown_verdicts(&steps), [Stop, Stop, Stop, Stop, Slow, Slow]);

@@ -265,7 +265,7 @@ mod tests {
 
     #[cfg(feature = "record")]
     #[test]
-    fn leaves_out_whole_parts_that_do_not_fit() {
+    fn drops_whole_parts_that_do_not_fit() {
         let parts = || [(2, "0:00:10"), (0, "6.0 KiB/s"), (1, "903 samples"), (3, "0 lost")];
         let in_columns =
             |columns| fitting(parts().map(|(rank, part)| (rank, part.to_owned())).into(), columns);

@@ -157,7 +157,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rate_and_silence() {
+    fn computes_rate_and_reports_silence_once() {
         let mut stats = ReceiveStats::new(Topic::Scan);
         let start = Instant::now();
         assert!(!stats.take_silence(start + Duration::from_secs(9)));

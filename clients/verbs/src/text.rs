@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn a_segment_without_support_says_so() {
+    fn text_and_json_mark_unsupported_segments() {
         let mut found = Foreground::of(3);
         let head = scanhub_schema::ForegroundHead {
             unit_um: 10_000,

@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn measures_a_busy_process_and_no_other() {
+    fn measures_cpu_usage_of_a_process() {
         let mut cpu = CpuUsage::default();
         let (me, begin) = (std::process::id(), Instant::now());
         assert_eq!(cpu.measure(me, begin), None, "one measurement has no span");

@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn tracker_places_its_sensors_in_its_map() {
+    fn tracks_set_the_placement_of_their_sensors() {
         let mut scene = Scene::default();
         scene.sensor("hall");
         let pose = Pose { x_m: 4.0, y_m: 1.0, yaw_rad: 0.5, ..Pose::default() };
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn remote_sensors_are_not_on_the_robot() {
+    fn robot_has_only_sensors_of_the_local_hub() {
         let mut scene = Scene::default();
         scene.sensor("hub1.front");
         assert_eq!(scene.robot().count(), 1);

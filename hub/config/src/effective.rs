@@ -131,7 +131,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_value_is_written_as_a_configuration_says_it() {
+    fn values_are_formatted_as_toml() {
         let written = |value: Json| TomlValue(&value).to_string();
         assert_eq!(written(json!("a \"b\"")), "\"a \\\"b\\\"\"");
         assert_eq!(written(json!([1.0, 0.6])), "[1.0, 0.6]");

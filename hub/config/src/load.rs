@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn flags_win() {
+    fn flags_take_precedence_over_files() {
         let config = Config::load(&sources(
             &["link.a.angle=100", "link.a.resolution=0.25", "link.a.unit=cm", "link.b.baud=38400"],
             &["a=/dev/x", "b=file:/tmp/a b.bin?rate=max"],
@@ -415,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn serial_servers() {
+    fn parses_serial_server_ports() {
         for (text, host, port) in [
             ("tcp:box:4001", "box", 4001),
             ("tcp:10.0.0.7:23", "10.0.0.7", 23),
@@ -427,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn refusals_name_place_value_and_remedy() {
+    fn refusal_has_location_value_and_remedy() {
         let unknown = refusal(&["link.front.prot=/dev/x"], &[]);
         assert!(unknown.contains("--set link.front.prot=/dev/x: unknown key `prot`"), "{unknown}");
         assert!(unknown.contains("did you mean `port`?"), "{unknown}");
@@ -493,7 +493,7 @@ mod tests {
     }
 
     #[test]
-    fn one_port_is_for_one_link() {
+    fn two_links_with_the_same_port_are_refused() {
         let directory = tempfile::tempdir().unwrap();
         let own = directory.path().join("port");
         std::os::unix::fs::symlink("/dev/null", &own).unwrap();
@@ -530,7 +530,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_error_has_line_and_column() {
+    fn file_error_has_line_and_column() {
         let path = tempfile::NamedTempFile::new().unwrap().into_temp_path();
         let load = |text: &str| {
             std::fs::write(&path, text).unwrap();

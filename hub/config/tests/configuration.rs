@@ -41,7 +41,7 @@ fn processing(files: &[&TempConfig], set: &[&str], link: usize) -> Processing {
 }
 
 #[test]
-fn the_page_holds() {
+fn example_on_the_page_has_the_documented_effect() {
     let page = include_str!("../../../docs/configuration.md");
     let example =
         page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
@@ -69,7 +69,7 @@ fn the_page_holds() {
 
 /// Every family has a section in the output of `config default`. All sections except the first are comments.
 #[test]
-fn the_default_has_a_section_for_each_family() {
+fn default_has_a_section_for_each_family() {
     let is_setting = |line: &&str| *line == "[[link]]" || line.contains(" = ");
     let all: Vec<&str> = scanhub_config::DEFAULT
         .lines()
@@ -89,7 +89,7 @@ fn the_default_has_a_section_for_each_family() {
 }
 
 #[test]
-fn a_scanner_is_refused_at_its_place() {
+fn refused_scanner_model_has_its_location() {
     let file = TempConfig::new(
         "family.toml",
         "[[link]]\nname = \"a\"\nport = \"x\"\nfamily = \"ld\"\nmodel = \"ld20\"\n",
@@ -147,7 +147,7 @@ fn link_settings_and_later_sources_take_precedence() {
 }
 
 #[test]
-fn refusal_names_place_value_and_remedy() {
+fn refused_setting_has_location_value_and_remedy() {
     for (setting, words) in [
         ("link.front.pose.x=nan", "x = NaN\n  meters"),
         ("link.front.pose=[1, 2]", "pose is a list\n  write it as [pose]"),
@@ -245,7 +245,7 @@ fn refusal_names_place_value_and_remedy() {
 }
 
 #[test]
-fn a_circle_that_the_sensor_cannot_see_is_refused() {
+fn zone_that_no_beam_can_see_is_refused() {
     let set = |settings: &[&str]| load(&[], settings).map(drop);
     let refused = |settings: &[&str], words: &str| {
         let refusal = set(settings).expect_err("must be refused");
@@ -294,7 +294,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
 }
 
 #[test]
-fn a_background_begins_with_a_model_of_its_own_sensor() {
+fn start_background_must_belong_to_the_sensor() {
     let head = BackgroundHead {
         first_angle: -90_f64.to_radians(),
         step: 0.5_f64.to_radians(),
@@ -369,7 +369,7 @@ fn old_names_are_errors_that_state_the_new_names() {
 }
 
 #[test]
-fn the_gateway_has_a_section_that_needs_no_links() {
+fn gateway_has_a_section_that_needs_no_links() {
     let first = TempConfig::new(
         "gateway-1.toml",
         "[gateway]\ninterface = \"eth0\"\nttl = 2\nkey_file = \"/k\"\ntopics = [\"a/scan\"]\n",

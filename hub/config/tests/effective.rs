@@ -92,7 +92,7 @@ fn reports_the_deciding_source_of_each_value() {
 }
 
 #[test]
-fn a_link_shows_the_keys_of_its_own_family() {
+fn link_shows_the_keys_of_its_own_family() {
     let settings = ["link.front.family=ld", "link.front.model=ld19", "link.front.beams=300"];
     let values = |set: &[&str]| values(&sources(&[], &LINKS, set)).unwrap();
     let (all, auto) = (values(&settings), values(&settings[..1]));

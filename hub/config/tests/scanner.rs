@@ -163,7 +163,7 @@ fn every_model_belongs_to_one_family() {
 }
 
 #[test]
-fn a_mode_and_rest_are_for_those_that_have_them() {
+fn mode_and_idle_are_refused_for_other_families() {
     let family = "link.front.family=rplidar";
     let front = |set: &[&str]| load(&[&[family], set].concat()).map(|mut config| config.links.swap_remove(0));
     let set = |set: &[&str]| {
@@ -219,7 +219,7 @@ fn keys_of_a_link_may_follow_its_port() {
 }
 
 #[test]
-fn a_family_may_be_searched_for() {
+fn auto_family_has_limits_for_every_family() {
     let front = |set: &[&str]| load(set).map(|mut config| config.links.swap_remove(0));
     let link = front(&[]).unwrap();
     assert_eq!(front(&["link.front.family=auto"]).unwrap(), link, "it is the default");

@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn a_warning_of_the_robots_own_body_is_withdrawn() {
+    fn warning_of_the_robots_own_body_is_withdrawn() {
         let at = |degrees: f32, range| Point { angle: -degrees.to_radians(), range, intensity: 9 };
         let own = [Sector { from_mdeg: -95_000, to_mdeg: -85_000, range_mm: 300 }];
         let settings = Settings { body_mask: own.to_vec(), ..Settings::default() };

@@ -239,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_of_a_search_do_not_count_for_the_scanner() {
+    fn bytes_of_a_search_do_not_count_as_damaged() {
         let mut window = LossWindow::new();
         let mut counters = Counters::default();
         (counters[Counter::BytesRead], counters[Counter::BytesDiscarded]) = (90_000, 90_000);

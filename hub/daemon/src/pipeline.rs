@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn a_generation_is_new_until_it_is_published() {
+    fn new_generation_is_due_until_published() {
         let mut pipeline = pipeline(&processing(|_| {}));
         assert!(!pipeline.is_background_due(), "nothing was learned yet");
         pipeline.learn(&wall(361, 1, 3000), None);
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_that_has_learned_enough_is_published_again() {
+    fn background_is_published_again_after_learning() {
         let mut pipeline = pipeline(&processing(|_| {}));
         pipeline.learn(&wall(361, 1, 3000), None);
         assert_eq!(shown(&mut pipeline).known_beams, 0);
@@ -481,7 +481,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_without_a_background_names_the_key() {
+    fn request_without_a_background_names_the_key() {
         let mut pipeline = pipeline(&processing(|processing| processing.background.is_enabled = false));
         pipeline.learn(&wall(361, 1, 3000), None);
         assert!(

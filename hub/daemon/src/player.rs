@@ -775,7 +775,7 @@ mod tests {
     }
 
     #[test]
-    fn pauses_are_not_playing_time() {
+    fn paused_time_does_not_count_as_elapsed() {
         let mut playback = Playback::new(
             PlaybackOptions { rate: PlaybackRate::Max, is_paused: true, ..PlaybackOptions::default() },
             1,

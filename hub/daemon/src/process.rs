@@ -190,7 +190,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn more_links_than_memory_are_refused() {
+    fn links_that_need_too_much_memory_are_refused() {
         assert!(check_memory(&[TopicLimits::default(); 2]).is_ok());
         let huge = TopicLimits { telegram: 1 << 50, ..TopicLimits::default() };
         let failure = check_memory(&[huge]).unwrap_err();

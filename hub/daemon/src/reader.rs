@@ -553,7 +553,7 @@ mod tests {
     }
 
     #[test]
-    fn stamps_near_the_end_of_time_are_read() {
+    fn samples_with_maximum_stamps_are_read() {
         let folder = TempDir::new().unwrap();
         let file = folder.path().join("a");
         write_log(&file, &[5.0, 4.0, 1e18, 2.0]);
@@ -582,7 +582,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_come_in_the_order_of_their_last_bytes() {
+    fn samples_are_sorted_by_last_byte() {
         let folder = TempDir::new().unwrap();
         let file = folder.path().join("a.mcap");
         // One of them sends for much longer than the other.
@@ -596,7 +596,7 @@ mod tests {
     }
 
     #[test]
-    fn verdict_of_a_silent_sensor_comes_when_it_is_stale() {
+    fn stale_verdict_is_sorted_by_expiry_time() {
         let folder = TempDir::new().unwrap();
         let file = folder.path().join("a.mcap");
         let every = |times: std::ops::Range<u64>| times.step_by(40).map(|at| (at, at + 14));
@@ -611,7 +611,7 @@ mod tests {
     }
 
     #[test]
-    fn file_that_becomes_shorter_is_an_error_at_its_end() {
+    fn file_truncated_while_reading_is_an_error() {
         let folder = TempDir::new().unwrap();
         let (log, mcap) = (folder.path().join("a.log"), folder.path().join("a.mcap"));
         write_log(&log, &(0..500).map(f64::from).collect::<Vec<_>>());
@@ -645,7 +645,7 @@ mod tests {
     }
 
     #[test]
-    fn family_that_is_not_that_of_the_bytes_is_refused() {
+    fn mismatched_family_is_refused() {
         let folder = TempDir::new().unwrap();
         let file = folder.path().join("a.bin");
         let telegram = lms::measured::encode(0, Unit::Mm, &[1000; 181], 0x10);

@@ -414,7 +414,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn message_is_made_once_per_change_of_the_error() {
+    fn message_is_updated_only_if_the_error_changes() {
         let source = PortSpec::Tty("/dev/no-such-port".into());
         let explain = |error: &PortError| one_line(error.explain(&source));
         let mut reason = PortUnavailable::missing("it went".to_owned());

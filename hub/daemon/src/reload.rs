@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn scanner_changes_at_the_next_start() {
+    fn scanner_settings_apply_at_restart() {
         let of = |set: &[&str]| config(&["a=/dev/x"], set);
         let (lms, auto) = (of(&[]), of(&["link.a.family=ld"]));
         let named = of(&["link.a.family=ld", "link.a.model=ld19", "link.a.beams=300"]);
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn processing_changes_now_and_lines_at_the_next_start() {
+    fn processing_applies_at_once_and_links_at_restart() {
         let old = config(&["a=/dev/x", "b=/dev/y,family=lms", "c=/dev/z"], &[]);
         let same = Differences::between(&old, &old);
         assert_eq!(same, Differences::default());
@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn started_background_keeps_its_start() {
+    fn change_of_background_start_applies_at_restart() {
         let of = |set: &[&str]| config(&["a=/dev/x"], set);
         let begun = of(&["background.start=first-scan"]);
         let other = of(&["background.threshold_mm=50"]);

@@ -580,7 +580,7 @@ mod tests {
     }
 
     #[test]
-    fn rate_is_known_for_the_same_link_and_port() {
+    fn saved_rate_applies_only_to_same_link_and_port() {
         let root = tempfile::tempdir().unwrap();
         let state = StateDirectory::at(root.path().join("state"));
         let known = |name: &str, port: &str| {
@@ -602,7 +602,7 @@ mod tests {
     }
 
     #[test]
-    fn scanner_is_known_for_the_same_link_and_port() {
+    fn saved_scanner_applies_only_to_same_link_and_port() {
         let root = tempfile::tempdir().unwrap();
         let state = StateDirectory::at(root.path().join("state"));
         let memory = Memory { family: Family::Ld, stream_rate: 921_600, reply_rate: 921_600 };

@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn kept_port_is_taken_once() {
+    fn stored_port_is_taken_once() {
         let line = || OwnedFd::from(std::fs::File::open("/dev/null").unwrap());
         let kept = vec![("front".to_owned(), line()), ("rear".to_owned(), line())];
         let service = Service { kept_ports: Mutex::new(kept), watchdog: None };
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn kept_port_goes_to_the_link_that_has_it_now() {
+    fn stored_port_is_assigned_to_its_current_link() {
         let line = |path| OwnedFd::from(std::fs::File::open(path).unwrap());
         let kept = [("front", "/dev/null"), ("rear", "/dev/zero"), ("side", "/dev/full")];
         let kept = kept.map(|(name, path)| (name.to_owned(), line(path)));

@@ -660,7 +660,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_backlog_is_detected_and_little_else() {
+    fn detects_backlog_with_little_excess() {
         assert_eq!(backlogged(0), 0);
         for waiting in [1_700, 4_095, 17_024, 65_000] {
             let counted = backlogged(waiting);
@@ -676,7 +676,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_are_checked_when_bytes_bring_no_telegram() {
+    fn settings_are_checked_if_bytes_have_no_telegram() {
         let mut check = SettingsCheck::default();
         let mut checks = |range: std::ops::Range<u64>, telegram_every: u64| {
             let due = range.filter(|ms| {

@@ -275,7 +275,7 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [AllocationWindow; 4
 
 /// One test runs all hubs one after the other, because a signal ends all hubs of a process.
 #[test]
-fn a_scan_takes_nothing_from_the_heap() {
+fn hub_allocates_only_loans_per_scan() {
     for (letter, follow_all, set, topics) in [
         // Scan and zones have a subscriber, and telegrams have none.
         ('a', false, &["background.method=paper"][..], 2),

@@ -51,7 +51,7 @@ fn two_links() -> Config {
 }
 
 #[test]
-fn bytes_with_times_become_samples_with_stamps() {
+fn samples_have_stamps_in_virtual_time() {
     let test_domain = TestDomain::new('m');
     let received = virtual_hub(&two_links(), &test_domain.0, |links| {
         let node = scanhub_shm::client_node(&test_domain.0).expect("a node");

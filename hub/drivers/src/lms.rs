@@ -254,7 +254,7 @@ mod tests {
     use crate::lms::command::Request;
 
     #[test]
-    fn requests_are_those_for_type_and_status() {
+    fn search_requests_type_and_status() {
         let steps = SEARCH_STEPS.request_steps.unwrap();
         assert_eq!(steps.requests[0], Request::Type.encode(0).bytes());
         assert_eq!(steps.requests[1], Request::Status.encode(0).bytes());

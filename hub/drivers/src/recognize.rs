@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn at_least_half_of_the_bytes_belong_to_the_family() {
+    fn family_needs_at_least_half_of_the_bytes() {
         let telegrams = telegrams(10);
         let mut random = fastrand::Rng::with_seed(1);
         let mut with_noise = |len: usize| {
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_first_bytes_count() {
+    fn only_the_first_bytes_determine_the_family() {
         let (telegrams, noise) = (telegrams(400), vec![0x42; EXAMINED_BYTES]);
         assert!(telegrams.len() > EXAMINED_BYTES);
         assert_eq!(family_of(&[&telegrams[..], &noise, &noise, &noise].concat()), Some(Family::Lms));
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_and_nothing_have_no_family() {
+    fn noise_and_empty_input_have_no_family() {
         assert_eq!(family_of(&[]), None);
         for seed in 0..40 {
             let mut random = fastrand::Rng::with_seed(seed);

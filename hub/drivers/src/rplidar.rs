@@ -308,7 +308,7 @@ mod tests {
     use crate::rplidar::request::Request;
 
     #[test]
-    fn id_belongs_to_the_model() {
+    fn model_id_round_trips() {
         assert!(Model::ALL.into_iter().all(|model| Model::of_id(model.id()) == Some(model)));
         assert_eq!([0x00, 0x58, 0x77, 0x91].map(Model::of_id), [None, None, Some(Model::S2), None]);
     }
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn requests_are_those_to_stop_and_for_the_identity() {
+    fn search_requests_stop_and_identity() {
         let steps = SEARCH_STEPS.request_steps.unwrap();
         assert_eq!(steps.stop.unwrap().request, Request::STOP.bytes());
         assert_eq!(steps.requests, [Request::INFO.bytes()]);

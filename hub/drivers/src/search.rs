@@ -916,7 +916,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_name_the_pace_and_the_port() {
+    fn messages_have_the_byte_rate_and_the_port() {
         let messages = [999, 1_000, 12_400]
             .map(|bytes_per_second| Problem::Unrecognized { bytes_per_second }.message("/dev/ttyUSB0"));
         let rest = "bytes/s arrive, but scanhub does not recognize the scanner: stop the hub, then: scanhub probe \

@@ -142,7 +142,7 @@ mod tests {
     ];
 
     #[test]
-    fn printed_writes_both_ways() {
+    fn printed_eeprom_writes_round_trip() {
         let configuration = EepromWrite::Configuration(&PRINTED).encode(0).unwrap();
         assert_eq!(configuration.bytes()[..5], [0x02, 0, 0x23, 0, 0x77]);
         assert_eq!(configuration.bytes()[39..], [0x7B, 0x4B]);
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn every_write_both_ways_and_none_is_a_request() {
+    fn every_eeprom_write_round_trips_and_is_no_request() {
         let all = [
             EepromWrite::Field(&[1, 2, 3]),
             EepromWrite::Password(b"SICK_LMSSICK_LMS"),

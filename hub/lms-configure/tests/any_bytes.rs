@@ -35,14 +35,14 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 4000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn bytes_without_a_checksum(bytes in proptest::collection::vec(any::<u8>(), 0..900)) {
+    fn decoding_of_any_bytes_does_not_panic(bytes in proptest::collection::vec(any::<u8>(), 0..900)) {
         if let Some(telegram) = Telegram::check(&bytes) {
             let _ = EepromWrite::decode(telegram);
         }
     }
 
     #[test]
-    fn requests(address in 0u8..0x80, command in commands(), data in data()) {
+    fn any_decoded_eeprom_write_is_no_request(address in 0u8..0x80, command in commands(), data in data()) {
         let encoded = telegram(address, command, &data);
         let telegram = encoded.telegram();
         if Request::decode(telegram).is_some() {
@@ -56,7 +56,7 @@ proptest! {
 }
 
 #[test]
-fn the_rate_after_power_on_is_explained() {
+fn every_power_on_setting_has_an_explanation() {
     for (power_on, words) in
         PowerOn::ALL.into_iter().zip(["9600", "the present rate is kept", "the type is kept"])
     {

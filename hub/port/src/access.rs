@@ -217,7 +217,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_reason_has_its_remedy() {
+    fn each_permission_problem_has_a_remedy() {
         let robot = PortPermissions {
             port: Some(Ownership { uid: 0, gid: 20, mode: 0o660 }),
             uid: 1000,
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rights_of_this_process() {
+    fn reads_permissions_of_this_process() {
         let rights = PortPermissions::of(Path::new("/dev/null"));
         assert_eq!(rights.uid, geteuid().as_raw());
         assert_eq!(rights.port.map(|port| port.uid), Some(0));
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn lock_of_another_process_names_it() {
+    fn lock_owner_is_the_locking_process() {
         let (_other, port) = crate::tests::pty();
         let mut owner = std::process::Command::new("flock");
         let owner = owner.arg(&port).args(["sh", "-c", "echo locked; exec cat"]);

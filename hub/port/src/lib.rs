@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn a_port_is_the_same_under_another_name() {
+    fn recognizes_a_port_under_another_name() {
         let directory = tempfile::tempdir().unwrap();
         let link = directory.path().join("lidar");
         std::os::unix::fs::symlink("/dev/null", &link).unwrap();
@@ -395,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_that_cannot_be_had_is_no_port_that_is_gone() {
+    fn rate_change_of_a_network_port_is_rejected() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         let source = PortSpec::parse(&format!("tcp:{}", listener.local_addr().unwrap())).unwrap();
         let port = Port::open(&source, 9600, &NEVER).unwrap();
@@ -403,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn why_a_port_cannot_be_used() {
+    fn unusable_ports_have_distinct_error_kinds() {
         assert_eq!(refused("/dev/no-such-port").kind, Kind::PortMissing);
         assert_eq!(refused("/dev/null").kind, Kind::PortNotTty);
         assert_eq!(refused("/etc/hostname").kind, Kind::PortNotTty);

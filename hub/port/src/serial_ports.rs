@@ -510,7 +510,7 @@ mod tests {
     }
 
     #[test]
-    fn device_file_without_a_device_is_dead() {
+    fn device_file_without_a_device_is_an_error() {
         let machine = Machine::new();
         let known = machine.root.join("sys/dev/char");
         let check = |path: &str| check_tty_in(Path::new(path), &known);
@@ -593,7 +593,7 @@ mod tests {
     }
 
     #[test]
-    fn the_debug_connector_of_a_raspberry_pi_5_is_named() {
+    fn debug_connector_of_a_raspberry_pi_5_is_named() {
         let machine = Machine::new();
         machine.uart("ttyAMA10", "32\n");
         machine.link("dev/ttyAMA10", "dev/serial0");
@@ -633,7 +633,7 @@ mod tests {
     }
 
     #[test]
-    fn names_the_module_that_is_missing() {
+    fn names_the_missing_kernel_module() {
         for (id, module) in [
             ("1a86:7523", "ch341"),
             ("10c4:ea60", "cp210x"),
@@ -692,7 +692,7 @@ mod tests {
     }
 
     #[test]
-    fn an_adapter_with_a_port_is_fine() {
+    fn only_adapters_without_a_port_are_reported() {
         let machine = machine("1a86:7523");
         machine.tty("ttyUSB0", "1-1.2", "ch341");
         assert_eq!(PortlessAdapter::all(&machine.root), []);

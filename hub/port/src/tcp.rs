@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_is_twice_the_line_behind_a_second_at_once() {
+    fn read_budget_allows_twice_the_line_rate() {
         for baud in [500_000, 38_400, 9_600] {
             let mut allowance = ReadBudget::new(baud, 9 * SECOND);
             let second = baud as usize / 10 * 2;

@@ -483,7 +483,7 @@ mod tests {
     use crate::tests::pty;
 
     #[test]
-    fn rates_that_are_near_enough() {
+    fn accepts_rates_within_3_percent() {
         assert!(is_near(500_000, 500_000) && is_near(485_000, 500_000) && is_near(515_000, 500_000));
         // Baud rates that drivers set instead of 500 kBd if they do not support it.
         assert!(!is_near(460_800, 500_000) && !is_near(9600, 500_000) && !is_near(0, 500_000));
@@ -551,21 +551,21 @@ mod tests {
     }
 
     #[test]
-    fn flags_that_matter() {
+    fn low_latency_flags_clear_custom_divisor() {
         // ASYNC_SKIP_TEST and ASYNC_SPD_CUST, as setserial leaves them.
         assert_eq!(low_latency_flags(0x40 | 0x30), 0x2040);
         assert_eq!(low_latency_flags(0x2040), 0x2040);
     }
 
     #[test]
-    fn a_line_that_has_none() {
+    fn pipe_has_no_counters_and_no_low_latency() {
         let (_, slave) = std::io::pipe().unwrap();
         assert_eq!(UartCounters::of(&slave), Err(Errno::NOTTY));
         assert_eq!(set_low_latency(&slave), Err(Errno::NOTTY));
     }
 
     #[test]
-    fn this_telegram_and_the_next_one() {
+    fn line_errors_mark_the_current_and_next_telegram() {
         let mut errors = LineErrors::default();
         let mut read = |counts: &[u64]| {
             let marked: Vec<bool> = counts.iter().map(|&count| errors.note_telegram(count)).collect();

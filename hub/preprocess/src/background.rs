@@ -607,7 +607,7 @@ mod tests {
     }
 
     #[test]
-    fn codes_and_ranges() {
+    fn classifies_codes_and_ranges() {
         let mut ranges: Vec<u16> = (0..10).map(|code| 0x1FFF - code).collect();
         ranges.push(0);
         let scan = Scan::of(ScanHead::lms(11, 0, 500, 10, 13), &ranges);
@@ -622,7 +622,7 @@ mod tests {
     }
 
     #[test]
-    fn readings_are_those_of_every_processor() {
+    fn readings_agree_between_processors() {
         for valid_to in [0_u16, 1, 0x1FF6, 0x3FF6, 0x7FF6, 0xFFEF] {
             let values: [u16; 32] = std::array::from_fn(|i| {
                 [0, 1, 2, 0x1FFF, 0x3FFF, 0x7FFF, 0xFFFF, i as u16][i % 8].wrapping_sub(i as u16 / 2)
@@ -648,7 +648,7 @@ mod tests {
     }
 
     #[test]
-    fn defaults_go_by_unit_and_resolution() {
+    fn defaults_depend_on_unit_and_resolution() {
         let limits = |settings, unit_mm: u32, turns| {
             let step_deg = 1.0 / f64::from(turns);
             let head = ScanHead {

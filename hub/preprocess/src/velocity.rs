@@ -238,7 +238,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_velocity_leads_to_its_step() {
+    fn velocity_integrates_to_the_step() {
         let mut random = fastrand::Rng::with_seed(45);
         for _ in 0..1000 {
             let mut number = |scale: f64| scale * (random.f64() - 0.5);

@@ -16,7 +16,7 @@ use scanhub_schema::{Background, Foreground, Lines, Marks, Motion, Pose, Scan, Z
 use surroundings::{MAX_TEST_BEAMS, RandomSurroundings, Shape};
 
 #[test]
-fn a_scan_takes_nothing_from_the_heap() {
+fn processors_do_not_allocate_per_scan() {
     let mut random = fastrand::Rng::with_seed(1);
     let mut scans: Vec<Box<Scan>> = Vec::new();
     for seed in 0..20 {

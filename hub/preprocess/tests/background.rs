@@ -118,7 +118,7 @@ fn any_settings(random: &mut fastrand::Rng) -> Settings {
 }
 
 #[test]
-fn paper_is_identical_beam_by_beam() {
+fn paper_method_matches_the_reference() {
     let mut class_counts = [0_u64; 5];
     let mut adopted = 0_u64;
     for seed in 0..16 {
@@ -370,7 +370,7 @@ fn learn(surfaces: &mut [SlowSurface; 3], reading: f64, gain: f64, threshold: f6
 }
 
 #[test]
-fn multi_is_identical_beam_by_beam() {
+fn multi_method_matches_the_reference() {
     let mut class_counts = [0_u64; 5];
     for seed in 0..12 {
         let mut random = fastrand::Rng::with_seed(seed);
@@ -461,7 +461,7 @@ fn update_times(model: &mut BackgroundModel, scan: &Scan, times: usize) -> Box<F
 }
 
 #[test]
-fn learned_compared_frozen_thawed_and_reset() {
+fn model_learns_freezes_thaws_and_resets() {
     for method in METHODS {
         let mut model = model(method);
         assert_eq!((model.classes(), background_of(&model)), (&[][..], Box::default()));
@@ -511,7 +511,7 @@ fn changed_scan_layout_resets_the_background() {
 }
 
 #[test]
-fn a_saved_model_is_taken_if_it_fits() {
+fn saved_model_is_loaded_only_if_the_layout_fits() {
     for method in METHODS {
         let head = BackgroundHead { unit_um: 1000, generation: 77, ..BackgroundHead::default() };
         let mut saved = Background::of(head, &[3_000; 361]);
@@ -549,7 +549,7 @@ fn a_saved_model_is_taken_if_it_fits() {
 }
 
 #[test]
-fn the_first_scan_may_be_the_background() {
+fn learns_background_from_the_first_scan() {
     for method in METHODS {
         let mut model = BackgroundModel::new(
             Settings { method, start: Start::FirstScan, ..Settings::default() },
@@ -595,7 +595,7 @@ fn learns_faint_wall_but_not_a_standing_person() {
 }
 
 #[test]
-fn no_scan_makes_it_panic() {
+fn no_scan_or_model_causes_a_panic() {
     let mut random = fastrand::Rng::with_seed(1);
     for method in METHODS {
         for round in 0..60 {

@@ -148,7 +148,7 @@ fn fit_error(scan: &Scan, lines: &Lines) -> (f64, usize) {
 }
 
 #[test]
-fn all_cuts_find_little_better() {
+fn fit_is_close_to_the_best_partition() {
     let (mut plain, mut refined, mut best) = (0.0, 0.0, 0.0);
     for seed in 0..12 {
         let scan = star(seed, 60);
@@ -177,7 +177,7 @@ fn is_near(one: f32, two: f64, tolerance: f64) -> bool {
 
 /// The found lines are the walls with their ends and corners, for any mount of the sensor.
 #[test]
-fn a_room_has_four_lines_and_its_corners() {
+fn room_has_four_lines_and_its_corners() {
     let mut random = Rng::with_seed(3);
     for (pose, count, step) in [
         (Pose::default(), 720, 0.5_f64.to_radians()),
@@ -217,7 +217,7 @@ fn a_room_has_four_lines_and_its_corners() {
 
 /// The reported deviations equal the measured deviations of lines over many scans.
 #[test]
-fn a_line_says_how_well_it_is_known() {
+fn reported_deviations_match_measured_deviations() {
     let mut random = Rng::with_seed(4);
     let pose = Pose { x_m: 0.4, y_m: 0.3, ..Pose::default() };
     let mut found: Vec<Line> = Vec::new();
@@ -249,7 +249,7 @@ fn a_line_says_how_well_it_is_known() {
 
 /// The points of a scanner with exact angles do not lie on the grid of beams.
 #[test]
-fn exact_angles_are_those_that_count() {
+fn lines_use_exact_angles() {
     let mut random = Rng::with_seed(5);
     let head = ScanHead { contents: ArrayFlags::ANGLES, ..head(450, 0.0, -TAU / 450.0) };
     let exact: Vec<f32> =
@@ -265,7 +265,7 @@ fn exact_angles_are_those_that_count() {
 }
 
 #[test]
-fn keys_are_kept_to() {
+fn settings_limit_lines_and_points() {
     let scan = star(1, 720);
     let all = find(&scan, Pose::default(), Settings::default());
     assert!(all.lines().len() >= 6 && !all.is_overflow(), "{all:?}");
@@ -299,7 +299,7 @@ fn assert_sound(lines: &Lines, scan: &Scan, settings: &Settings) {
 
 /// Input without information yields no line, or a line with large deviations.
 #[test]
-fn input_that_says_nothing() {
+fn uninformative_input_yields_no_certain_line() {
     let mut random = Rng::with_seed(6);
     let settings = Settings::default();
     let wide = head(361, -FRAC_PI_2, 0.5_f64.to_radians());
@@ -336,7 +336,7 @@ fn input_that_says_nothing() {
 
 /// No scan causes a panic, and all results are plausible.
 #[test]
-fn any_scan() {
+fn no_scan_causes_a_panic() {
     for seed in 0..3000 {
         let mut random = Rng::with_seed(seed);
         let count = match random.u8(..4) {

@@ -79,7 +79,7 @@ fn fill(random: &mut Rng, scan: &mut Scan) {
 }
 
 #[test]
-fn marks_are_those_of_the_definition() {
+fn marks_match_the_reference() {
     let mut random = Rng::with_seed(1);
     let (mut marks, mut edges, mut overflows) = (0, 0, 0);
     for _ in 0..2000 {
@@ -126,7 +126,7 @@ fn find(scan: &Scan, settings: Settings) -> Marks {
 }
 
 #[test]
-fn halves_are_rounded_up() {
+fn half_units_are_rounded_up() {
     let mut scan = scan_with_intensities(&[(4, 1), (5, 1)]);
     scan.arrays().ranges[4] = 1001;
     scan.step = 0.001_f64.to_radians();
@@ -147,7 +147,7 @@ fn each_joining_beam_restarts_the_gap_count() {
 }
 
 #[test]
-fn without_reflector_bits_nothing_is_known() {
+fn marks_are_unavailable_without_reflector_bits() {
     let mut scan = scan_with_intensities(&[(4, 1)]);
     scan.intensity_bits = 0;
     let out = find(&scan, Settings::default());
@@ -174,7 +174,7 @@ fn revolution(intensities: [u8; 8]) -> Box<Scan> {
 }
 
 #[test]
-fn counts_of_any_surface_are_marks_from_a_level_on() {
+fn intensities_above_a_level_are_marks() {
     let scan = revolution([3, 90, 240, 255, 241, 239, 0, 7]);
     let none = find(&scan, Settings::default());
     assert_eq!((none.count, none.is_available(), none.lacks_level()), (0, false, true));
@@ -190,7 +190,7 @@ fn counts_of_any_surface_are_marks_from_a_level_on() {
 }
 
 #[test]
-fn a_mark_is_at_the_exact_angles() {
+fn mark_position_uses_exact_angles() {
     let angle = |intensities| {
         let settings = Settings { level: Some(100), ..Settings::PAPER };
         f64::from(find(&revolution(intensities), settings).mark_array[0].angle_mdeg) / 1000.0

@@ -92,7 +92,7 @@ fn reference_match(reference: &Scan, now: &Scan) -> Pose2 {
 }
 
 #[test]
-fn steps_are_those_of_a_slow_version_and_of_the_truth() {
+fn steps_match_the_reference_and_the_truth() {
     for seed in 0..4 {
         let drive = Drive::through_a_room(seed, 181, 2, 0.01);
         let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
@@ -204,7 +204,7 @@ fn pose_covariance_is_not_too_small_while_driving() {
 }
 
 #[test]
-fn a_turn_during_the_scans_is_measured() {
+fn measures_turns_during_scans() {
     for (seed, deg_per_s) in [(101, 45.0), (102, 90.0), (103, 180.0)] {
         let count = (270.0 / deg_per_s / drives::SCAN_PERIOD_S) as usize;
         let drive = Drive::on_the_spot(seed, count, deg_per_s);
@@ -227,7 +227,7 @@ fn a_turn_during_the_scans_is_measured() {
 
 /// The estimator starts while the robot drives at 3 m/s.
 #[test]
-fn a_robot_that_is_already_fast_is_corrected_too() {
+fn corrects_scans_of_an_already_moving_robot() {
     let mut drive = Drive::through_furniture(7, 0, 0, 0.0);
     drive.drive_on(40, 0.08);
     drive.scans.remove(0);
@@ -297,7 +297,7 @@ fn motion_does_not_depend_on_the_mounting_pose() {
 }
 
 #[test]
-fn a_robot_that_stands_does_not_drift() {
+fn standing_robot_does_not_drift() {
     let mut drive = Drive::through_a_room(3, 361, 1, 0.01);
     drive.stand_still(600);
     let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
@@ -306,7 +306,7 @@ fn a_robot_that_stands_does_not_drift() {
 }
 
 #[test]
-fn a_corridor_leaves_its_direction_open() {
+fn corridor_makes_its_direction_uncertain() {
     let drive = Drive::along_a_corridor(5, 361, 60);
     let found = estimate_motion(&drive.scans, Pose::default(), Settings::default());
     for motion in &found[1..] {
@@ -341,7 +341,7 @@ fn refuses_a_jump_and_continues_afterwards() {
 }
 
 #[test]
-fn people_around_the_robot_do_not_carry_it_away() {
+fn people_do_not_bias_the_motion() {
     let mut off = [Vec::new(), Vec::new()];
     for seed in 0..4 {
         for (of, people) in off.iter_mut().zip([0, 7]) {
@@ -405,7 +405,7 @@ fn uninformative_scans_are_refused_or_uncertain() {
 /// Scan 30 sees only one wall. The next step includes the uncertainty of that position, and from then on the sum
 /// includes it.
 #[test]
-fn a_step_from_an_open_position_is_open_too() {
+fn step_from_an_uncertain_position_is_uncertain() {
     let mut open = 0;
     for seed in 0..6 {
         let mut drive = Drive::through_a_room(seed, 361, 60, 0.01);
@@ -429,7 +429,7 @@ fn a_step_from_an_open_position_is_open_too() {
 }
 
 #[test]
-fn any_scan_is_answered_with_numbers() {
+fn motion_of_any_scan_is_finite() {
     let mut random = Rng::with_seed(17);
     for _ in 0..150 {
         let pose = Pose {

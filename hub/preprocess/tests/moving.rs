@@ -108,7 +108,7 @@ impl ReferenceModel {
 }
 
 #[test]
-fn classes_are_those_of_a_slow_version() {
+fn classes_match_the_reference() {
     for (seed, speed) in [(0, 0.02), (1, 0.02), (2, 0.02), (3, 0.2), (4, 0.2)] {
         let drive = Drive::with_walkers(seed, 361, 160, 3, speed);
         let (mut model, mut slow) = (BackgroundModel::new(MAP_SETTINGS, 361), ReferenceModel::default());
@@ -168,7 +168,7 @@ fn distinguishes_walkers_from_a_driving_robot() {
 
 /// A beam meets the leg of a chair in only some of the scans.
 #[test]
-fn legs_of_chairs_stand_while_people_walk() {
+fn chair_legs_are_static_while_people_walk() {
     for seed in 200..203 {
         let drive = Drive::through_furniture(seed, 900, 3, 0.02);
         let (found, missed, wrong) = count_moving(&drive, 450);
@@ -237,7 +237,7 @@ fn shows_the_static_scene_as_background() {
 }
 
 #[test]
-fn any_place_and_any_scan_are_taken() {
+fn no_pose_or_scan_causes_a_panic() {
     let mut random = Rng::with_seed(5);
     let mut model = BackgroundModel::new(MAP_SETTINGS, 300);
     let mut out = Foreground::of(300);
@@ -347,7 +347,7 @@ fn lifting_the_scanner_is_refused_or_uncertain() {
 
 /// One beam in ten has a return, which is too few to detect motion.
 #[test]
-fn where_little_returns_nothing_moves() {
+fn scans_with_few_returns_have_no_foreground() {
     let mut random = Rng::with_seed(9);
     for seed in 0..4 {
         let mut drive = Drive::through_a_room(seed, 361, 120, 0.01);

@@ -36,7 +36,7 @@ fn distance(a: (f64, f64), b: (f64, f64)) -> f64 {
 }
 
 #[test]
-fn segments_are_those_of_the_formula() {
+fn segments_match_the_reference() {
     let mut random = fastrand::Rng::with_seed(3);
     let mut maximum = 0;
     // Number of scans in which the exact angles change the result.
@@ -131,7 +131,7 @@ fn segment_points_follow_a_change_of_angles() {
 
 /// Consecutive scans have walls of several beams, and single foreground beams that appear again, move, or disappear.
 #[test]
-fn several_beams_or_the_scan_before_support_a_segment() {
+fn neighbors_or_previous_scan_support_a_segment() {
     let mut random = fastrand::Rng::with_seed(27);
     let (mut supported, mut unsupported) = (0, 0);
     for unit_mm in [1, 10] {

@@ -64,7 +64,7 @@ fn false_segments(room: &Room) -> [usize; 2] {
 }
 
 #[test]
-fn values_between_hardly_make_segments_with_support() {
+fn mixed_ranges_rarely_form_supported_segments() {
     let mut sums = [0; 2];
     for name in WORLDS {
         let counts = wide_and_narrow(name).each_ref().map(false_segments);
@@ -122,7 +122,7 @@ fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
 }
 
 #[test]
-fn values_between_make_no_lines() {
+fn mixed_ranges_form_no_lines() {
     let mut sums = [0; 3];
     for name in WORLDS {
         let exact = room(name, |layers| NoiseModel { comb: layers.comb, ..NoiseModel::NONE });

@@ -220,7 +220,7 @@ struct CaseTally {
 }
 
 #[test]
-fn zones_are_those_of_the_formula_and_of_geometry() {
+fn zones_match_the_reference_and_geometry() {
     let mut random = Rng::with_seed(1);
     let mut verdicts = [0; 4];
     let (mut sure, mut close, mut blind) = (0, 0, 0);
@@ -289,7 +289,7 @@ fn invalid_scan_delays_a_clear_verdict() {
 }
 
 #[test]
-fn on_a_circle_is_outside_wherever_it_is_seen_from() {
+fn point_on_a_circle_is_outside_from_any_pose() {
     let mut random = Rng::with_seed(2);
     // Position of a sensor that looks ahead; and the ranges at which the beam ahead enters and leaves the circle of 1
     // m.
@@ -363,7 +363,7 @@ fn verdict(settings: &Settings, scan: &Scan) -> Verdict {
 }
 
 #[test]
-fn the_two_circles_of_the_paper() {
+fn default_circles_give_slow_and_stop() {
     let settings = Settings::default();
     assert_eq!(verdict(&settings, &scan(&[])), Verdict::Clear);
     assert_eq!(verdict(&settings, &scan(&[(7, 1000)])), Verdict::Clear);
@@ -411,7 +411,7 @@ fn stale_verdict_is_unknown_and_restarts_counting() {
 }
 
 #[test]
-fn too_many_invalid_beams_hide_all_but_a_stop() {
+fn too_many_invalid_beams_yield_unknown_or_stop() {
     let invalid: Vec<_> = (0..11).map(|i| (i, INVALID_CODE)).collect();
     let settings = Settings::default();
     assert_eq!(verdict(&settings, &scan(&invalid[..10])), Verdict::Clear, "a tenth is not too many");
@@ -426,7 +426,7 @@ fn too_many_invalid_beams_hide_all_but_a_stop() {
 }
 
 #[test]
-fn the_robot_itself_is_neither_near_nor_invalid() {
+fn body_mask_hides_the_robot_itself() {
     // The sectors cover beams 0 to 10. The body ends inside the circle in one case, and hides the whole circle in the
     // other.
     let partly = [Sector { from_mdeg: -90_000, to_mdeg: -72_000, range_mm: 400 }];
@@ -458,7 +458,7 @@ fn verdict_is_unknown_without_usable_input() {
 }
 
 #[test]
-fn an_old_scan_is_never_clear() {
+fn backlogged_scan_is_never_clear() {
     let mut check = ZoneChecker::new(Pose::default(), &Settings::default(), 100);
     let mut of = |is_late, scan: &Scan| {
         check.set_backlogged(is_late);
@@ -472,7 +472,7 @@ fn an_old_scan_is_never_clear() {
 }
 
 #[test]
-fn a_circle_that_cannot_be_violated_is_never_clear() {
+fn unviolable_circle_is_never_clear() {
     let settings = Settings::default();
     let of = |pose: Pose, settings: &Settings, scan: &Scan| {
         let mut check = ZoneChecker::new(pose, settings, 100);
@@ -534,7 +534,7 @@ fn zones_of_revolution(pose: Pose, settings: &Settings, scan: &Scan) -> Zones {
 }
 
 #[test]
-fn the_exact_point_counts_where_there_is_one() {
+fn zones_use_exact_points_if_available() {
     let settings = Settings::default();
     assert_eq!(zones_of_revolution(Pose::default(), &settings, &revolution(&[])).verdict(), Verdict::Clear);
     let near =
@@ -666,7 +666,7 @@ fn partial_scan_warns_and_complete_scan_confirms() {
 }
 
 #[test]
-fn scans_of_another_form_warn_of_nothing() {
+fn scan_with_another_layout_causes_no_warning() {
     let mut check = ZoneChecker::new(Pose::default(), &Settings::default(), BEAM_COUNT);
     let near = [300; BEAM_COUNT];
     assert_eq!(check.check_partial(BEAM_COUNT, 1000, &near, &[]), None, "nothing is known of the sensor");
@@ -683,7 +683,7 @@ fn scans_of_another_form_warn_of_nothing() {
 
 /// If the spacing of a rotating scanner's points varies by an arc second, the layout does not change.
 #[test]
-fn slightly_uneven_revolutions_count_in_a_row() {
+fn slightly_uneven_revolutions_are_consecutive() {
     let settings = Settings { min_scans: 2, ..Settings::default() };
     let mut check = ZoneChecker::new(Pose::default(), &settings, BEAM_COUNT);
     let mut turn = Scan::zeroed(Scan::len(BEAM_COUNT, scanhub_schema::ArrayFlags::REVOLUTION));

@@ -536,7 +536,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_becomes_the_telegram_of_a_sensor() {
+    fn scan_becomes_the_telegram_of_a_sensor() {
         let log_scan = LogScan::parse(&line(180, "2.5")).unwrap().unwrap();
         assert_eq!((log_scan.time_ns, log_scan.has_pose), (Some(1_071_078_720_500_000_000), true));
         let mm = encoding(Unit::Mm, 1);
@@ -565,7 +565,7 @@ mod tests {
     }
 
     #[test]
-    fn a_code_stays_that_code_in_every_encoding() {
+    fn range_code_is_kept_in_every_encoding() {
         let word = |range: &str, own, other| {
             LogScan::parse(&line(181, range)).unwrap().unwrap().words(own, other)[7]
         };
@@ -579,7 +579,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_of_later_logs_are_scans_too() {
+    fn lines_of_newer_logs_are_scans() {
         let sensor = "0 -1.570796 3.141593 0.008727 81.91 0.01 0";
         let ranges = vec!["2.5"; 361].join(" ");
         for line in [
@@ -632,7 +632,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_says_whether_it_has_a_pose_and_remissions() {
+    fn detects_pose_and_remissions_of_a_log_scan() {
         let has = |line: &str| {
             let log_scan = LogScan::parse(line).unwrap().unwrap();
             (log_scan.has_pose, log_scan.has_remissions)
@@ -657,7 +657,7 @@ mod tests {
     }
 
     #[test]
-    fn unit_and_bits_are_those_that_lose_nothing() {
+    fn chooses_lossless_unit_and_bits() {
         let none = UnencodableRanges::default();
         assert_eq!(chosen(&[], None), (10, 13, none));
         assert_eq!(chosen(&[20.0, 0.01, 81.91, f64::NAN, -1.0], None), (10, 13, none));
@@ -698,7 +698,7 @@ mod tests {
 
     #[cfg(feature = "mcap")]
     #[test]
-    fn a_line_is_read_as_it_was_written() {
+    fn written_line_is_read_back() {
         let mut words = vec![1234; 181];
         (words[0], words[1], words[2]) = (0xE000 | 500, 8191, 8183);
         let telegram = measured::encode(0, Unit::Cm, &words, 0x10);

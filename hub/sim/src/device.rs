@@ -318,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_line_does_not_pause() {
+    fn slow_line_does_not_pause() {
         let chunks = times(Transmission::new(vec![7; 732], 5, 38_400, ChunkSize::Uart, ()));
         let longest = chunks.windows(2).map(|w| w[1].1 - w[0].1).max().unwrap();
         assert!(longest <= line_time(16, 38_400) + 1);
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn breaks_off_after_byte_in_transmitter() {
+    fn aborted_transmission_ends_after_the_current_byte() {
         let mut transmission = Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Uart, ());
         assert!(transmission.take_chunk(320 * MICROS).is_some());
         transmission.abort(405 * MICROS);

@@ -430,7 +430,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn right_rate_changes_nothing() {
+    fn matching_rate_changes_no_byte() {
         let bytes: Vec<u8> = (0..=255).collect();
         for rate in [9_600, 9_500, 9_700] {
             assert_eq!(UartReceiver::new(9_600, rate).receive(&bytes, true), bytes, "{rate}");
@@ -445,14 +445,14 @@ mod tests {
     }
 
     #[test]
-    fn a_faster_host_reads_zeros() {
+    fn faster_host_reads_zeros() {
         let read =
             UartReceiver::new(38_400, 500_000).receive(&[0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41], true);
         assert!(read.len() > 7 && read.iter().all(|&byte| byte == 0), "{read:02X?}");
     }
 
     #[test]
-    fn a_slower_host_reads_less() {
+    fn slower_host_reads_fewer_bytes() {
         let bytes: Vec<u8> = (0..20_000u32).map(|i| ((i * i) >> 3) as u8).collect();
         for (rate, share) in [(19_200, 0.5), (9_600, 0.25)] {
             let read =
@@ -464,7 +464,7 @@ mod tests {
     /// Compares a recording of a host at 19200 on a line at 38400 with the output of the model for the bytes that the
     /// scanner sent.
     #[test]
-    fn agrees_with_a_recording() {
+    fn line_model_agrees_with_a_recording() {
         let data = std::env::var_os("SCANHUB_DATA").map_or_else(
             || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
             PathBuf::from,

@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn it_swings_to_and_fro_and_stands_while_it_halts() {
+    fn mount_swings_and_stands_during_a_halt() {
         let swings = mount(&[]);
         assert_eq!([0.0, 1.0, 2.0, 3.0, 4.0].map(|s| deg(&swings, s)), [-10.0, 20.0, 50.0, 20.0, -10.0]);
         let halted = mount(&[Fault { kind: FaultKind::Halt, from_s: 1.0, until_s: 5.0 }]);
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn reports_come_when_they_arrive() {
+    fn delayed_angle_reports_arrive_late() {
         let late = Fault { kind: FaultKind::Delay(0.015), from_s: 0.01, until_s: 0.02 };
         let mut encoder = Encoder::new(mount(&[late]));
         let mut come = Vec::new();
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn encoder_reports_the_angle_except_for_its_faults() {
+    fn encoder_reports_true_angle_except_for_faults() {
         let report_with_fault =
             |kind: FaultKind, number: u64| mount(&[Fault { kind, from_s: 0.5, until_s: 1.5 }]).report(number);
         let deg = |kind, number| {

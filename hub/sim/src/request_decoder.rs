@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn receives_request_when_line_has_carried_it() {
+    fn receives_request_after_its_time_on_the_line() {
         let mut decoder = RequestDecoder::new(1.0, false);
         for (round, baud) in [9_600, 19_200, 38_400, 500_000].repeat(25).into_iter().enumerate() {
             let start = (round as Nanos + 1) * 1_000 * MILLIS;

@@ -628,7 +628,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_follow_contract() {
+    fn truth_and_summary_lines_follow_the_contract() {
         let record = Record {
             port: "/tmp/a".into(),
             index: 3,

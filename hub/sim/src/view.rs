@@ -410,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn glass_is_seen_where_the_beam_falls_squarely() {
+    fn glass_returns_only_perpendicular_beams() {
         let mut view = View::empty();
         let shape = Shape::Wall { from: (-3000.0, 2000.0), to: (3000.0, 2000.0) };
         view.draw(Face { shape, surface: Surface::Glass, kind: Kind::Static });

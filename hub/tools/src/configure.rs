@@ -668,7 +668,7 @@ mod tests {
     }
 
     #[test]
-    fn each_key_changes_its_byte() {
+    fn each_setting_changes_its_byte() {
         let byte = |setting: &str, at: usize| {
             let plan = applied(&[setting], Some(LmsModel::Lms291)).unwrap();
             plan.new.bytes()[at]

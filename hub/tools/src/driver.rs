@@ -220,7 +220,7 @@ impl Task<Session> for Detection {
         self.introduction = session.device_info();
         self.introduced_at = clock::now();
         match (&self.introduction, self.dtr) {
-            (Some(said), _) if said.condition == HealthStatus::Error => Ok(false),
+            (Some(info), _) if info.condition == HealthStatus::Error => Ok(false),
             (Some(_), Some(on)) => port.set_dtr(on).map(|()| true),
             _ => Ok(true),
         }
@@ -252,7 +252,7 @@ impl Task<Session> for Detection {
     fn deadline(&mut self, _: &Session, now: Nanos) -> Option<Nanos> {
         let is_detected = self.packets >= MIN_PACKETS;
         let limit = match (&self.introduction, self.measures_since) {
-            (Some(said), _) if said.condition == HealthStatus::Error => now,
+            (Some(info), _) if info.condition == HealthStatus::Error => now,
             (Some(_), Some(since)) => since + MEASURING_TIME,
             (Some(_), None) => self.introduced_at + SPIN_UP_TIMEOUT,
             (None, Some(since)) if is_detected && self.revolutions >= MIN_REVOLUTIONS => {

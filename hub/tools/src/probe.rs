@@ -650,7 +650,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_is_quoted_where_a_shell_needs_it() {
+    fn command_is_quoted_where_a_shell_needs_it() {
         let plain = link("/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0", &[("family", "ld")]);
         assert_eq!(plain.command(), format!("scanhub run --link {}", plain.flag()));
         let brackets = link("tcp:[::1]:4001", &[("family", "ld")]);
@@ -659,7 +659,7 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_changes_is_replaced() {
+    fn name_that_changes_is_replaced() {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path().canonicalize().unwrap();
         let (by_id, by_path) = (root.join("serial/by-id/a"), root.join("serial/by-path/b"));

@@ -324,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_complete_or_absent() {
+    fn file_is_complete_or_absent() {
         let directory = TempDir::new().unwrap();
         let path = directory.path().join("a.json");
         let mut file = OutputFile::create(&path, false).unwrap();
@@ -395,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_with_another_name_is_not_emptied() {
+    fn file_with_another_name_is_not_emptied() {
         let directory = TempDir::new().unwrap();
         let [path, backup] = ["a", "backup"].map(|name| directory.path().join(name));
         fs::write(&path, "old").unwrap();
@@ -407,7 +407,7 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_is_created_with_those_above_it() {
+    fn directory_is_created_with_those_above_it() {
         let directory = TempDir::new().unwrap();
         let at = |name: &str| directory.path().join(name);
         for _ in 0..2 {

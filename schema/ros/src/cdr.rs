@@ -188,7 +188,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_stand_at_multiples_of_their_size() {
+    fn values_are_aligned_to_their_size() {
         // Bytes before the message do not count.
         let mut message = vec![9; 3];
         let mut cdr = Cdr::begin(&mut message);

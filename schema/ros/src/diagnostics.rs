@@ -99,7 +99,7 @@ mod tests {
     use crate::{DIAGNOSTIC_ARRAY, STRING, Value, read};
 
     #[test]
-    fn a_verdict_is_a_word() {
+    fn verdict_is_encoded_as_its_name() {
         let mut message = Vec::new();
         verdict_message(&mut message, Verdict::Unknown);
         assert_eq!(read(&STRING, &message).unwrap().text("data"), Some("unknown"));
@@ -112,14 +112,17 @@ mod tests {
     }
 
     #[test]
-    fn a_sensor_is_as_good_as_its_state_and_its_line() {
+    fn diagnostic_level_depends_on_state_and_line_loss() {
         let mut status = Status { rate_mhz: 37_500, ..Status::default() };
         status.set_sensor_type("LMS291-S05 30106");
         let mut diagnose = |state: State, damaged_ppm: u64| {
             status.state = state as u8;
             status.counters[Counter::DamagedPpm] = damaged_ppm;
-            let told = diagnosis_of(Some(&status), Some(250_000_000));
-            (told.number("status.0.level").unwrap() as u8, told.text("status.0.message").unwrap().to_owned())
+            let decoded = diagnosis_of(Some(&status), Some(250_000_000));
+            (
+                decoded.number("status.0.level").unwrap() as u8,
+                decoded.text("status.0.message").unwrap().to_owned(),
+            )
         };
         assert_eq!(diagnose(State::Streaming, 0), (0, "streaming".to_owned()));
         assert_eq!(
@@ -129,17 +132,17 @@ mod tests {
         assert_eq!(diagnose(State::Probing, 0), (1, "probing".to_owned()));
         assert_eq!(diagnose(State::Silent, 0), (2, "silent".to_owned()));
         assert_eq!(diagnose(State::Absent, 0), (2, "absent".to_owned()));
-        let told = diagnosis_of(Some(&status), Some(250_000_000));
+        let decoded = diagnosis_of(Some(&status), Some(250_000_000));
         assert_eq!(
-            (told.number("header.stamp.sec"), told.number("header.stamp.nanosec")),
+            (decoded.number("header.stamp.sec"), decoded.number("header.stamp.nanosec")),
             (Some(9.0), Some(1.0))
         );
-        assert_eq!(told.text("status.0.name"), Some("scanhub: front"));
-        assert_eq!(told.text("status.0.hardware_id"), Some("LMS291-S05 30106"));
-        let values: Vec<_> = (0..told.sequence("status.0.values").unwrap().len())
+        assert_eq!(decoded.text("status.0.name"), Some("scanhub: front"));
+        assert_eq!(decoded.text("status.0.hardware_id"), Some("LMS291-S05 30106"));
+        let values: Vec<_> = (0..decoded.sequence("status.0.values").unwrap().len())
             .map(|i| {
                 let [key, value] =
-                    ["key", "value"].map(|of| told.text(&format!("status.0.values.{i}.{of}")).unwrap());
+                    ["key", "value"].map(|of| decoded.text(&format!("status.0.values.{i}.{of}")).unwrap());
                 (key, value)
             })
             .collect();
@@ -149,24 +152,27 @@ mod tests {
     }
 
     #[test]
-    fn without_a_hub_nothing_is_known() {
-        let told = diagnosis_of(None, None);
+    fn sensor_without_a_hub_is_stale() {
+        let decoded = diagnosis_of(None, None);
         assert_eq!(
-            (told.number("status.0.level"), told.text("status.0.message")),
+            (decoded.number("status.0.level"), decoded.text("status.0.message")),
             (Some(3.0), Some("no hub"))
         );
     }
 
     #[test]
-    fn a_hub_is_there_or_not() {
-        let told = [true, false].map(|is_there| {
+    fn hub_diagnostic_reports_running_or_missing() {
+        let diagnoses = [true, false].map(|is_there| {
             let mut message = Vec::new();
             hub_diagnosis(&mut message, 9_000_000_001, is_there);
-            let told = read(&DIAGNOSTIC_ARRAY, &message).unwrap();
-            let text = |key: &str| told.text(key).unwrap().to_owned();
-            (told.number("status.0.level").unwrap() as u8, text("status.0.name"), text("status.0.message"))
+            let decoded = read(&DIAGNOSTIC_ARRAY, &message).unwrap();
+            let text = |key: &str| decoded.text(key).unwrap().to_owned();
+            (decoded.number("status.0.level").unwrap() as u8, text("status.0.name"), text("status.0.message"))
         });
         let wanted = [(0, "running"), (3, "no hub")];
-        assert_eq!(told, wanted.map(|(level, words)| (level, "scanhub: hub".to_owned(), words.to_owned())));
+        assert_eq!(
+            diagnoses,
+            wanted.map(|(level, words)| (level, "scanhub: hub".to_owned(), words.to_owned()))
+        );
     }
 }

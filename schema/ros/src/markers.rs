@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn marks_are_points_of_one_list() {
+    fn marks_are_encoded_as_points_of_one_marker() {
         let drawn = |marks: &Marks| {
             let mut message = vec![7];
             mark_markers(&mut message, "rear", &header(), marks);
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn people_are_columns_with_their_numbers() {
+    fn people_are_encoded_as_columns_with_ids() {
         let mut tracks = Tracks::default();
         for (id, state) in [(5, TrackState::Confirmed), (6, TrackState::Tentative), (7, TrackState::Hidden)] {
             tracks.push(Track { id, state: state as u8, x_m: id as f32, y_m: -1.0, ..Track::default() });

@@ -130,14 +130,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_those_that_ros_takes() {
+    fn topic_names_are_valid_in_ros() {
         assert_eq!(scan_topic("front"), "/front/scan");
         assert_eq!(scan_topic("front-left_2"), "/front_left_2/scan");
         assert_eq!(scan_topic("5f3a12bc00d1e2f3.front"), "/sensor_5f3a12bc00d1e2f3/front/scan");
     }
 
     #[test]
-    fn names_stand_in_namespaces() {
+    fn topic_and_frame_names_have_namespaces() {
         let frames = vec![("front".to_owned(), "laser".to_owned())];
         let names = RosNames::new("robot1/base", "/lidars", frames).unwrap();
         assert_eq!(names.topic("front", "zones"), "/robot1/base/lidars/front/zones");
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn a_beam_points_where_its_pose_says() {
+    fn rotation_of_a_frame_matches_the_pose() {
         for (yaw_rad, upside_down) in [(0.0, 0), (0.7, 0), (2.9, 1), (-1.2, 1), (0.0, 1)] {
             let pose = Pose { yaw_rad, upside_down, ..Pose::default() };
             for angle_deg in [-90.0_f64, -60.0, 0.0, 55.0, 90.0] {
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_has_all_sensors() {
+    fn static_transform_message_has_all_sensors() {
         let front = Pose { x_m: 0.5, ..Pose::default() };
         let poses = [("front".to_owned(), front), ("rear".to_owned(), Pose::default())];
         let mut message = Vec::new();

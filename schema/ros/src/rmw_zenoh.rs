@@ -197,7 +197,7 @@ mod tests {
         Publisher { number: 3, topic: "/front/scan", message_type: &LASER_SCAN, qos: Qos::SensorData };
 
     #[test]
-    fn keys_and_tokens_are_those_of_rmw_zenoh() {
+    fn keys_and_tokens_match_rmw_zenoh() {
         let hash = "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828";
         assert_eq!(node().key(&SCAN), format!("7/front/scan/sensor_msgs::msg::dds_::LaserScan_/{hash}"));
         assert_eq!(node().token(), "@ros2_lv/7/1f2e3d4c/0/0/NN/%/%/scanhub");
@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn an_attachment_has_number_time_and_publisher() {
+    fn attachment_has_number_time_and_publisher() {
         let bytes = attachment(258, -2, [9; 16]);
         assert_eq!(bytes[..8], [2, 1, 0, 0, 0, 0, 0, 0]);
         assert_eq!(bytes[8..16], [0xFE, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF]);

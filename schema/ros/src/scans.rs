@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_is_these_numbers() {
+    fn laser_scan_message_has_the_expected_values() {
         let header = Header { wall_ns: 1_700_000_001_000_000_000, period_us: 13_320, ..Header::default() };
         let mut message = Vec::new();
         let mut it = scan(&[100, 0x1FFF, 0x1FF7, 0x1FFE, 0, 0x1FF6], 1000);
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn points_are_where_the_beams_of_the_foreground_hit() {
+    fn foreground_points_lie_on_their_beams() {
         let scan = Scan::of(ScanHead::lms(181, -90_000, 1000, 10, 13), &[500; 181]);
         let mut foreground = Foreground::of(181);
         let head = ForegroundHead { unit_um: 10_000, count: 181, beams: 4, ..ForegroundHead::default() };
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_has_a_point_for_each_reading() {
+    fn scan_has_a_point_for_each_reading() {
         let mut ranges = [500; 181];
         (ranges[0], ranges[1], ranges[90]) = (0x1FFF, 0x1FFF, 200);
         let scan = Scan::of(ScanHead::lms(181, -90_000, 1000, 10, 13), &ranges);
@@ -324,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sweep_has_its_points_with_beams_and_classes() {
+    fn sweep_cloud_has_points_beams_and_classes() {
         let point = CloudPoint { at: [1.5, -2.0, 0.25], beam: 300, point_class: 2, reserved: 0 };
         let header = Header { wall_ns: 7_000_000_009, ..Header::default() };
         let mut message = Vec::new();

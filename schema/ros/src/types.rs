@@ -271,14 +271,14 @@ mod tests {
     ];
 
     #[test]
-    fn hashes_are_those_of_independent_implementations() {
+    fn type_hashes_match_independent_implementations() {
         for (of, golden) in GOLDEN {
             assert_eq!(of.hash(), format!("RIHS01_{golden}"), "{}", of.name);
         }
     }
 
     #[test]
-    fn every_contained_type_is_there_once() {
+    fn every_contained_type_is_listed_once() {
         for (of, _) in GOLDEN {
             let layout = MessageDef::of(&of);
             let fields = layout.types.iter().flat_map(|(_, fields)| fields);

@@ -581,7 +581,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_directory_is_none_or_made_private() {
+    fn missing_directory_is_none_or_created_private() {
         let here = TestDirectory::new();
         assert!(Directory::open(&here.at("base/domain")).unwrap().is_some());
         for absent in ["base/other", "other/domain", "a/b/c"] {
@@ -594,7 +594,7 @@ mod tests {
     }
 
     #[test]
-    fn base_and_domain_are_this_users_alone() {
+    fn base_and_domain_must_belong_to_this_user() {
         let here = TestDirectory::new();
         let path = here.at("base/domain");
         let own = effective_uid();
@@ -653,7 +653,7 @@ mod tests {
     }
 
     #[test]
-    fn files_are_regular_ones() {
+    fn special_files_and_links_are_refused() {
         let here = TestDirectory::new();
         let directory = Directory::create(&here.at("base/domain")).unwrap();
         assert!(directory.file("hub.lock").unwrap().is_none());
@@ -695,7 +695,7 @@ mod tests {
     }
 
     #[test]
-    fn the_environment_says_where() {
+    fn environment_determines_the_state_directory() {
         let base = |set: &[(&str, &str)]| {
             base_in(|name| set.iter().find(|(key, _)| *key == name).map(|(_, value)| value.into()))
         };
@@ -765,7 +765,7 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_is_taken_by_a_directory_stays_as_it_is() {
+    fn write_over_a_directory_leaves_no_temporary_file() {
         let (place, state) = TempStateDirectory::new();
         fs::create_dir_all(state.path("f").join("full")).unwrap();
         state.write("f", "text").unwrap_err();

@@ -371,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hub_takes_the_first_place() {
+    fn hub_uses_the_first_location() {
         let all = environment(Some("/run/scanhub"), Some("/run/user/7"));
         let user = environment(None, Some("/run/user/7"));
         let none = environment(None, None);
@@ -382,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn a_client_looks_everywhere_in_order() {
+    fn client_searches_all_locations_in_order() {
         let roots = |environment: &Environment| -> Vec<String> {
             let places = Domain::candidates("a", None, environment).unwrap();
             places.iter().map(|domain| domain.root().display().to_string()).collect()
@@ -394,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn names_and_lengths() {
+    fn invalid_domain_names_and_long_paths_are_refused() {
         assert_eq!(Domain::at("t-1", Path::new("/x")).unwrap().prefix(), "sh_t-1_");
         for bad in ["", "A", "a_b", "a/b", &"a".repeat(17)] {
             assert_eq!(
@@ -412,7 +412,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_of_several_directories_counts() {
+    fn first_of_several_runtime_directories_is_used() {
         assert_eq!(first_path("/run/a:/run/b".into()), Some("/run/a".into()));
         assert_eq!(first_path("relative".into()), None);
     }

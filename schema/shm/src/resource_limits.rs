@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_system_without_a_size_is_not_full() {
+    fn file_system_without_a_size_is_not_full() {
         let mut stat = statvfs(SHARED_MEMORY_DIRECTORY).unwrap();
         (stat.f_frsize, stat.f_blocks, stat.f_bavail) = (4096, 100, 0);
         assert_eq!(free(&stat), 0);
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_without_proc_is_not_short() {
+    fn missing_proc_does_not_count_as_a_shortage() {
         for (error, open) in
             [(Errno::MFILE, 1000), (Errno::NFILE, 1000), (Errno::NOENT, 0), (Errno::ACCESS, 0)]
         {

@@ -304,7 +304,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_is_the_one_that_the_library_would_make() {
+    fn created_segment_equals_that_of_the_library() {
         let base = tempfile::tempdir().unwrap();
         let prefix = format!("sh_k{}_", std::process::id());
         let join = || {
@@ -352,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_is_kept_and_never_the_same_twice() {
+    fn prefix_is_kept_and_never_reused() {
         let base = tempfile::tempdir().unwrap();
         let root = base.path().join("a-1");
         assert_eq!(prefix_of(&root), Ok(None), "there is no such directory");

@@ -14,7 +14,7 @@ use scanhub_shm::{Payload, PortFactory, SharedMemory, WakeSender};
 use temp_domain::TempDomain;
 
 #[test]
-fn a_scan_is_written_and_read_in_place() {
+fn scan_is_written_and_read_in_place() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let topic = Scan::create(&hub, "front", &TOPIC_LIMITS).unwrap();
@@ -46,7 +46,7 @@ fn a_scan_is_written_and_read_in_place() {
 }
 
 #[test]
-fn a_telegram_is_as_long_as_it_is() {
+fn telegram_has_variable_length() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let topic = <[u8]>::create(&hub, "front", &TOPIC_LIMITS).unwrap();
@@ -61,7 +61,7 @@ fn a_telegram_is_as_long_as_it_is() {
 }
 
 #[test]
-fn a_late_subscriber_gets_the_last_status() {
+fn late_subscriber_gets_the_last_status() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let topic = Status::create(&hub, "front", &TOPIC_LIMITS).unwrap();
@@ -95,7 +95,7 @@ fn full_queue_drops_the_oldest_without_blocking() {
 }
 
 #[test]
-fn a_second_publisher_is_refused() {
+fn second_publisher_is_refused() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let topic = Scan::create(&hub, "front", &TOPIC_LIMITS).unwrap();
@@ -106,7 +106,7 @@ fn a_second_publisher_is_refused() {
 }
 
 #[test]
-fn limits_are_those_of_the_contract() {
+fn topic_limits_match_the_contract() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let scan = Scan::create(&hub, "front", &TOPIC_LIMITS).unwrap();
@@ -214,7 +214,7 @@ fn absent_topics_are_none_and_sensors_are_listed() {
 }
 
 #[test]
-fn one_hub_holds_a_domain() {
+fn second_hub_cannot_lock_a_domain() {
     let test_domain = TempDomain::new();
     let root = test_domain.domain.root();
     assert_eq!(hub_pid(root), Ok(None));
@@ -253,7 +253,7 @@ fn topic_half_created_by_a_killed_hub_is_recreated() {
 }
 
 #[test]
-fn a_request_is_answered_and_both_are_woken() {
+fn control_request_and_response_wake_their_receivers() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let server = scanhub_shm::ControlServer::create(&hub).unwrap();
@@ -273,7 +273,7 @@ fn a_request_is_answered_and_both_are_woken() {
 }
 
 #[test]
-fn clients_that_went_while_they_asked_are_no_obstacle() {
+fn exited_clients_with_open_requests_free_their_slots() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     assert!(scanhub_shm::ControlClient::open(&hub).unwrap().is_none());
@@ -296,7 +296,7 @@ fn clients_that_went_while_they_asked_are_no_obstacle() {
 }
 
 #[test]
-fn the_librarys_version_is_the_one_that_is_built_with() {
+fn library_version_matches_the_manifest() {
     let manifest = include_str!("../../../Cargo.toml");
     let pinned = manifest.lines().find_map(|line| line.strip_prefix("iceoryx2 = { version = \"="));
     let version = pinned.and_then(|rest| rest.split('"').next()).expect("it is pinned");
@@ -304,7 +304,7 @@ fn the_librarys_version_is_the_one_that_is_built_with() {
 }
 
 #[test]
-fn a_topic_with_another_layout_is_incompatible() {
+fn topic_with_another_layout_is_incompatible() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let service = Topic::Scan.service("front").as_str().try_into().unwrap();

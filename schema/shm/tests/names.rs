@@ -76,7 +76,7 @@ fn equal_domains_below_two_roots_have_own_doorbells() {
 }
 
 #[test]
-fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
+fn next_hub_rings_the_doorbell_of_a_killed_hub() {
     let test_domain = TempDomain::new();
     let hub = scanhub_shm::hub_node(&test_domain.domain).unwrap();
     let killed = WakeSender::new(&hub, "front").unwrap();
@@ -115,7 +115,7 @@ fn unusable_doorbell_file_is_reported() {
 }
 
 #[test]
-fn the_last_one_out_takes_the_names_along() {
+fn last_process_removes_the_prefix_and_all_files() {
     let test_domain = TempDomain::new();
     let root = test_domain.domain.root();
     let prefix = || std::fs::read_to_string(root.join("prefix")).ok();
@@ -147,7 +147,7 @@ fn the_last_one_out_takes_the_names_along() {
 
 /// Creates a domain at a location of the maximum length, and uses all kinds of shared memory in it.
 #[test]
-fn at_the_longest_place_all_works() {
+fn shared_memory_works_at_the_longest_location() {
     let test_domain = TempDomain::new();
     let base =
         |length: usize| test_domain.base.join("x".repeat(length - test_domain.base.as_os_str().len() - 1));

@@ -90,7 +90,7 @@ fn wrap(first: &str, next: &str, text: &str, width: usize) -> String {
 
 /// Offsets are sums of sizes, so a wrong offset would also lead to a wrong size.
 #[test]
-fn sizes_are_those_of_the_structs() {
+fn sizes_match_the_structs() {
     let description = Description::read();
     assert_eq!(description.layout("Header").size, size_of::<scanhub_schema::Header>());
     let limits = TopicLimits { beams: 0, contents: 0, ..TopicLimits::default() };
@@ -110,12 +110,12 @@ fn layouts_are_up_to_date() {
 }
 
 #[test]
-fn recordings_are_described() {
+fn recording_layout_is_up_to_date() {
     check("schema/src/file/layout.txt", &recording::layout(&Description::read()));
 }
 
 #[test]
-fn c_is_up_to_date() {
+fn c_headers_are_up_to_date() {
     let description = Description::read();
     let blocks = [
         ("structs", c::structs(&description)),

@@ -88,9 +88,9 @@ impl InstalledLibrary {
             skip("pkg-config", "it is not installed, so the flags for the static library are unknown");
             return None;
         };
-        let said = stdout_if_success(&pkg_config).unwrap_or_else(|said| panic!("{said}"));
+        let flags = stdout_if_success(&pkg_config).unwrap_or_else(|message| panic!("{message}"));
         let mut libraries = vec![build_directory().join("libscanhub.a").display().to_string()];
-        libraries.extend(said.split_whitespace().filter(|word| *word != "-lscanhub").map(str::to_owned));
+        libraries.extend(flags.split_whitespace().filter(|word| *word != "-lscanhub").map(str::to_owned));
         let program = self.build("cc", env, source, &["-std=c99"], &libraries);
         Some(program.unwrap_or_else(|message| panic!("{message}")))
     }

@@ -46,8 +46,8 @@ fn count_received_and_lost(received: &[Vec<u8>]) -> (u64, u64) {
 }
 
 #[test]
-fn a_cable_is_pulled_and_an_address_taken() {
-    in_a_network("lan::link_failures::a_cable_is_pulled_and_an_address_taken", || {
+fn gateway_counts_losses_without_cable_or_address() {
+    in_a_network("lan::link_failures::gateway_counts_losses_without_cable_or_address", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.test_address());
         let mut gateway = robot.gateway::<&str>(&[]);
@@ -78,8 +78,8 @@ fn a_cable_is_pulled_and_an_address_taken() {
 }
 
 #[test]
-fn a_queue_is_full() {
-    in_a_network("lan::link_failures::a_queue_is_full", || {
+fn full_send_queue_counts_failed_datagrams() {
+    in_a_network("lan::link_failures::full_send_queue_counts_failed_datagrams", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.test_address());
         let mut gateway = robot.gateway::<&str>(&[]);
@@ -133,8 +133,8 @@ fn unreachable_hosts_do_not_disturb_other_receivers() {
 }
 
 #[test]
-fn hubs_and_gateways_are_killed() {
-    in_a_network("lan::link_failures::hubs_and_gateways_are_killed", || {
+fn counters_are_right_after_killed_hubs_and_gateways() {
+    in_a_network("lan::link_failures::counters_are_right_after_killed_hubs_and_gateways", || {
         let second = Machine::new(2);
         let mut robot = Robot::new(&["front"]);
         let relay = Relay::new(&robot.machine, 7);

@@ -33,7 +33,7 @@ fn module_reads_the_same_datagrams_as_schema() {
 }
 
 #[test]
-fn the_module_puts_parts_together() {
+fn module_reassembles_parts() {
     if reader().is_none() {
         return;
     }
@@ -55,7 +55,7 @@ fn the_module_puts_parts_together() {
 }
 
 #[test]
-fn the_module_knows_keys() {
+fn module_checks_macs_with_a_key() {
     let Some(mut reader) = reader() else { return };
     let list = vectors::read_list();
     let key = list["key"].as_str().expect("a key");

@@ -88,10 +88,10 @@ for line in sys.stdin:
     key, _, at_s = key.partition("@")
     if at_s:
         try:
-            said = outcome(bytes.fromhex(digits), bytes.fromhex(key), int(at_s))
+            result = outcome(bytes.fromhex(digits), bytes.fromhex(key), int(at_s))
         except scanhub_lan.Refused as refused:
-            said = refused.reason
-        print(json.dumps({"outcome": said}), flush=True)
+            result = refused.reason
+        print(json.dumps({"outcome": result}), flush=True)
         continue
     try:
         out = says(scanhub_lan.read(bytes.fromhex(digits), bytes.fromhex(key) if key else None))

@@ -171,7 +171,7 @@ fn damaged_datagrams_are_shown_as_refused() {
 
 /// With the key, the dissector marks datagrams with a wrong MAC as refused. Without a key, it cannot check them.
 #[test]
-fn macs_are_checked() {
+fn wireshark_checks_macs_with_a_key() {
     if !has_tshark() {
         return;
     }

@@ -51,7 +51,7 @@ pub(crate) fn blocks_of_page(name: &str, text: &str) -> Vec<Block> {
 }
 
 #[test]
-fn blocks_have_a_place_and_a_language() {
+fn page_blocks_have_a_location_and_a_language() {
     let page = "words\n```sh\none\n\ntwo\n```\n- item\n  ```\n  three\n  ```\n";
     let block = |place: &str, language: &str, text: &str| Block {
         location: place.into(),

@@ -19,7 +19,7 @@ const TEXT_BLOCKS: [(&str, &str, &str); 8] = [
     ("docs/ros2.md", "scanhub bridge --connect", "clients/bridge/tests/ros2.rs runs it"),
     ("docs/tracks.md", "1 appeared in hall", "tests/it/track_page.rs reads it"),
     ("docs/measured.md", "empty rooms: ", "figures, which the example `proof` prints"),
-    ("docs/worlds.md", "w.toml:2:1: unknown key", "a_wrong_world_is_refused_as_the_page_says"),
+    ("docs/worlds.md", "w.toml:2:1: unknown key", "invalid_world_has_the_error_on_the_page"),
 ];
 
 /// The CMake project of the examples in C and C++.
@@ -135,7 +135,7 @@ fn detects_invalid_blocks() {
 }
 
 #[test]
-fn a_wrong_world_is_refused_as_the_page_says() {
+fn invalid_world_has_the_error_on_the_page() {
     let is_it = |block: &Block| block.location.starts_with("docs/worlds.md") && block.language == "text";
     let block = blocks().into_iter().find(is_it).expect("a block of text");
     let env = TestEnv::new();

@@ -211,7 +211,7 @@ fn failures(environment: &ShellEnv, lines: &[(String, String)]) -> Vec<String> {
 }
 
 #[test]
-fn every_line_for_a_shell_runs() {
+fn every_shell_line_of_the_pages_runs() {
     let lines: Vec<_> =
         command_lines().into_iter().filter(|(_, line)| !is_excluded(line) && !needs_network(line)).collect();
     assert!(lines.len() > 25, "{lines:#?}");
@@ -221,8 +221,8 @@ fn every_line_for_a_shell_runs() {
 }
 
 #[test]
-fn every_line_about_a_network_runs() {
-    in_a_network("pages::lines::every_line_about_a_network_runs", || {
+fn every_network_line_of_the_pages_runs() {
+    in_a_network("pages::lines::every_network_line_of_the_pages_runs", || {
         let lines: Vec<_> = command_lines().into_iter().filter(|(_, line)| needs_network(line)).collect();
         assert!(lines.len() > 3, "{lines:#?}");
         let (desk, _running) = ShellEnv::new();
@@ -263,7 +263,7 @@ fn excluded_shell_lines_exist_and_name_existing_files() {
 }
 
 #[test]
-fn a_line_that_does_not_run_is_found() {
+fn failing_shell_line_is_detected() {
     let (desk, _running) = ShellEnv::new();
     for line in
         ["scanhub ecko front/scan", "scanhub info rear", "scanhub convert none.mcap x.mcap", "scnahub list"]

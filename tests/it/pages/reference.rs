@@ -218,7 +218,7 @@ fn missing_output(printed: &Printed, page: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_page_has_every_class_and_key() {
+fn page_has_every_class_and_key() {
     let tree = SourceTree::load();
     let all = printed(&tree);
     assert!(all.classes.len() > 50 && all.keys.len() > 150, "{all:?}");
@@ -285,7 +285,7 @@ fn missing_exit_codes(kinds: &[Kind], page: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_page_has_every_exit_code() {
+fn page_has_every_exit_code() {
     let page = page("output");
     let source = SourceTree::load();
     let source = source.text("schema/src/text.rs").split("pub enum Kind {\n").nth(1).expect("the kinds");
@@ -316,7 +316,7 @@ fn missing_keys(keys: &[(String, String)], page: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_page_has_every_configuration_key() {
+fn page_has_every_configuration_key() {
     let (mut keys, page) = (of_configuration(), page("configuration"));
     assert!(keys.len() > 40, "{keys:?}");
     assert_eq!(missing_keys(&keys, &page), Vec::<String>::new());
@@ -377,7 +377,7 @@ fn missing_fields(source: &str, page: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_page_has_every_field_of_a_datagram() {
+fn page_has_every_field_of_a_datagram() {
     let tree = SourceTree::load();
     let (source, page) = (tree.text("schema/src/datagram.rs"), page("datagram"));
     assert_eq!(missing_fields(source, &page), Vec::<String>::new());

@@ -94,7 +94,7 @@ fn words(line: &str) -> Vec<(String, bool)> {
 }
 
 #[test]
-fn lines_are_read_as_a_shell_does() {
+fn page_lines_are_parsed_like_a_shell() {
     assert_eq!(lines("# no\na b   # c\n\nd '# e'#f\n"), ["a b", "d '# e'#f"]);
     let line = "scanhub a 'b c' \"d|e\" | scanhub f > g && x; cargo run --release -- h i # j";
     let expected: [&[&str]; 4] = [

@@ -177,8 +177,8 @@ fn compare(
 }
 
 #[test]
-fn it_equals_a_replay_bit_for_bit() {
-    in_own_process("python::read::it_equals_a_replay_bit_for_bit", || {
+fn python_read_equals_a_replay_bit_for_bit() {
+    in_own_process("python::read::python_read_equals_a_replay_bit_for_bit", || {
         let read = check("read");
         let read = read.as_ref();
         let env = TestEnv::new();
@@ -194,7 +194,7 @@ fn it_equals_a_replay_bit_for_bit() {
 }
 
 #[test]
-fn arrays_and_errors() {
+fn python_read_has_arrays_and_errors() {
     let Some(mut read) = check("read") else { return };
     let env = TestEnv::new();
     let world = "room".parse().expect("a world");
@@ -207,7 +207,7 @@ fn arrays_and_errors() {
 }
 
 #[test]
-fn the_program_on_the_page_runs() {
+fn program_on_the_page_runs() {
     let Some(mut program) = client_python() else { return };
     let env = TestEnv::new();
     let file = recorded_world(&env, &"room".parse().expect("a world"), &["front", "rear"], 4);
@@ -222,7 +222,7 @@ fn the_program_on_the_page_runs() {
 }
 
 #[test]
-fn the_example_plots_a_recording() {
+fn example_plots_a_recording() {
     let Some(mut plot) = client_python() else { return };
     if python_for("matplotlib", "matplotlib").is_none() {
         return;

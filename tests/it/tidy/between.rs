@@ -32,8 +32,8 @@ fn schema_uses_no_operating_system() {
 }
 
 #[test]
-fn shm_and_files_know_only_schema() {
-    assert_rule(crates::shm_and_files_know_only_schema, |tree| {
+fn shm_and_files_depend_only_on_schema() {
+    assert_rule(crates::shm_and_files_depend_only_on_schema, |tree| {
         let (files, shm) = ("schema/files/Cargo.toml", "schema/shm/Cargo.toml");
         vec![
             tree.with_line(files, "[dependencies]", "scanhub-shm.workspace = true"),
@@ -90,8 +90,8 @@ fn drivers_only_compute() {
 }
 
 #[test]
-fn no_family_names_another() {
-    assert_rule(crates::no_family_names_another, |tree| {
+fn no_family_module_uses_another_family() {
+    assert_rule(crates::no_family_module_uses_another_family, |tree| {
         let planted = |path: &str, code: &str| tree.with(path, &format!("//! A driver.\n{code}\n"));
         vec![
             planted("hub/drivers/src/ld/planted.rs", "use crate::lms::telegram::Telegram;"),
@@ -104,8 +104,8 @@ fn no_family_names_another() {
 }
 
 #[test]
-fn the_rplidar_simulator_is_independent() {
-    assert_rule(crates::the_rplidar_simulator_is_independent, |tree| {
+fn rplidar_simulator_is_independent() {
+    assert_rule(crates::rplidar_simulator_is_independent, |tree| {
         let planted =
             |code: &str| tree.with("hub/sim/src/rplidar/planted.rs", &format!("//! A unit.\n{code}\n"));
         vec![
@@ -153,8 +153,8 @@ fn no_processor_uses_another() {
 }
 
 #[test]
-fn clients_know_only_schema() {
-    assert_rule(crates::clients_know_only_schema, |tree| {
+fn clients_depend_only_on_schema() {
+    assert_rule(crates::clients_depend_only_on_schema, |tree| {
         let (client, verbs) = ("clients/client/Cargo.toml", "clients/verbs/Cargo.toml");
         vec![
             tree.with_line(client, "[dependencies]", "scanhub-drivers.workspace = true"),
@@ -166,8 +166,8 @@ fn clients_know_only_schema() {
 }
 
 #[test]
-fn ros_knows_only_schema() {
-    assert_rule(crates::ros_knows_only_schema, |tree| {
+fn ros_depends_only_on_schema() {
+    assert_rule(crates::ros_depends_only_on_schema, |tree| {
         let (manifest, lib) = ("schema/ros/Cargo.toml", "schema/ros/src/lib.rs");
         vec![
             tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
@@ -179,8 +179,8 @@ fn ros_knows_only_schema() {
 }
 
 #[test]
-fn the_scene_only_computes() {
-    assert_rule(crates::the_scene_only_computes, |tree| {
+fn scene_only_computes() {
+    assert_rule(crates::scene_only_computes, |tree| {
         let planted =
             |code: &str| tree.with("clients/viewer/src/scene/planted.rs", &format!("//! So.\n{code}\n"));
         vec![
@@ -223,8 +223,8 @@ fn perception_only_computes() {
 }
 
 #[test]
-fn the_server_knows_no_hub() {
-    assert_rule(crates::the_server_knows_no_hub, |tree| {
+fn viewer_server_depends_on_no_hub() {
+    assert_rule(crates::viewer_server_depends_on_no_hub, |tree| {
         let lib = "clients/viewer/src/lib.rs";
         let planted =
             |code: &str| tree.with("clients/viewer/src/server/planted.rs", &format!("//! So.\n{code}\n"));
@@ -249,8 +249,8 @@ fn the_server_knows_no_hub() {
 }
 
 #[test]
-fn the_ends_of_a_network_only_compute() {
-    assert_rule(crates::the_ends_of_a_network_only_compute, |tree| {
+fn network_protocol_modules_only_compute() {
+    assert_rule(crates::network_protocol_modules_only_compute, |tree| {
         let lib = "clients/network/src/lib.rs";
         let planted =
             |code: &str| tree.with("clients/network/src/lan/planted.rs", &format!("//! So.\n{code}\n"));
@@ -272,8 +272,8 @@ fn the_ends_of_a_network_only_compute() {
 }
 
 #[test]
-fn the_libraries_for_c_and_python_know_clients() {
-    assert_rule(crates::the_libraries_for_c_and_python_know_clients, |tree| {
+fn c_and_python_libraries_depend_only_on_clients() {
+    assert_rule(crates::c_and_python_libraries_depend_only_on_clients, |tree| {
         let python = "clients/python/Cargo.toml";
         vec![
             tree.with_line(python, "[dependencies]", "scanhub-drivers.workspace = true"),
@@ -290,8 +290,8 @@ fn the_libraries_for_c_and_python_know_clients() {
 }
 
 #[test]
-fn the_daemon_knows_neither_clients_nor_sim() {
-    assert_rule(crates::the_daemon_knows_neither_clients_nor_sim, |tree| {
+fn daemon_depends_on_neither_clients_nor_sim() {
+    assert_rule(crates::daemon_depends_on_neither_clients_nor_sim, |tree| {
         vec![
             tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-client.workspace = true"),
             tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-verbs.workspace = true"),
@@ -304,8 +304,8 @@ fn the_daemon_knows_neither_clients_nor_sim() {
 }
 
 #[test]
-fn only_the_program_sees_all() {
-    assert_rule(crates::only_the_program_sees_all, |tree| {
+fn only_the_program_depends_on_all_crates() {
+    assert_rule(crates::only_the_program_depends_on_all_crates, |tree| {
         let python = "clients/python/Cargo.toml";
         vec![
             tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-daemon.workspace = true"),
@@ -318,16 +318,16 @@ fn only_the_program_sees_all() {
 }
 
 #[test]
-fn every_crate_is_tested_from_the_top() {
-    assert_rule(crates::every_crate_is_tested_from_the_top, |tree| {
+fn cargo_test_at_the_top_tests_every_crate() {
+    assert_rule(crates::cargo_test_at_the_top_tests_every_crate, |tree| {
         let manifest = tree.text("Cargo.toml");
         vec![tree.with("Cargo.toml", &manifest.replacen("members = [", "members = [\"new\", ", 1))]
     });
 }
 
 #[test]
-fn every_crate_obeys_the_lints() {
-    assert_rule(crates::every_crate_obeys_the_lints, |tree| {
+fn every_crate_uses_the_workspace_lints() {
+    assert_rule(crates::every_crate_uses_the_workspace_lints, |tree| {
         let (top, sim) = (tree.text("Cargo.toml"), tree.text("hub/sim/Cargo.toml"));
         vec![
             tree.with("Cargo.toml", &top.replace("unsafe_code = \"deny\"", "unsafe_code = \"warn\"")),
@@ -337,15 +337,15 @@ fn every_crate_obeys_the_lints() {
 }
 
 #[test]
-fn shared_memory_is_pinned() {
-    assert_rule(crates::shared_memory_is_pinned, |tree| {
+fn shared_memory_library_version_is_pinned() {
+    assert_rule(crates::shared_memory_library_version_is_pinned, |tree| {
         vec![tree.with("Cargo.toml", &tree.text("Cargo.toml").replace("version = \"=0.", "version = \"0."))]
     });
 }
 
 /// The hub has few dependencies: most of its crates come with shared memory, and serialport brings three.
 #[test]
-fn the_daemon_is_built_from_few_crates() {
+fn daemon_is_built_from_few_crates() {
     let mut crates = crates::dependency_tree("scanhub-daemon", &[]);
     crates.retain(|name| !name.starts_with("scanhub-"));
     eprintln!("daemon: {} crates of others", crates.len());
@@ -354,7 +354,7 @@ fn the_daemon_is_built_from_few_crates() {
 
 /// Besides shared memory, a client needs few crates: no verb, and no crate that only verbs need.
 #[test]
-fn the_client_is_built_from_few_crates() {
+fn client_is_built_from_few_crates() {
     let mut crates = crates::dependency_tree("scanhub-client", &[]);
     // Cargo lists a crate outside of this workspace only if it has downloaded everything, including the bridge's
     // crates.

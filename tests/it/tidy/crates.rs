@@ -54,7 +54,7 @@ fn words(text: &str) -> impl Iterator<Item = &str> {
 }
 
 /// Finds crates of this project that `shm` and `files` may not use.
-pub(crate) fn shm_and_files_know_only_schema(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn shm_and_files_depend_only_on_schema(tree: &SourceTree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] =
         [("scanhub-files", &["scanhub-schema"]), ("scanhub-shm", &["scanhub-files", "scanhub-schema"])];
     forbidden_dependencies(tree, &known)
@@ -77,7 +77,7 @@ pub(crate) fn drivers_only_compute(tree: &SourceTree) -> Vec<String> {
 }
 
 /// Finds names of one family in the code of another, and names of families in the code that they share.
-pub(crate) fn no_family_names_another(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn no_family_module_uses_another_family(tree: &SourceTree) -> Vec<String> {
     const FAMILIES: [&str; 3] = ["ld", "lms", "rplidar"];
     let mut breaches = Vec::new();
     for own in ["ld", "line", "lms", "rplidar"] {
@@ -99,7 +99,7 @@ pub(crate) fn no_family_names_another(tree: &SourceTree) -> Vec<String> {
 
 /// Finds uses of the RPLIDAR's driver in the simulator. If both used one description of the protocol, an error in it
 /// would stay unnoticed.
-pub(crate) fn the_rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<String> {
     let mut breaches = Vec::new();
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("hub/sim/src/")) {
         let text: String = code(text).map(|(_, line)| format!("{line} ")).collect();
@@ -237,7 +237,7 @@ pub(crate) fn no_processor_uses_another(tree: &SourceTree) -> Vec<String> {
 /// Finds crates of this project that the client library and the crates above it may not use. The client library uses
 /// only `schema` and `shm`. The verbs use it like any client, and `ros` for recordings. The network and the viewer use
 /// the verbs.
-pub(crate) fn clients_know_only_schema(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn clients_depend_only_on_schema(tree: &SourceTree) -> Vec<String> {
     let known: [(&str, &[&str]); 4] = [
         // The crate's own tests name it to enable its features.
         ("scanhub-client", &["scanhub-client", "scanhub-schema", "scanhub-shm"]),
@@ -305,7 +305,7 @@ fn forbidden_dependencies(tree: &SourceTree, known: &[(&str, &[&str])]) -> Vec<S
 
 /// Finds code in `ros` that does more than turn payloads into messages. It uses only `schema`, so that any crate can
 /// use it.
-pub(crate) fn ros_knows_only_schema(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn ros_depends_only_on_schema(tree: &SourceTree) -> Vec<String> {
     let mut breaches = dependencies_beyond(tree, "scanhub-ros", &["scanhub-schema", "sha2"]);
     breaches.extend(missing_attributes(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let ours = |path: &str| path.starts_with("schema/ros/src/");
@@ -315,7 +315,7 @@ pub(crate) fn ros_knows_only_schema(tree: &SourceTree) -> Vec<String> {
 
 /// Finds code in the network's `lan` module that does more than turn samples into datagrams and back. Bytes and time
 /// are arguments, so that a simulation runs the same code as sockets.
-pub(crate) fn the_ends_of_a_network_only_compute(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn network_protocol_modules_only_compute(tree: &SourceTree) -> Vec<String> {
     const FOLDER: &str = "clients/network/src/lan";
     const OF_STD: [&str; 8] = ["array", "cmp", "collections", "fmt", "mem", "num", "ops", "time::Duration"];
     const CRATES: [&str; 3] = ["hmac", "scanhub-schema", "sha2"];
@@ -343,7 +343,7 @@ pub(crate) fn the_ends_of_a_network_only_compute(tree: &SourceTree) -> Vec<Strin
 
 /// Finds code in the scene that does more than compute. Samples and times are arguments, so that a terminal and a
 /// browser show the same.
-pub(crate) fn the_scene_only_computes(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn scene_only_computes(tree: &SourceTree) -> Vec<String> {
     const HARMLESS: [&str; 5] =
         ["std::collections", "std::fmt", "std::iter", "std::mem", "std::time::Duration"];
     let is_harmless = |place: &String| {
@@ -407,7 +407,7 @@ pub(crate) fn perception_only_computes(tree: &SourceTree) -> Vec<String> {
 /// Finds code in the web server that could reach a hub, a file or a process, because the server handles input of
 /// strangers. It has lists of allowed crates and modules, so that it cannot subscribe through another module of its
 /// crate either.
-pub(crate) fn the_server_knows_no_hub(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn viewer_server_depends_on_no_hub(tree: &SourceTree) -> Vec<String> {
     const CRATES: [&str; 9] = [
         "data-encoding",
         "httparse",
@@ -513,7 +513,7 @@ fn remove_feature_read(manifest: &mut toml::Table) {
 
 /// Finds dependencies of the libraries for C and Python besides the client library, and crates that are built with
 /// these libraries.
-pub(crate) fn the_libraries_for_c_and_python_know_clients(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn c_and_python_libraries_depend_only_on_clients(tree: &SourceTree) -> Vec<String> {
     let mut members = tree.members();
     members.entry("scanhub-python".to_owned()).and_modify(remove_feature_read);
     let mut breaches = Vec::new();
@@ -534,7 +534,7 @@ pub(crate) fn the_libraries_for_c_and_python_know_clients(tree: &SourceTree) -> 
 
 /// Finds crates of clients, of the simulator and of the EEPROM writer among the direct and indirect dependencies of the
 /// daemon.
-pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn daemon_depends_on_neither_clients_nor_sim(tree: &SourceTree) -> Vec<String> {
     let members = tree.members();
     let mut reached = BTreeSet::new();
     let mut open = vec!["scanhub-daemon".to_owned()];
@@ -559,7 +559,7 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &SourceTree) -> Vec
 
 /// Finds crates that depend on more than one of daemon, clients, simulator and tools. Only the program may combine
 /// them.
-pub(crate) fn only_the_program_sees_all(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn only_the_program_depends_on_all_crates(tree: &SourceTree) -> Vec<String> {
     let ends: [&[&str]; 4] = [
         &["scanhub-daemon"],
         &["scanhub-client", "scanhub-network", "scanhub-perception", "scanhub-verbs", "scanhub-viewer"],
@@ -593,7 +593,7 @@ pub(crate) fn only_the_program_sees_all(tree: &SourceTree) -> Vec<String> {
 const WORLD: &str = "scanhub-world";
 
 /// Finds crates that `cargo test` at the top would not test.
-pub(crate) fn every_crate_is_tested_from_the_top(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn cargo_test_at_the_top_tests_every_crate(tree: &SourceTree) -> Vec<String> {
     let manifest = tree.manifest("Cargo.toml");
     let list = |key: &str| -> BTreeSet<String> {
         let list = manifest["workspace"].get(key).and_then(toml::Value::as_array).into_iter().flatten();
@@ -618,7 +618,7 @@ pub(crate) fn every_crate_is_tested_from_the_top(tree: &SourceTree) -> Vec<Strin
 }
 
 /// Finds crates that do not inherit the workspace's lints, which deny unsafe code.
-pub(crate) fn every_crate_obeys_the_lints(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn every_crate_uses_the_workspace_lints(tree: &SourceTree) -> Vec<String> {
     let top = tree.manifest("Cargo.toml");
     let mut breaches = Vec::new();
     if top["workspace"]["lints"]["rust"]["unsafe_code"].as_str() != Some("deny") {
@@ -634,7 +634,7 @@ pub(crate) fn every_crate_obeys_the_lints(tree: &SourceTree) -> Vec<String> {
 }
 
 /// Checks that the version of `iceoryx2` is pinned: a hub and clients with different versions cannot share memory.
-pub(crate) fn shared_memory_is_pinned(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn shared_memory_library_version_is_pinned(tree: &SourceTree) -> Vec<String> {
     let manifest = tree.manifest("Cargo.toml");
     let version = manifest["workspace"]["dependencies"]["iceoryx2"]["version"].as_str().unwrap_or_default();
     if version.starts_with('=') { Vec::new() } else { vec![format!("iceoryx2 {version:?}")] }

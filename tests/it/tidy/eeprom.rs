@@ -60,8 +60,8 @@ fn only_configure_may_write_the_eeprom() {
 }
 
 #[test]
-fn consent_is_given_by_persons() {
-    assert_rule(sources::consent_is_given_by_persons, |tree| {
+fn only_a_person_confirms_eeprom_writes() {
+    assert_rule(sources::only_a_person_confirms_eeprom_writes, |tree| {
         let planted = "//! Writes.\nlet consent = Consent::confirmed_by_person(plan);\n";
         let ask = tree.text("hub/tools/src/configure.rs");
         let plan = tree.text("hub/lms-configure/src/plan.rs");

@@ -97,7 +97,7 @@ fn files_with_words<'a>(tree: &'a SourceTree, name: &str, words: &[&str]) -> Vec
 }
 
 #[test]
-fn the_hub_names_no_lms() {
+fn hub_sources_do_not_name_the_lms() {
     assert_rule(hub_names_no_lms, |tree| {
         vec![
             tree.with(
@@ -119,7 +119,7 @@ fn the_hub_names_no_lms() {
 }
 
 #[test]
-fn a_family_is_a_line_in_few_files() {
+fn family_is_named_in_few_files() {
     assert_rule(few_files_name_a_family, |tree| {
         vec![
             tree.with(

@@ -67,8 +67,8 @@ fn shared_memory_is_built_in_one_crate() {
 }
 
 #[test]
-fn ranges_are_born_in_one_file() {
-    assert_rule(sources::ranges_are_born_in_one_file, |tree| {
+fn ranges_are_created_in_one_file() {
+    assert_rule(sources::ranges_are_created_in_one_file, |tree| {
         vec![
             tree.with("hub/daemon/src/link.rs", "//! A link.\nfor word in measured.words() {}\n"),
             tree.with("hub/tools/src/probe.rs", "//! Probes.\nfor word in measured.words() {}\n"),
@@ -84,8 +84,8 @@ fn files_begin_with_a_description() {
 }
 
 #[test]
-fn names_say_something() {
-    assert_rule(sources::names_say_something, |tree| {
+fn names_have_no_vague_words() {
+    assert_rule(sources::names_have_no_vague_words, |tree| {
         vec![
             tree.with("clients/verbs/src/utils.rs", "//! Things.\n"),
             tree.with("clients/verbs/src/planted.rs", "//! Things.\nstruct LinkManager;\n"),
@@ -96,8 +96,8 @@ fn names_say_something() {
 }
 
 #[test]
-fn nothing_promises_safety() {
-    assert_rule(sources::nothing_promises_safety, |tree| {
+fn no_text_promises_safety() {
+    assert_rule(sources::no_text_promises_safety, |tree| {
         vec![
             tree.with("clients/verbs/src/planted.rs", "//! A protective field.\n"),
             tree.with("CHANGELOG.md", "- A safety function for robots.\n"),
@@ -106,8 +106,8 @@ fn nothing_promises_safety() {
 }
 
 #[test]
-fn the_first_program_is_compiled() {
-    assert_rule(pages::the_first_program_is_compiled, |tree| {
+fn first_program_page_matches_the_example() {
+    assert_rule(pages::first_program_page_matches_the_example, |tree| {
         let (page, example) = ("docs/first-program.md", "clients/examples/first.rs");
         let (shown, compiled) = (tree.text(page), tree.text(example));
         vec![

@@ -36,7 +36,7 @@ fn few_files_name_a_key(tree: &SourceTree) -> Vec<String> {
 }
 
 #[test]
-fn a_key_is_in_few_files() {
+fn key_is_named_in_few_files() {
     assert_rule(few_files_name_a_key, |tree| {
         let use_it =
             |number: usize| (format!("hub/daemon/src/planted{number}.rs"), "settings.stop_when_idle;\n");

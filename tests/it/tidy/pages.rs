@@ -4,7 +4,7 @@ use super::tree::SourceTree;
 
 const FIRST_PAGE: (&str, &str) = ("docs/first-program.md", "clients/examples/first.rs");
 
-pub(crate) fn the_first_program_is_compiled(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn first_program_page_matches_the_example(tree: &SourceTree) -> Vec<String> {
     let (page, example) = FIRST_PAGE;
     let shown: Vec<&str> =
         tree.text(page).split("```rust\n").skip(1).filter_map(|rest| rest.split("```").next()).collect();

@@ -83,7 +83,7 @@ pub(crate) fn shared_memory_is_built_in_one_crate(tree: &SourceTree) -> Vec<Stri
 
 /// Finds code in the daemon and the tools that converts raw values to ranges. Only one file may do that, between the
 /// protocol and the published topics.
-pub(crate) fn ranges_are_born_in_one_file(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn ranges_are_created_in_one_file(tree: &SourceTree) -> Vec<String> {
     find(tree, &[".words()", "range_array", "upper_array"], |path| {
         path.starts_with("hub/daemon/src/") || path.starts_with("hub/tools/src/")
     })
@@ -132,7 +132,7 @@ pub(crate) fn only_configure_may_write_the_eeprom(tree: &SourceTree) -> Vec<Stri
 
 /// Finds code that creates consent outside of the one place that asks a person. Without consent, no request that writes
 /// the EEPROM is sent to a port.
-pub(crate) fn consent_is_given_by_persons(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn only_a_person_confirms_eeprom_writes(tree: &SourceTree) -> Vec<String> {
     const CONSENT_FILE: &str = "hub/tools/src/configure.rs";
     const CONSENT_USER: &str = "hub/lms-configure/src/";
     let mut breaches = find(tree, &["confirmed_by_person", "Consent("], |path| {
@@ -226,7 +226,7 @@ pub(crate) fn files_begin_with_a_description(tree: &SourceTree) -> Vec<String> {
 }
 
 /// Finds names of files and items with words that have no meaning, such as `util`.
-pub(crate) fn names_say_something(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn names_have_no_vague_words(tree: &SourceTree) -> Vec<String> {
     const EMPTY_NAMES: [&str; 7] = ["manager", "util", "utils", "helper", "helpers", "common", "misc"];
     let empty = |name: &str| {
         let spread: String = name
@@ -253,7 +253,7 @@ pub(crate) fn names_say_something(tree: &SourceTree) -> Vec<String> {
 }
 
 /// Finds text that presents the project as a safety device. Only README.md explains at length that it is none.
-pub(crate) fn nothing_promises_safety(tree: &SourceTree) -> Vec<String> {
+pub(crate) fn no_text_promises_safety(tree: &SourceTree) -> Vec<String> {
     let mut breaches = Vec::new();
     for ending in [".rs", ".md", ".toml", ".service", ".rules", ".run"] {
         for (path, text) in tree.files(ending) {

@@ -65,7 +65,7 @@ fn the_page_lists_the_files_of_a_topic(tree: &SourceTree) -> Vec<String> {
 }
 
 #[test]
-fn a_topic_is_in_few_files() {
+fn topic_is_named_in_few_files() {
     assert_rule(few_files_name_a_topic, |tree| {
         vec![
             tree.with("hub/daemon/src/topics.rs", "//! Topics.\nif topic == Topic::Motion {\n"),
@@ -82,7 +82,7 @@ fn a_topic_is_in_few_files() {
 }
 
 #[test]
-fn the_design_says_which_files_a_topic_touches() {
+fn design_page_lists_the_files_of_a_topic() {
     assert_rule(the_page_lists_the_files_of_a_topic, |tree| {
         vec![tree.with(
             "docs/design.md",

@@ -44,7 +44,7 @@ fn the_page_lists_the_files_of_a_verb(tree: &SourceTree) -> Vec<String> {
 }
 
 #[test]
-fn a_verb_is_in_few_files() {
+fn verb_is_named_in_few_files() {
     assert_rule(few_files_name_a_verb, |tree| {
         vec![
             tree.with("hub/main.rs", "//! The program.\nVerb::Hz(hz) => hz.run(json, &places),\n"),
@@ -60,7 +60,7 @@ fn a_verb_is_in_few_files() {
 }
 
 #[test]
-fn the_design_says_which_files_a_verb_touches() {
+fn design_page_lists_the_files_of_a_verb() {
     assert_rule(the_page_lists_the_files_of_a_verb, |tree| {
         let page = tree.text("docs/design.md").replace("`hub/cli.rs`", "the table");
         vec![tree.with("docs/design.md", &page)]

@@ -490,7 +490,7 @@ fn string(text: &str, before: Option<char>, language: Language) -> Option<(&str,
 }
 
 #[test]
-fn words_that_are_never_right_are_not_used() {
+fn forbidden_words_are_not_used() {
     assert_rule(words_are_of_today, |_| {
         let mut planted = Vec::new();
         for (words, _) in NEVER {
@@ -545,7 +545,7 @@ const PLANTED: [(&str, &str); 26] = [
 ];
 
 #[test]
-fn code_and_names_are_not_words() {
+fn code_and_names_are_not_checked_for_words() {
     let texts = [
         ("//! A file.\nstruct Nobody { centre: Point }\n", Language::Rust),
         ("//! A file.\nsubscribe(\"nobody/scan\");\n", Language::Rust),

@@ -43,7 +43,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn order_length_and_every_bit_count() {
+    fn hash_depends_on_order_length_and_every_bit() {
         let of = |parts: &[&[u8]]| {
             let mut history = HistoryHash::new();
             parts.iter().for_each(|part| history.add_bytes(part));

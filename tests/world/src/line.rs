@@ -67,8 +67,8 @@ impl OpenLine {
     ///
     /// Returns the same error as the kernel if the device is not connected.
     fn check(&self, is_connected: bool) -> io::Result<bool> {
-        let is_told = !self.handle.shared.defect.is_active(Defect::SwallowedHangUp);
-        if is_connected || !is_told {
+        let is_hang_up_reported = !self.handle.shared.defect.is_active(Defect::SwallowedHangUp);
+        if is_connected || !is_hang_up_reported {
             Ok(is_connected)
         } else {
             Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the line hung up"))
@@ -131,8 +131,9 @@ impl PortIo for OpenLine {
     fn alteration(&self) -> io::Result<Option<SettingsChange>> {
         let Handle { shared, port, device } = &*self.handle;
         let tty = shared.ports[*port].borrow();
-        let is_told = self.check(tty.is_plugged_in(*device))? && !shared.defect.is_active(Defect::HiddenRate);
-        Ok(tty.altered_rate().filter(|_| is_told).map(SettingsChange::Rate))
+        let is_rate_reported =
+            self.check(tty.is_plugged_in(*device))? && !shared.defect.is_active(Defect::HiddenRate);
+        Ok(tty.altered_rate().filter(|_| is_rate_reported).map(SettingsChange::Rate))
     }
 
     fn restore(&self, baud: u32) -> io::Result<()> {

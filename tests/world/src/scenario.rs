@@ -229,7 +229,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_plan_is_the_same_as_text() {
+    fn scenario_round_trips_through_text() {
         let mut met = std::collections::HashSet::new();
         for seed in 0..50 {
             let scenario = Scenario::from_seed(seed, 60);
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn two_culprits_among_many_are_found() {
+    fn shrink_finds_two_culprits_among_many() {
         let scenario = (0..)
             .map(|seed| Scenario::from_seed(seed, 60))
             .find(|scenario| scenario.actions.len() > 40)

@@ -12,7 +12,7 @@ fn saved_scenarios_of_fixed_bugs_keep_all_invariants() {
 }
 
 #[test]
-fn the_same_seed_has_the_same_hash() {
+fn same_seed_has_the_same_hash() {
     let scenarios: Vec<Scenario> = (0..10).map(|seed| Scenario::from_seed(seed, 20)).collect();
     let hashes = |scenarios: &[Scenario]| -> Vec<u64> {
         scenarios.iter().map(|scenario| run(scenario, Detail::Nothing).hash).collect()
@@ -25,20 +25,20 @@ fn the_same_seed_has_the_same_hash() {
 
 /// The hash is the same in debug and release builds and on every machine.
 #[test]
-fn the_hash_of_a_world_is_known() {
+fn world_hash_is_the_same_on_every_machine() {
     let scenario: Scenario = "seed 5 seconds 15\n1000 kill_hub away_ms=500\n".parse().unwrap();
     assert_eq!(run(&scenario, Detail::Nothing).hash, 0xad26_3a4b_b7f0_1116);
 }
 
 /// Runs the first seeds of those that `.ci/run` runs.
 #[test]
-fn worlds_are_well() {
+fn random_scenarios_keep_all_invariants() {
     assert_no_violation((0..20).map(|seed| Scenario::from_seed(seed, 60)).collect());
 }
 
 /// Runs the first seeds of those that `.ci/run` runs. The hub searches for scanners in these worlds.
 #[test]
-fn worlds_with_links_without_a_family_are_well() {
+fn random_scenarios_with_auto_family_keep_invariants() {
     assert_no_violation((0..10).map(|seed| Scenario::auto_from_seed(seed, 60)).collect());
 }
 

@@ -462,7 +462,7 @@ mod tests {
     }
 
     #[test]
-    fn each_topic_of_the_hub_becomes_topics_of_the_graph() {
+    fn each_hub_topic_has_its_ros_topics() {
         let mut graph = graph(|_| Some(1));
         let topics: Vec<_> = graph.topics().iter().map(|topic| (&*topic.name, topic.qos)).collect();
         let best = Qos::SensorData;
@@ -512,7 +512,7 @@ mod tests {
     }
 
     #[test]
-    fn as_many_wait_as_are_kept_and_old_ones_give_way() {
+    fn full_queue_replaces_the_oldest_messages() {
         let mut graph = graph(|topic| (topic == Topic::Scan).then_some(1));
         let ranges = |messages: Vec<(String, Value)>| {
             messages
@@ -564,7 +564,7 @@ mod tests {
     }
 
     #[test]
-    fn a_foreground_waits_for_its_scan_alone() {
+    fn foreground_is_published_with_the_scan_of_equal_seq() {
         let mut graph = graph(|topic| (topic == Topic::Foreground).then_some(1));
         assert!(graph.needs(0, Topic::Scan), "it says where beams point");
         let (scan, foreground) = (scan(500), foreground());
@@ -673,7 +673,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sweep_is_one_cloud() {
+    fn cloud_samples_of_a_sweep_are_one_message() {
         let mut graph = graph(|topic| (topic == Topic::Cloud).then_some(1));
         assert_eq!(graph.topics().len(), 1);
         assert!(graph.needs(0, Topic::Cloud) && !graph.needs(0, Topic::Scan));

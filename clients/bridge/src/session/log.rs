@@ -160,7 +160,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn places_in_other_peoples_files_are_left_out() {
+    fn source_locations_are_removed_from_zenoh_errors() {
         let line =
             "no link: [host: refused (error 111) at /a/b-1.0/tcp.rs:105.] at /a/c.rs:1. at noon. Retry";
         assert_eq!(without_locations(line), "no link: [host: refused (error 111)] at noon. Retry");

@@ -210,7 +210,7 @@ fn error_of_lone_program(env: &TestEnv, bridge_script: Option<&str>) -> String {
 }
 
 #[test]
-fn explains_how_to_install_the_matching_program() {
+fn missing_or_older_bridge_program_is_reported() {
     let env = TestEnv::new();
     assert!(error_of_lone_program(&env, None).contains("is not installed"));
     let other = error_of_lone_program(&env, Some("echo scanhub-bridge 0.0.7"));
@@ -218,7 +218,7 @@ fn explains_how_to_install_the_matching_program() {
 }
 
 #[test]
-fn it_is_ready_when_the_router_is_there() {
+fn bridge_waits_for_a_router_and_then_connects() {
     let (robot, middle) = (TestEnv::new(), TestEnv::new());
     let at = address("tcp");
     let mut there = bridge_without_peer(&robot, &["--connect", &at]);
@@ -241,7 +241,7 @@ fn it_is_ready_when_the_router_is_there() {
 }
 
 #[test]
-fn only_the_topics_that_are_named_are_received() {
+fn publishes_only_selected_topics() {
     let (robot, desk) = (TestEnv::new(), TestEnv::new());
     let _sensor = robot.simulator(&["front"], NO_FLAGS);
     let at = address("tcp");

@@ -17,7 +17,7 @@ fn blocks(language: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_commands_of_the_page_run() {
+fn page_commands_run_without_error() {
     let env = TestEnv::new();
     let [configuration] = &blocks("json5")[..] else { panic!("one configuration") };
     let mut count = 0;

@@ -60,7 +60,7 @@ fn losses_of_a_restarted_router_are_all_counted() {
 
 /// The link to a stopped router ends after Zenoh's lease, even while a sample waits until the link has room for it.
 #[test]
-fn stopped_router_loses_its_link_and_gets_it_back() {
+fn link_to_a_stopped_router_ends_and_is_restored() {
     let (robot, desk) = (TestEnv::new(), TestEnv::new());
     let _sensor = robot.simulator(&["front"], NO_FLAGS);
     let at = address("tcp");

@@ -43,8 +43,8 @@ fn end_after_delivery(mut sender: Program, mut receiver: Program) -> (Outcome, u
 }
 
 #[test]
-fn on_a_slow_link_the_newest_comes_first() {
-    in_a_network("slow::on_a_slow_link_the_newest_comes_first", || {
+fn slow_link_delivers_the_newest_samples() {
+    in_a_network("slow::slow_link_delivers_the_newest_samples", || {
         let (robot, desk) = (TestEnv::new(), TestEnv::new());
         let _sensors = robot.simulator(&["front", "rear"], NO_FLAGS);
         if !limit_rate() {

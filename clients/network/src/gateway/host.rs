@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn resolves_a_name_again() {
+    fn resolves_host_name_again_after_an_interval() {
         static QUERIES: AtomicU32 = AtomicU32::new(0);
         // The address changes with every second query.
         fn resolve(_: &str) -> io::Result<Vec<SocketAddr>> {

@@ -923,7 +923,7 @@ mod tests {
     }
 
     #[test]
-    fn retired_runs_make_room_and_stay_in_totals() {
+    fn evicted_retired_runs_remain_in_totals() {
         let mut table = full();
         let fresh = |table: &mut GatewayTable, bytes: &[u8]| at(table, bytes, 1000);
         assert_eq!(fresh(&mut table, &zones(head(5, 1, 4))), Ok(SequenceStatus::New));
@@ -990,7 +990,7 @@ mod tests {
     }
 
     #[test]
-    fn restarted_gateway_makes_its_own_room() {
+    fn restarted_gateway_evicts_its_own_earlier_run() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for hub in 0..MAX_RUNS as u64 {
             assert!(!is_full(&table));
@@ -1054,7 +1054,7 @@ mod tests {
     }
 
     #[test]
-    fn announcements_give_names() {
+    fn announcement_sets_the_sensor_name() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let head = Head { sensor: 1, ..head(5, 9, 0) };
         table.begin((5, 9), delivers(0));
@@ -1066,7 +1066,7 @@ mod tests {
     }
 
     #[test]
-    fn row_of_two_sensors_has_no_name() {
+    fn counters_of_a_reused_sensor_number_have_no_name() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let row = StreamCounters::new((5, 9, 0, 4), 0);
         table.begin((5, 9), delivers(0));

@@ -548,7 +548,7 @@ mod tests {
     }
 
     #[test]
-    fn receives_only_from_hubs_that_are_named() {
+    fn receives_only_from_selected_hubs() {
         let mut incoming = Incoming::new(&Topic::ALL).with_hubs(vec![4, 5]);
         let mut is_ignored = |bytes: &[u8]| {
             matches!(

@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn four_of_a_topic_wait_and_the_oldest_makes_room() {
+    fn fifth_partial_sample_of_a_topic_evicts_the_oldest() {
         let mut parts = Reassembler::default();
         for sequence in 0..4 {
             take(&mut parts, head(sequence), 0, 1);

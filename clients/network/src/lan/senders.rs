@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn moved_gateway_continues_and_another_begins() {
+    fn moved_gateway_continues_and_a_new_one_begins() {
         let mut senders = Senders::NONE;
         send(&mut senders, 1, Some(7), 0);
         assert_eq!(send(&mut senders, 2, None, 100), SenderMatch::Twin);

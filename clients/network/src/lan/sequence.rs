@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_wrap() {
+    fn sequence_numbers_wrap_around() {
         let mut row = row(u32::MAX - 1);
         assert_eq!(row.record(u32::MAX - 1), SequenceStatus::New);
         assert_eq!(row.record(1), SequenceStatus::New);
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn the_window_ends_after_1024() {
+    fn numbers_older_than_1024_are_stale() {
         let mut row = row(5000);
         row.record(5000);
         assert!(!row.is_stale(5000 - 1023) && row.is_stale(5000 - 1024));

@@ -283,7 +283,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waiting_time_survives_a_clock_that_is_set() {
+    fn buffering_time_is_bounded_after_a_clock_change() {
         assert_eq!(waited_ns(Some(700), 1_000, 5_000), 300);
         assert_eq!(waited_ns(Some(700), 900_000, 5_000), 5_000, "set forward");
         assert_eq!(waited_ns(Some(700), 100, 5_000), 0, "set back");

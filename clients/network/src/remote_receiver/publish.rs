@@ -353,7 +353,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn share_returns_to_the_budget() {
+    fn dropped_share_returns_to_the_budget() {
         let budget = Rc::new(Budget::new(100));
         let shares = [budget.take(60), budget.take(40)];
         assert!(budget.has_left(0) && !budget.has_left(1));

@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn between_two_angles_it_goes_evenly() {
+    fn interpolates_between_two_angles() {
         let (angles, steps, _) = angles(&[(10, 1.0), (20, 2.0), (40, 1.0)]);
         assert_eq!(steps, [AngleUpdate::Interrupted, AngleUpdate::Moved, AngleUpdate::Moved]);
         assert_eq!([15, 20, 30, 40].map(|ms| deg(&angles, ms)), [1.5, 2.0, 1.5, 1.0].map(Some));
@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn a_silence_and_a_jump_are_no_way() {
+    fn does_not_interpolate_over_silence_or_jump() {
         let (silent, ..) = angles(&[(10, 1.0), (20, 2.0), (200, 3.0), (210, 4.0)]);
         assert_eq!(silent.at(100 * MS), AngleLookup::Never(DropReason::Silent));
         assert_eq!(deg(&silent, 205), Some(3.5));
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn stamps_that_cannot_be_are_dropped_and_counted() {
+    fn impossible_stamps_are_dropped_and_counted() {
         let (angles, steps, counts) =
             angles(&[(1500, 1.0), (1490, 1.0), (2100, 1.0), (1510, 2.0), (100, 3.0), (110, 4.0)]);
         use AngleUpdate::{Dropped as D, Interrupted, Moved};
@@ -369,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn it_turns_where_the_angle_was_farthest() {
+    fn reversal_is_at_the_extreme_angle() {
         let turns = events((0..500).map(triangle));
         let times: Vec<u64> = turns
             .iter()
@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn it_stands_when_the_angle_does() {
+    fn constant_angle_is_reported_as_standing() {
         let stands = events((0..200).map(|i| f64::from(i.min(100)) * 0.3));
         let SwingEvent::Standing(since) = stands[0] else { panic!("{stands:?}") };
         assert_eq!(since / MS, 1000);

@@ -378,14 +378,14 @@ mod tests {
     }
 
     #[test]
-    fn a_sweep_that_did_not_measure_the_place_is_no_visit() {
+    fn sweep_without_a_measurement_is_not_a_visit() {
         let settings = Settings::default();
         let sweeps = [Some(4.0); 6].into_iter().chain([None, Some(2.0)].repeat(4)).chain([Some(4.0)]);
         assert!(!is_narrow_background(&settings, sweeps));
     }
 
     #[test]
-    fn a_narrow_surface_that_is_seen_through_is_forgotten() {
+    fn narrow_surface_seen_through_is_removed() {
         let visits = [Some(4.0); 3].into_iter().chain([Some(4.0), Some(2.0)].repeat(3));
         for (after, is_background) in [(60, true), (61, false)] {
             let sweeps = visits.clone().chain(vec![Some(4.0); after]);
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sweep_counts_once_however_often_a_cell_is_met() {
+    fn sweep_counts_once_per_cell() {
         let mut model = SurfaceModel::new(11, &settings());
         (0..9).for_each(|_| model.learn(&reading(4.0), 90, 0, &settings()));
         assert!(!model.is_known(&reading(4.0), 90));
@@ -466,7 +466,7 @@ mod tests {
     }
 
     #[test]
-    fn the_background_is_that_of_the_definition() {
+    fn background_matches_the_reference() {
         for seed in 0..200 {
             let mut random = fastrand::Rng::with_seed(seed);
             let surfaces = [2.0, 2.05, 3.0, f32::INFINITY];

@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn two_pairs_of_sweeps_show_the_delay_of_a_pendulum() {
+    fn estimates_stamp_delay_from_two_pairs_of_sweeps() {
         for (seed, late_s) in [0.02, -0.02, 0.06, 0.12].into_iter().enumerate() {
             let found = delays(late_s, seed as u64);
             assert_eq!(found[..2], [None; 2], "{late_s}");

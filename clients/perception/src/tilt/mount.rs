@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn a_greater_angle_looks_down_to_the_floor() {
+    fn greater_angle_points_down_to_the_floor() {
         let mount = Mount { axis_at: [0.0, 0.0, 1.0], sensor_at: [0.0, 0.0, 1.0], ..Mount::default() };
         assert!(is_near(mount.point(FRAC_PI_6, 0.0, 2.0), [3.0_f64.sqrt(), 0.0, 0.0]));
         assert!(
@@ -356,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn a_side_wall_behind_the_origin_is_not_a_wall_ahead() {
+    fn side_wall_behind_the_origin_is_not_a_wall_ahead() {
         let grid =
             |points: usize| (0..points).map(|i| (0.005 * (i % 100) as f32, 0.1 * (i / 100 % 10) as f32));
         let ahead = grid(2000).map(|(y, z)| [3.0, 4.0 * y - 1.0, 0.4 + z]);
@@ -370,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn each_sweep_counts_whole_and_as_much_as_the_others() {
+    fn each_sweep_has_equal_weight_in_the_check() {
         let points: Vec<Point> = (0..100_000_u32)
             .map(|i| Point { at: [if i < 50_000 { 1.0 } else { 2.0 }, 0.0, 0.0], ..Point::default() })
             .collect();
@@ -413,7 +413,7 @@ mod tests {
     }
 
     #[test]
-    fn each_error_shows_where_it_is() {
+    fn each_mount_error_affects_its_own_result() {
         let real = mount();
         let (floor, wall) = check_room(&real, &Mount { level_rad: 0.02, ..real });
         assert!((floor.level_rad - 0.02).abs() < 2e-3, "{floor:?}");

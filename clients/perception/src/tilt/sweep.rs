@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn near_points_are_one_obstacle_and_few_are_none() {
+    fn near_points_form_an_obstacle_unless_too_few() {
         let pole = (0..20).map(|i| ([2.0, 0.0, 0.05 * i as f32], Obstacle::FOREGROUND));
         let crate_ = (0..9).map(|i| ([1.0 + 0.1 * i as f32, -1.0, 0.3], Obstacle::NEAR));
         let speck = (0..3).map(|i| ([5.0, 5.0, 0.1 * i as f32], Obstacle::FOREGROUND));
@@ -371,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn obstacles_are_those_of_the_definition() {
+    fn obstacles_match_the_reference_clusters() {
         let mut clusters = Clusters::default();
         for seed in 0..40 {
             let mut random = fastrand::Rng::with_seed(seed);

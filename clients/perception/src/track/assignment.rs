@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn the_sum_is_the_greatest() {
+    fn assignment_has_the_greatest_total_gain() {
         let mut random = fastrand::Rng::with_seed(1);
         let mut assignment = Assignment::default();
         for _ in 0..400 {

@@ -115,7 +115,7 @@ mod tests {
     const SQUARE: [Point; 4] = [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]];
 
     #[test]
-    fn points_and_segments() {
+    fn computes_containment_distance_and_crossings() {
         assert!(contains(&SQUARE, [1.0, 1.9]) && !contains(&SQUARE, [1.0, 2.1]));
         assert_eq!((area(&SQUARE), distance_to_border(&SQUARE, [1.0, 1.5])), (4.0, 0.5));
         assert_eq!(crossing([[0.0, 0.0], [4.0, 0.0]], [[1.0, -1.0], [1.0, 1.0]]), Some(0.25));

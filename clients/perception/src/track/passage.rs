@@ -193,7 +193,7 @@ seconds = [2, 15]
     }
 
     #[test]
-    fn the_normal_distribution_agrees_with_its_integral() {
+    fn normal_distribution_agrees_with_the_integral() {
         let mut sum = 0.0;
         for i in 0..80_000 {
             let z = -4.0 + 1e-4 * f64::from(i);

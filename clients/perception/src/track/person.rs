@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn agrees_with_the_textbook_form_by_whole_matrices() {
+    fn filter_agrees_with_the_textbook_form() {
         // Textbook form of the filter: eight states, with both coordinates and both legs measured at once.
         let mut random = fastrand::Rng::with_seed(2);
         let mut filter = Filter::of_leg([1.0, 2.0], 0.03);

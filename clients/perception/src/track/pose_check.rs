@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn legs_that_are_not_known_well_say_nothing() {
+    fn uncertain_legs_do_not_vote_on_poses() {
         let mut poses = PoseVotes::new(2);
         let leg = |x, is_fresh| Leg {
             at: [x, 0.0],

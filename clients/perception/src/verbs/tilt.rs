@@ -613,7 +613,7 @@ mod tests {
     }
 
     #[test]
-    fn points_go_scan_by_scan() {
+    fn points_are_split_by_scan_and_maximum() {
         let point = |beam| Point { beam, ..Point::default() };
         let points = [3, 4, 7, 1, 2, 2, 0, 1, 2].map(point);
         let lengths = |most| scans(&points, most).map(<[Point]>::len).collect::<Vec<_>>();

@@ -35,7 +35,7 @@ fn point(mount: &Mount, angle_rad: f64, beam_rad: f64, range_m: f64) -> [f64; 3]
 }
 
 #[test]
-fn each_point_is_where_all_angles_together_say() {
+fn point_positions_match_the_reference() {
     for seed in 0..8 {
         let mut random = fastrand::Rng::with_seed(seed);
         let mut draw = |maximum: f64| maximum * (2.0 * random.f64() - 1.0);

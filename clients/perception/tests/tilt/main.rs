@@ -78,7 +78,7 @@ fn points_of_a_halted_mount_are_dropped_as_standing() {
 }
 
 #[test]
-fn points_of_a_hanging_encoder_are_dropped() {
+fn points_of_a_stuck_encoder_are_dropped() {
     let ([silent, jumped, inconsistent, standing], unreliable) = run_with_fault(FaultKind::Stuck);
     assert_eq!([silent, inconsistent, unreliable], [0; 3]);
     assert!(standing > 30_000 && jumped > 0, "{standing} {jumped}");
@@ -100,7 +100,7 @@ fn jumping_encoder_is_reported_and_unreliable() {
 }
 
 #[test]
-fn an_encoder_that_lies_is_unreliable() {
+fn drifting_encoder_makes_sweeps_unreliable() {
     for by_deg in [4.0, -2.0] {
         let (points_dropped, unreliable) = run_with_fault(FaultKind::Drift(by_deg));
         assert!(unreliable >= 3, "{by_deg}: {points_dropped:?} {unreliable}");
@@ -173,7 +173,7 @@ fn narrow_boards_between_scans_are_no_obstacles() {
 }
 
 #[test]
-fn a_top_that_level_beams_graze_is_no_obstacle() {
+fn top_that_level_beams_graze_is_no_obstacle() {
     let mut hall = Hall::new(&halls::unchanging(41), 41);
     let until_s = 33 * hall.sweep_ns() / seconds(1);
     hall.play(Settings::default(), until_s, |_, sweep| {
@@ -182,7 +182,7 @@ fn a_top_that_level_beams_graze_is_no_obstacle() {
 }
 
 #[test]
-fn a_check_finds_the_wall_ahead_between_side_walls() {
+fn check_finds_the_wall_ahead_between_side_walls() {
     let mut check = scanhub_perception::tilt::MountCheck::default();
     let mut hall = Hall::new(&"tilt".parse().expect("built in"), 1);
     hall.play(Settings::default(), 14, |_, sweep| check.take(sweep));

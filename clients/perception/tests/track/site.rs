@@ -46,7 +46,7 @@ polygon = [[2, 1], [3, 1], [3, 2]]
 "#;
 
 #[test]
-fn a_house_is_read() {
+fn parses_the_house_site_file() {
     let site = Site::parse("house.toml", HOUSE).unwrap();
     assert_eq!((site.sensors.len(), site.rooms.len(), site.doors.len(), site.gaps.len()), (2, 3, 2, 1));
     assert_eq!((site.sensors[0].hub(), site.sensors[1].hub()), ("", "kitchen"));
@@ -144,7 +144,7 @@ fn each_site_error_has_a_location_and_a_remedy() {
 }
 
 #[test]
-fn the_drawing_has_all_that_the_file_names() {
+fn drawing_shows_everything_in_the_site_file() {
     let svg = Site::parse("house.toml", &HOUSE.replace("kitchen\"", "<&\"")).unwrap().svg();
     for word in [
         "front",

@@ -580,7 +580,7 @@ mod tests {
     }
 
     #[test]
-    fn tracks_to_the_letter() {
+    fn tracks_have_the_exact_json_form() {
         let mut all = Tracks::default();
         for name in ["front", "kitchen.rear"] {
             all.push_sensor(TrackSensor::new(name, &Pose::default()));
@@ -607,7 +607,7 @@ mod tests {
     }
 
     #[test]
-    fn events_to_the_letter() {
+    fn events_have_the_exact_json_form() {
         let door = Event::new(EventKind::Door, 3, Some("hall")).with_door("left", "outside", "hall");
         let line = letters(event("house", &header(), &door));
         let rest = r#""kind":"door","id":3,"room":"hall","from":"outside","to":"hall","door":"left"}"#;
@@ -622,7 +622,7 @@ mod tests {
     }
 
     #[test]
-    fn angles_to_the_letter() {
+    fn tilt_angles_have_the_exact_json_form() {
         let sample = Tilt { angle_rad: -0.5, rate_rad_s: 0.25 };
         let rest = r#""angle_deg":-28.6479,"rate_deg_s":14.3239}"#;
         assert_eq!(letters(tilt("house", &header(), &sample)), format!(r#"{{"class":"tilt",{HEAD}{rest}"#));
@@ -632,7 +632,7 @@ mod tests {
     }
 
     #[test]
-    fn points_to_the_letter() {
+    fn cloud_has_the_exact_json_form() {
         let point =
             |beam, point_class| CloudPoint { at: [1.0, -2.5, 0.1234], beam, point_class, reserved: 0 };
         let flags = Cloud::FIRST | Cloud::COMPLETE;
@@ -644,7 +644,7 @@ mod tests {
     }
 
     #[test]
-    fn obstacles_to_the_letter() {
+    fn obstacles_have_the_exact_json_form() {
         let mut found = Obstacles { sweep: 3, flags: Obstacles::COMPLETE, ..Obstacles::default() };
         found.push(Obstacle {
             middle: [2.0, 0.0, 0.5],

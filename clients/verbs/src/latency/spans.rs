@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_telegram_is_split() {
+    fn latency_is_split_into_line_hub_and_wake() {
         let mut spans = started_spans();
         let header = Header { flags: Flags::SIMULATED, ..header(2_000_000 * US) };
         spans.take(&header, arrival_after(&header, 72 * US));
@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn of_other_machines_there_are_wall_clocks() {
+    fn remote_latency_uses_wall_clocks() {
         let arrival = 2_000_000 * US;
         let remote = |wall_ns| Header {
             stamp_first_ns: arrival,
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_of_a_thousand() {
+    fn computes_quantiles_of_1000_ages() {
         assert_eq!(Ages::new().quantiles(), None);
         let quantiles = of((1..=1000).rev()).quantiles().expect("a thousand");
         let Quantiles { count, min_ns, p50_ns, p90_ns, p99_ns, p999_ns, max_ns } = quantiles;
@@ -346,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn three_digits_are_kept_and_the_ends_as_they_are() {
+    fn quantiles_keep_three_digits_and_exact_extremes() {
         for ns in [1_000, 72_345, 26_640_123, 99_000_000_000] {
             let quantiles = of([ns - 1, ns, ns, ns + ns / 2]).quantiles().expect("four");
             assert!((ns..=ns + ns / 1000).contains(&quantiles.p50_ns), "{ns}: {quantiles:?}");
@@ -357,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn bars_hold_each_time_once() {
+    fn histogram_counts_each_age_once() {
         assert_eq!(Ages::new().bins(), []);
         let bar = |from_us: u64, to_us: u64, count| HistogramBin {
             from_ns: from_us * 1000,

@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_light_is_written_where_it_changes() {
+    fn led_is_written_only_on_a_change() {
         let (root, now) = (Root::new(), Instant::now());
         root.plug("red", "[none] timer\n");
         let (mut red, trigger) = Device::open(root.0.path(), "red").unwrap();
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn opening_a_light_disables_its_trigger() {
+    fn opening_an_led_disables_its_trigger() {
         let root = Root::new();
         root.plug("red", "none timer [heartbeat]\n");
         let (_, trigger) = Device::open(root.0.path(), "red").unwrap();
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_light_is_refused_and_available_ones_named() {
+    fn unknown_led_is_refused_with_available_names() {
         let root = Root::new();
         for (plugged, hint) in [("", "there are none"), ("red", "there are red")] {
             if !plugged.is_empty() {
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn unplugged_light_is_reported_once_and_resumes_later() {
+    fn unplugged_led_is_reported_once_and_resumes_later() {
         let (root, start) = (Root::new(), Instant::now());
         root.plug("red", "[none]\n");
         let (mut red, _) = Device::open(root.0.path(), "red").unwrap();

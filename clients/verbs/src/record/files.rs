@@ -365,7 +365,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_and_times() {
+    fn parses_split_sizes_and_times() {
         assert_eq!(Split::parse("512MiB"), Ok(Split::Bytes(512 << 20)));
         assert_eq!(Split::parse("1.5GB"), Ok(Split::Bytes(1_500_000_000)));
         assert_eq!(Split::parse("1h"), Ok(Split::Time(Duration::from_secs(3600))));
@@ -378,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn dates() {
+    fn formats_dates_and_default_file_name() {
         let at = |seconds: u64| iso(seconds * 1_000_000_000);
         assert_eq!(at(0), "1970-01-01T00:00:00Z");
         assert_eq!(at(951_782_400), "2000-02-29T00:00:00Z");
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn no_recorder_takes_a_file_that_is_being_removed() {
+    fn file_being_removed_cannot_be_opened() {
         let directory = tempfile::tempdir().unwrap();
         let place = directory.path();
         let path = place.join("walk-0001.mcap");
@@ -486,7 +486,7 @@ mod tests {
     }
 
     #[test]
-    fn files_of_others_stay() {
+    fn does_not_remove_files_of_other_runs() {
         let directory = tempfile::tempdir().unwrap();
         let place = directory.path();
         let at = |name: &str| place.join(name);
@@ -522,7 +522,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_has_one_writer() {
+    fn second_writer_of_a_file_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let place = directory.path();
         let path = place.join("walk.mcap");

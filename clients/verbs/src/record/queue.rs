@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_ends_a_wait() {
+    fn end_of_the_queue_ends_a_wait() {
         let queue = Queue::new();
         assert!(!queue.wait(Instant::now()));
         queue.end();

@@ -375,7 +375,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes() {
+    fn formats_sizes_with_binary_units() {
         assert_eq!(
             [0, 1023, 1024, 5 << 19, 3 << 30].map(size),
             ["0 B", "1023 B", "1.0 KiB", "2.5 MiB", "3.0 GiB"]

@@ -427,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn person_in_front_of_body_does_not_change_it() {
+    fn person_in_front_of_body_does_not_change_the_mask() {
         let found = mask(|beam, slice, _| match beam {
             90..=150 if slice == 4 => Some(250),
             100..=110 => Some(500),
@@ -509,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn detects_scan_of_another_shape() {
+    fn detects_scan_with_a_different_layout() {
         let mut body = Body::new(Pose::default(), 1000.0);
         let scan =
             |count, unit_mm| Scan::of(ScanHead::lms(count, -90_000, 1000, unit_mm, 13), &vec![0; count]);

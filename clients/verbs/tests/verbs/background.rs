@@ -130,7 +130,7 @@ fn load_order(file: &Path) -> ModelRequest {
 }
 
 #[test]
-fn a_model_is_saved_forgotten_and_loaded_again() {
+fn background_is_saved_reset_and_loaded_again() {
     let test_domain = TestDomain::new();
     let _keeper = FakeControlServer::new(&test_domain.domain, model());
     let file = test_domain.base.join("model.json");
@@ -211,7 +211,7 @@ fn unsuitable_or_unreadable_models_are_refused() {
 }
 
 #[test]
-fn nothing_is_saved_by_halves() {
+fn failed_save_leaves_no_partial_file() {
     let test_domain = TestDomain::new();
     let _keeper = FakeControlServer::new(&test_domain.domain, model());
     let save =
@@ -260,7 +260,7 @@ fn existing_file_is_replaced_only_by_force() {
 }
 
 #[test]
-fn a_model_that_knows_nothing_takes_no_others_place() {
+fn empty_background_does_not_replace_a_saved_one() {
     let test_domain = TestDomain::new();
     let _keeper = FakeControlServer::new(&test_domain.domain, model());
     let file = test_domain.base.join("model.json");
@@ -280,7 +280,7 @@ fn a_model_that_knows_nothing_takes_no_others_place() {
 }
 
 #[test]
-fn before_the_first_scan_there_is_nothing_to_save() {
+fn save_before_the_first_scan_is_an_error() {
     let test_domain = TestDomain::new();
     let _keeper = FakeControlServer::new(&test_domain.domain, Box::default());
     let file = test_domain.base.join("model.json");

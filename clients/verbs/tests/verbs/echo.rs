@@ -57,7 +57,7 @@ fn all_but_last_line(text: &str) -> Vec<&str> {
 }
 
 #[test]
-fn scans_as_json() {
+fn prints_scans_as_json() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 0xAB);
     let verb = start(&test_domain, &["front/scan"], Format::Json, count(2));
@@ -79,7 +79,7 @@ fn scans_as_json() {
 }
 
 #[test]
-fn telegrams_and_status_as_json() {
+fn prints_telegrams_and_status_as_json() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(&test_domain, &["front/telegram", "front/status"], Format::Json, count(2));
@@ -106,7 +106,7 @@ fn telegrams_and_status_as_json() {
 }
 
 #[test]
-fn scans_as_columns_and_as_bytes() {
+fn prints_scans_as_csv_and_raw_bytes() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let csv = start(&test_domain, &["front/scan"], Format::Csv, count(2));
@@ -133,7 +133,7 @@ fn scans_as_columns_and_as_bytes() {
 }
 
 #[test]
-fn samples_as_text() {
+fn prints_samples_as_text() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(&test_domain, &["front/scan", "front/telegram"], Format::Text, count(2));
@@ -153,7 +153,7 @@ fn samples_as_text() {
 }
 
 #[test]
-fn a_gap_in_the_numbers_is_missed() {
+fn sequence_gap_counts_as_missed() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(&test_domain, &["front/scan"], Format::Json, count(2));
@@ -191,7 +191,7 @@ fn several_sensors_wake_one_echo() {
 }
 
 #[test]
-fn no_hub() {
+fn count_fails_and_endless_echo_waits_without_hub() {
     let test_domain = TestDomain::new();
     let (end, out, _) = start(&test_domain, &["front/scan"], Format::Json, count(1)).join();
     assert_eq!(end.unwrap_err().kind, Kind::NoHub);
@@ -211,7 +211,7 @@ fn no_hub() {
 }
 
 #[test]
-fn bounds_that_are_not_met() {
+fn unmet_limits_are_a_timeout_or_interrupt() {
     let test_domain = TestDomain::new();
     let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let short = Some(Duration::from_millis(50));
@@ -227,7 +227,7 @@ fn bounds_that_are_not_met() {
 }
 
 #[test]
-fn all_sensors_and_all_topics() {
+fn wildcards_select_all_sensors_and_topics() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 1);
     let verb = start(&test_domain, &["*/scan", "rear/*"], Format::Json, count(3));
@@ -270,7 +270,7 @@ fn unknown_topics_and_unsuitable_formats_are_refused() {
 }
 
 #[test]
-fn a_reader_that_goes_away_is_a_quiet_end() {
+fn closed_output_pipe_ends_echo_without_error() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let (args, domain) = (args(&["front/scan"], &Format::Json, count(5)), domain_options(&test_domain));
@@ -285,7 +285,7 @@ fn a_reader_that_goes_away_is_a_quiet_end() {
 }
 
 #[test]
-fn flags_are_the_last_key_of_a_line_with_a_head() {
+fn flags_are_the_last_key_of_sample_lines() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let verb = start(&test_domain, &["front/scan", "front/zones", "front/telegram"], Format::Json, count(4));
@@ -337,7 +337,7 @@ fn summary_reports_line_loss_during_the_run() {
 
 /// A subscriber can borrow at most four statuses. The same number of statuses may be queued.
 #[test]
-fn statuses_that_waited_do_not_hide_later_ones() {
+fn queued_statuses_do_not_hide_later_statuses() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let names = [TopicName { sensor: "front".to_owned(), topic: Topic::Scan }];

@@ -75,7 +75,7 @@ fn each_wait_mode_reports_ages() {
 }
 
 #[test]
-fn a_limit_is_kept_or_is_a_failed_check() {
+fn exceeded_p99_limit_is_a_failed_check() {
     let test_domain = TestDomain::new();
     let with = |limit: &str| {
         run_with_three_zones(&test_domain, true, &format!("front/zones -n 20 --max-p99 {limit}"))
@@ -110,7 +110,7 @@ fn samples_from_before_the_start_have_no_age() {
 }
 
 #[test]
-fn as_text() {
+fn prints_latency_as_text() {
     let test_domain = TestDomain::new();
     let (end, out, notes) = run_with_three_zones(&test_domain, false, "front/zones -n 20");
     assert_eq!(end, Ok(()));
@@ -124,7 +124,7 @@ fn as_text() {
 }
 
 #[test]
-fn a_line_each_second_and_a_hub_that_is_replaced() {
+fn prints_a_line_per_second_across_hub_restarts() {
     let test_domain = TestDomain::new();
     let verb = start(&test_domain, true, "front/zones");
     let tell = |boot, lines| {
@@ -148,7 +148,7 @@ fn a_line_each_second_and_a_hub_that_is_replaced() {
 }
 
 #[test]
-fn without_a_hub_it_ends_within_a_second() {
+fn latency_fails_at_once_without_a_hub() {
     let test_domain = TestDomain::new();
     let failure = start(&test_domain, true, "front/scan -n 1").join().0.expect_err("no hub");
     assert_eq!(failure.kind, Kind::NoHub);

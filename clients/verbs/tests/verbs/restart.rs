@@ -69,7 +69,7 @@ fn echo_continues_after_a_killed_hub() {
 }
 
 #[test]
-fn a_subscription_says_that_the_hub_was_restarted() {
+fn subscription_reports_a_hub_restart_once() {
     let test_domain = TestDomain::new();
     let mut scans = Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).open().unwrap();
     assert!(!scans.hub_is_running() && scans.try_next().unwrap().is_none());
@@ -121,7 +121,7 @@ fn subscriber_continues_after_a_clean_hub_exit() {
 }
 
 #[test]
-fn a_client_that_comes_between_two_hubs() {
+fn client_started_between_two_hubs_receives_scans() {
     let test_domain = TestDomain::new();
     let hub = HubProcess::start(&test_domain, 1);
     wait_until("a hub", || matches!(hub_pid(test_domain.domain.root()), Ok(Some(1..))));

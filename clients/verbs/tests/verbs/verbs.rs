@@ -25,7 +25,7 @@ fn start_info(test_domain: &TestDomain, sensor: Option<&str>, json: bool) -> Run
 }
 
 #[test]
-fn without_a_hub_they_end() {
+fn list_and_info_fail_without_a_hub() {
     let test_domain = TestDomain::new();
     let verbs = [start_list(&test_domain, true), start_info(&test_domain, None, true)];
     for verb in verbs {
@@ -34,7 +34,7 @@ fn without_a_hub_they_end() {
 }
 
 #[test]
-fn topics_of_a_hub() {
+fn list_prints_topics_and_rates_of_a_hub() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["rear", "front"], 1);
     for sensor in &mut hub.sensors {
@@ -70,7 +70,7 @@ fn topics_of_a_hub() {
 }
 
 #[test]
-fn live_domains() {
+fn list_prints_domains_with_a_running_hub() {
     let test_domain = TestDomain::new();
     let list = || {
         let (end, out, _) = list(&test_domain, ListArgs { domains: true }, true).join();
@@ -87,7 +87,7 @@ fn live_domains() {
 }
 
 #[test]
-fn info_of_a_sensor() {
+fn info_prints_the_status_of_a_sensor() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front", "rear"], 1);
     for sensor in &mut hub.sensors {
@@ -116,7 +116,7 @@ fn info_of_a_sensor() {
 }
 
 #[test]
-fn a_hub_that_says_nothing() {
+fn missing_status_is_a_timeout_of_info() {
     let test_domain = TestDomain::new();
     let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     assert_eq!(start_info(&test_domain, None, true).join().0.unwrap_err().kind, Kind::Timeout);
@@ -125,7 +125,7 @@ fn a_hub_that_says_nothing() {
 }
 
 #[test]
-fn rates_of_all_topics() {
+fn hz_measures_all_topics() {
     let test_domain = TestDomain::new();
     let mut hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let args = HzArgs { topics: Vec::new(), window: Duration::from_secs(10), limits: RunLimits::default() };

@@ -30,7 +30,7 @@ fn publish_until_received(sensor: &mut FakeSensor, verdict: Verdict, mut is_rece
 }
 
 #[test]
-fn a_silence_is_unknown_once() {
+fn silence_is_unknown_once() {
     let test_domain = TestDomain::new();
     let mut hub = slow_hub(&test_domain, &["front"], 7);
     let mut zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open().unwrap();
@@ -60,7 +60,7 @@ fn a_silence_is_unknown_once() {
 }
 
 #[test]
-fn without_a_hub_and_after_one() {
+fn verdict_is_unknown_before_and_after_a_hub() {
     let test_domain = TestDomain::new();
     let mut zones = ZonesSubscriber::builder("front").in_domain(&test_domain.domain).open().unwrap();
     let received = zones.next().unwrap();
@@ -95,7 +95,7 @@ fn newest_verdict_counts_and_stale_one_is_unknown() {
 }
 
 #[test]
-fn echo_says_the_silence_too() {
+fn echo_prints_a_silence_in_each_format() {
     let test_domain = TestDomain::new();
     let mut hub = slow_hub(&test_domain, &["front"], 0xAB);
     let verbs = [Format::Json, Format::Text, Format::Raw]
@@ -136,7 +136,7 @@ fn echo_says_the_silence_too() {
 }
 
 #[test]
-fn the_robot_is_the_worst_of_its_sensors() {
+fn combined_verdict_is_the_worst_of_all_sensors() {
     let test_domain = TestDomain::new();
     let mut hub = slow_hub(&test_domain, &["front", "rear"], 1);
     let mut all = RobotSubscriber::builder(&[]).in_domain(&test_domain.domain).open().unwrap();
@@ -175,7 +175,7 @@ fn the_robot_is_the_worst_of_its_sensors() {
 }
 
 #[test]
-fn echo_of_the_robot() {
+fn echo_prints_combined_verdicts() {
     let test_domain = TestDomain::new();
     let mut hub = slow_hub(&test_domain, &["rear", "front"], 1);
     let bounds = RunLimits { count: Some(3), ..RunLimits::default() };

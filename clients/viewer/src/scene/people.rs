@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn tail_follows_the_id_and_ends() {
+    fn tail_belongs_to_an_id_and_expires() {
         let mut people = People::default();
         for n in 0..300 {
             let x_m = n as f32 / 100.0;
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn rooms_are_counted_by_name() {
+    fn people_are_counted_by_room_name() {
         let mut tracks = of(&[(1, 0.0), (2, 0.0), (3, 0.0), (4, 0.0)]);
         for (track, room) in tracks.track_array.iter_mut().zip(["kitchen", "", "hall", "kitchen"]) {
             track.set_room(room);

@@ -369,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn trail_has_few_steps_and_ends() {
+    fn trail_is_thinned_and_expires() {
         let mut trail = Trail::default();
         for n in 0..100 {
             trail.take(n * 25_000_000, || vec![(n as f64, 0.0)]);

@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn a_queue_covers_a_quarter_of_a_second() {
+    fn queue_covers_a_quarter_of_a_second() {
         let store = ChannelStore::new().unwrap();
         // Interval of the messages in milliseconds, and how many of them are queued.
         for (interval, queued) in [(1000, 2), (100, 3), (27, 10), (5, 16), (0, 16)] {

@@ -141,7 +141,7 @@ mod tests {
     /// The expected messages were recorded from a server of PyPI's foxglove-sdk 0.30.3, with the same channel and
     /// message.
     #[test]
-    fn sends_the_same_as_the_foxglove_sdk() {
+    fn messages_equal_those_of_the_foxglove_sdk() {
         let channel = Channel {
             topic: "/front/status".into(),
             encoding: "json",

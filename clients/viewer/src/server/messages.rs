@@ -313,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn state_of_the_hub_as_text() {
+    fn hub_text_has_domain_process_and_cpu_usage() {
         let mut scene = Scene { hub_is_running: true, ..Scene::default() };
         assert_eq!(hub_text(&scene, "default"), "domain default");
         (scene.hub_pid, scene.hub_percent) = (77, Some(1.26));

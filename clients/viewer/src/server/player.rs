@@ -92,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn progress_as_text() {
+    fn progress_is_formatted_as_text() {
         let playing =
             Progress { position_s: 59.96, length_s: Some(75.0), rate: Some(0.5), ..Progress::default() };
         let paused = Progress { paused: true, rate: None, length_s: None, lap: 1, ..playing };

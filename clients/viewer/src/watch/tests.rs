@@ -146,7 +146,7 @@ fn compare(file: &str, text: &str) {
 }
 
 #[test]
-fn robot_on_small_and_large_screens() {
+fn draws_robot_on_small_and_large_screens() {
     let (scene, colors, plain) = (scene(), View::new(true), View::new(false));
     compare("tests/watch/robot_60x20.txt", &text(&screen(&scene, &colors, (60, 20))));
     compare("tests/watch/robot_120x40.txt", &text(&screen(&scene, &colors, (120, 40))));
@@ -155,7 +155,7 @@ fn robot_on_small_and_large_screens() {
 }
 
 #[test]
-fn help_one_sensor_and_no_hub() {
+fn draws_help_single_sensor_and_missing_hub() {
     let mut scene = scene();
     let help = View { help: true, ..View::new(false) };
     compare("tests/watch/help_60x20.txt", &text(&screen(&scene, &help, (60, 20))));
@@ -265,7 +265,7 @@ fn draws_on_tiny_screens() {
 }
 
 #[test]
-fn picture_in_the_documents_is_current() {
+fn documentation_picture_is_up_to_date() {
     compare("../../docs/watch.svg", &svg(&screen(&scene(), &View::new(true), (80, 30))));
 }
 

@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn keys_choose_sensors_and_layers() {
+    fn keys_select_sensors_and_layers() {
         let (mut view, scene) = (View::new(false), two());
         assert_eq!(view.shown(&scene).len(), 2);
         for only in [Some(0), Some(1), None] {
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn arrows_move_the_pointer_if_there_is_one() {
+    fn arrows_move_the_pointer_or_else_the_picture() {
         let (mut view, scene) = (View::new(false), two());
         view.key(Key::Up, &scene);
         let moved = view.center_m;
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn mouse_moves_the_pointer_and_wheel_zooms_around_it() {
+    fn mouse_moves_the_pointer_and_wheel_zooms() {
         let (mut view, scene) = (View::new(false), two());
         view.map = Rect::new(0, 1, 60, 16);
         (view.center_m, view.dot_m) = ((2.0, 1.0), 0.1);
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn picture_fits_until_it_is_moved_and_after_c() {
+    fn picture_fits_until_moved_and_after_key_c() {
         let (mut view, scene) = (View::new(false), two());
         view.map = Rect::new(0, 1, 60, 17);
         view.fit(&scene);

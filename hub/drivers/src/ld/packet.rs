@@ -285,7 +285,7 @@ mod tests {
     ];
 
     #[test]
-    fn the_manuals_packet() {
+    fn decodes_and_encodes_the_packet_of_the_manual() {
         let packet = Packet::check(&MANUAL).expect("intact");
         assert_eq!((packet.speed(), packet.start(), packet.span()), (2_152, 32_427, 33_470 - 32_427));
         assert_eq!((packet.measured(0), packet.measured(11)), ((224, 228), (192, 229)));
@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn every_bit_counts() {
+    fn checksum_detects_every_flipped_bit() {
         for bit in 0..PACKET_LEN * 8 {
             let mut bytes = MANUAL;
             bytes[bit / 8] ^= 1 << (bit % 8);
@@ -307,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn angles_run_on_through_zero() {
+    fn packet_angles_continue_across_zero() {
         let contents = PacketContents {
             speed: 3_600,
             start: 35_560,

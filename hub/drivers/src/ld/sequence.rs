@@ -314,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn packets_follow_each_other_and_points_come_evenly() {
+    fn consecutive_packets_have_evenly_spaced_points() {
         let mut sequence = PacketSequencer::new();
         let mut before: Option<Nanos> = None;
         for n in 0..2_000 {
@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn gaps_are_counted_however_long() {
+    fn counts_missing_packets_of_any_gap() {
         for gap in [1, 2, 5, 36, 37, 38, 75, 190, 370] {
             let mut sequence = PacketSequencer::new();
             (0..100).for_each(|n| {
@@ -373,7 +373,7 @@ mod tests {
     }
 
     #[test]
-    fn a_head_that_stands_still_is_no_error() {
+    fn stopped_head_has_no_point_rate() {
         let mut sequence = PacketSequencer::new();
         for n in 0..100 {
             let still = PacketContents {
@@ -395,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_continues_is_not_a_restart() {
+    fn continuous_scanner_clock_is_not_a_restart() {
         for last in [0, 1, 12_345, 29_999] {
             for passed in
                 [0, 3 * MILLIS, 400 * MILLIS, 12 * SECOND, 29_990 * MILLIS, 31 * SECOND, 125 * SECOND]
@@ -410,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_begins_again_is_a_restart() {
+    fn scanner_clock_reset_is_a_restart() {
         for last in [5_000, 12_345, 29_000] {
             for (passed, millis) in [(350, 300), (1_200, 800), (2_300, 2_000), (40_000, 2_000)] {
                 assert!(has_restarted(last, millis, after(passed * MILLIS)), "{last} {passed} {millis}");
@@ -419,7 +419,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_that_waited_in_the_host_are_not_a_restart() {
+    fn backlog_of_the_host_is_not_a_restart() {
         // The hub's process was stopped for 9 s and then read a packet. The scanner measured it at an unknown time in
         // these 9 s.
         for advance in [100, 2_000, 8_900] {
@@ -430,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn one_packet_alone_proves_nothing() {
+    fn restart_needs_two_consecutive_packets() {
         let mut restarts = Restarts::default();
         restarts.note_first(100, Some((0, 0)));
         restarts.note_next(20_000, SECOND);

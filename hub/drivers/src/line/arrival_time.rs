@@ -148,7 +148,7 @@ mod tests {
     use scanhub_schema::MILLIS;
 
     #[test]
-    fn later_bytes_took_their_time() {
+    fn latest_arrival_allows_for_line_time() {
         let mut arrivals = ReadLog::default();
         arrivals.note_read(1_000_000, 100);
         arrivals.note_read(1_500_000, 0);
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn backlogged_bytes_may_be_old() {
+    fn backlogged_bytes_have_an_early_earliest_arrival() {
         let (mut arrivals, flow) = (ReadLog::default(), evenly(100_000.0));
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note_read(at(1_000), 50);
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn packets_arrive_in_one_piece() {
+    fn earliest_arrival_uses_packet_boundaries() {
         let (mut arrivals, flow) = (ReadLog::default(), evenly(100_000.0));
         let packets = StreamTiming { packet_len: 84, ..flow };
         let on_a_line = StreamTiming { line_rate: Some(400_000), ..packets };
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn full_tty_has_space_once_it_is_read() {
+    fn full_tty_buffer_has_space_after_a_read() {
         let mut arrivals = ReadLog::default();
         let packets = StreamTiming { packet_len: 84, ..evenly(15_000.0) };
         let at = |millis: Nanos| millis * MILLIS;

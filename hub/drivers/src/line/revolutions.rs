@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn lacks_points_that_arrived_before_it_was_reached() {
+    fn revolutions_with_missing_points_are_incomplete() {
         let mut turns = RevolutionAssembler::<400>::new();
         turns.begin(360);
         let pace = RotationRate { step: 1.0, point_ns: 1e6 };

@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn writes_words_that_have_arrived() {
+    fn writes_received_words_of_a_partial_scan() {
         let raw = |bytes| RawScan {
             number: 0,
             first: 0,
@@ -322,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn zero_and_a_turn_are_one_beam_from_both_sides() {
+    fn angles_0_and_360_belong_to_the_same_beam() {
         for degrees in [-22.0, 0.0, 22.0, 338.0, 360.0, 382.0] {
             let (ranges, ..) = eight(&[at(degrees, 500)]);
             assert_eq!(ranges[0], 500, "{degrees}");
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn the_order_of_points_changes_nothing() {
+    fn grid_does_not_depend_on_point_order() {
         let mut random = fastrand::Rng::with_seed(3);
         let mut turn = [NONE; 1_000];
         for (number, point) in turn.iter_mut().enumerate() {
@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn every_angle_has_a_place_even_one_that_is_none() {
+    fn every_angle_maps_to_a_beam_even_nan() {
         let grid = Grid::new(8_192);
         let (mut ranges, mut intensities, mut angles) = ([0; 8_192], [0; 8_192], [0.0; 8_192]);
         let wild = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 100.0, -100.0, TAU, -TAU, 2.0 * TAU];

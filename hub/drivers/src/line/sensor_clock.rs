@@ -207,14 +207,14 @@ mod tests {
     }
 
     #[test]
-    fn late_packets_do_not_move_it() {
+    fn late_packets_do_not_shift_the_clock() {
         assert!(worst_us(0.0, 0.0, 1.0, 0.5) < 500.0);
         assert!(worst_us(0.0, 0.5, 3.0, 0.5) < 500.0);
         assert!(worst_us(0.0, 0.9, 5.0, 0.5) < 500.0);
     }
 
     #[test]
-    fn miscounted_times_are_corrected_and_are_not_drift() {
+    fn miscounted_times_do_not_change_the_drift() {
         let mut clock = SensorClock::new();
         let (mut counted, mut wrong) = (0, 0);
         for n in 0..40_000u64 {
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn drift_is_followed() {
+    fn clock_follows_drift() {
         for drift in [-0.01, -0.000_5, 0.000_5, 0.01] {
             let worst = worst_us(drift, 0.0, 1.0, 4.0);
             assert!(worst < 1_000.0, "{drift}: {worst}");

@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_that_a_line_held_back_are_not_new() {
+    fn stamp_of_delayed_bytes_is_their_earliest_arrival() {
         let mut arrivals = ArrivalEstimator::new(0);
         arrivals.note_read(1_000 * MILLIS, 16, Some(500_000));
         arrivals.note_read(1_500 * MILLIS, 0, Some(500_000));
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn first_bytes_are_not_older_than_the_session() {
+    fn stamp_is_not_before_the_session_start() {
         let mut arrivals = ArrivalEstimator::new(9_000 * MILLIS);
         arrivals.note_read(9_010 * MILLIS, 400, Some(500_000));
         let at = 9_010 * MILLIS - 399 * 20_000;
@@ -384,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn host_sleeps_after_three_telegrams() {
+    fn host_sleeps_once_three_telegrams_are_timed() {
         let mut rhythm = TelegramTiming::new();
         for took in [18_300_000, 18_000_000, 90_000_000] {
             rhythm.begin_telegram(0);
@@ -432,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn lead_leaves_one_chunk() {
+    fn wake_lead_leaves_about_one_chunk() {
         for (chunk, lateness) in [(320, 60), (320, 150), (1_240, 60), (1_240, 400), (80, 30)] {
             let (reads, late) = play(chunk * MICROS, lateness * MICROS);
             assert!(
@@ -447,7 +447,7 @@ mod tests {
     }
 
     #[test]
-    fn host_reads_once_for_each_piece() {
+    fn host_wakes_once_per_partial_read() {
         let mut rhythm = TelegramTiming::new();
         (0..3).for_each(|_| rhythm.end_telegram(18_000_000));
         rhythm.set_partial_reads(3);

@@ -346,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn printed_requests_both_ways() {
+    fn printed_requests_encode_and_decode() {
         let vectors: [(Request, &[u8]); 23] = [
             (Request::Reset, &[0x02, 0, 1, 0, 0x10, 0x34, 0x12]),
             (Request::Status, &[0x02, 0, 1, 0, 0x31, 0x15, 0x12]),
@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn every_other_request_both_ways() {
+    fn unprinted_requests_encode_and_decode() {
         let span = SubRange { first: 1, last: 181 };
         let spans = SubRanges::new(&[span, SubRange { first: 200, last: 201 }]).unwrap();
         for request in [
@@ -427,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn one_to_five_spans() {
+    fn subranges_have_one_to_five_spans() {
         let span = SubRange { first: 1, last: 2 };
         assert_eq!(SubRanges::new(&[]), None);
         assert_eq!(SubRanges::new(&[span; 6]), None);
@@ -442,7 +442,7 @@ mod tests {
     }
 
     #[test]
-    fn raw_parameters_end_somewhere() {
+    fn raw_parameters_have_at_most_16_bytes() {
         assert_eq!(RawParameters::new(&[7; 16]).unwrap().as_slice(), [7; 16]);
         assert_eq!(RawParameters::new(&[7; 17]), None);
     }

@@ -132,7 +132,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn items_leave_no_gap() {
+    fn configuration_items_are_contiguous() {
         let end = ITEMS.iter().fold(0, |at, item| {
             assert_eq!(item.at, at, "{}", item.name);
             at + item.len
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn old_and_new_lengths() {
+    fn accepts_both_configuration_lengths() {
         let mut bytes = factory_configuration(Mode(4), Unit::Mm);
         bytes[4] = 3;
         assert_eq!(Configuration::new(&bytes[..31]), None);

@@ -730,7 +730,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_field_by_field() {
+    fn explains_each_field_of_a_request() {
         let request = Request::Variant(crate::lms::variant::Variant::HALF).encode(0);
         let lines = explained(request.telegram(), None);
         let expected = [
@@ -746,7 +746,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_with_and_without_its_mode() {
+    fn explains_scan_with_known_and_unknown_mode() {
         let encoded = measured::encode(1, Unit::Cm, &[0xA3E8, 0x3FFF, 200], 0x92);
         let words =
             |mode| explained(encoded.telegram(), mode).into_iter().map(|(_, line)| line).collect::<Vec<_>>();

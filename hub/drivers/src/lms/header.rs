@@ -216,7 +216,7 @@ mod tests {
     const HEADER: StreamHeader = [0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41];
 
     #[test]
-    fn a_header_is_judged_as_soon_as_a_byte_decides() {
+    fn header_is_refused_at_the_first_wrong_byte() {
         let stream = ExpectedHeaders::Stream { header: HEADER, reply: None };
         let states =
             [State::Address, State::LengthLow, State::LengthHigh, State::Body, State::Body, State::Body];
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn before_the_mode_is_known_any_reply_may_come() {
+    fn accepts_any_reply_while_the_mode_is_unknown() {
         let any = ExpectedHeaders::Anything;
         assert_eq!(check_header(&[0x02, 0x81, 3, 0, 0xA0], &any), HeaderCheck::Candidate { len: 9 });
         assert_eq!(check_header(&[0x02, 0x00], &any), HeaderCheck::Refused(Reject::Address));
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn in_a_stream_the_open_reply_may_come() {
+    fn accepts_the_pending_reply_in_a_stream() {
         let open = ExpectedHeaders::Stream { header: HEADER, reply: Some(0xB1) };
         assert_eq!(check_header(&[0x02, 0x80, 0x9A, 0, 0xB1], &open), HeaderCheck::Candidate { len: 160 });
         assert_eq!(check_header(&[0x02, 0x80, 2, 0, 0x92], &open), HeaderCheck::Candidate { len: 8 });

@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn each_cannot_do_something() {
+    fn each_model_refuses_unsupported_requests() {
         let span = SubRange { first: 1, last: 2 };
         assert!(LmsModel::Lms200.refuses(Request::Counters).is_some());
         assert!(LmsModel::Lms211.refuses(Request::Counters).is_none());

@@ -246,7 +246,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_are_split_as_the_mode_says() {
+    fn mode_determines_range_and_intensity_bits() {
         let words: Vec<u16> = (0..181).map(|i| (i % 8) << 13 | (1000 + i)).collect();
         let encoded = encode(0, Unit::Cm, &words, 0x10);
         let measured = MeasuredValues::decode(encoded.telegram()).unwrap();
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn a_status_knows_the_modes_with_reflector_bits() {
+    fn status_reports_modes_with_reflector_bits() {
         for mode in 0..scanhub_schema::Status::MODE_UNKNOWN {
             let status = scanhub_schema::Status { mode, ..scanhub_schema::Status::default() };
             assert_eq!(status.has_reflector_bits(), Some(Mode(mode).intensity_bits() > 0), "{mode}");
@@ -273,12 +273,12 @@ mod tests {
     }
 
     #[test]
-    fn periods() {
+    fn nominal_period_needs_a_known_beam_count() {
         assert_eq!((nominal_period(361, 500_000), nominal_period(180, 500_000)), (26_640_000, 0));
     }
 
     #[test]
-    fn the_synthetic_scan_of_the_reference() {
+    fn encodes_and_decodes_the_reference_scan() {
         let words: [u16; 361] = core::array::from_fn(|i| 1000 + i as u16);
         let encoded = encode(0, Unit::Mm, &words, 0x10);
         assert_eq!(encoded.bytes().len(), 732);
@@ -290,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn partial_scans_with_indices_both_ways() {
+    fn partial_scan_with_indices_round_trips() {
         let words: [u16; 180] = core::array::from_fn(|i| i as u16);
         let frame = ScanFrame { unit: Unit::Cm, partial: Some(2), indices: Some((255, 7)) };
         let encoded = encode_with(1, frame, &words, 0x11);
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_of_the_listing() {
+    fn telegram_lengths_match_the_listing() {
         for (beams, length) in [(181, 0x016E), (361, 0x02D6), (101, 0xCE), (201, 0x0196), (401, 0x0326)] {
             let encoded = encode(0, Unit::Mm, &[0; MAX_BEAMS][..beams], 0x10);
             assert_eq!(encoded.telegram().length(), length);
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_count_that_lies_is_refused() {
+    fn mismatched_value_count_is_refused() {
         for (word, values) in [(361, 360), (361, 363), (0, 0), (402, 402), (0xC001, 1)] {
             let mut writer = Writer::new(0x80, MEASURED).word(word);
             for _ in 0..values {
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hundred_field_values_fill_a_telegram() {
+    fn hundred_field_values_fill_a_telegram() {
         let mut data = [0; 806];
         data[4] = 100;
         assert!(Rows::of_fields(&data).is_some());

@@ -129,7 +129,7 @@ mod tests {
     use crate::lms::command::{MODE, Request};
 
     #[test]
-    fn every_mode_both_ways() {
+    fn every_operating_mode_round_trips() {
         let span = SubRange { first: 1, last: 181 };
         let modes = [
             Operating::Installation(Password::FACTORY),
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn one_range_as_drivers_ask_for_it() {
+    fn reflectivity_request_matches_carmen() {
         // CARMEN sends 20 2B 01 00 01 00 B5 00.
         let spans = SubRanges::new(&[SubRange { first: 1, last: 181 }]).unwrap();
         let encoded = Request::Operate(Operating::Reflectivities(spans)).encode(0);
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mode_with_wrong_parameters_is_none() {
+    fn operating_mode_with_bad_parameters_is_refused() {
         for data in [&[][..], &[0, 1, 2], &[0x24, 0], &[0x26], &[0x27, 1, 0, 2], &[0x43], &[0x2B, 6, 0]] {
             let telegram = Writer::new(0, MODE).slice(data).finish();
             assert_eq!(Request::decode(telegram.telegram()), None, "{data:?}");

@@ -396,7 +396,7 @@ mod tests {
     use crate::lms::command::Request;
 
     #[test]
-    fn waits_for_a_server_that_packs_the_longest_reply() {
+    fn reply_timeout_is_longer_behind_a_serial_server() {
         let until = |behind_server: bool| {
             let mut exchange = RequestChannel::new(Baud::B9600, 0);
             exchange.is_behind_server = behind_server;

@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn delays_are_not_losses() {
+    fn delayed_scans_do_not_count_as_lost() {
         let jittery = (0..4000).map(|n| f64::from(n) + f64::from(n * 7 % 10) * 0.04);
         assert_eq!(after_scans(jittery).lost, 0);
         // A network sometimes delays scans for 200 ms and then delivers all of them at once.

@@ -443,7 +443,7 @@ mod tests {
     }
 
     #[test]
-    fn complaint_counts_once_confirmed() {
+    fn defect_is_reported_once_confirmed() {
         let healthy = SimulatedStatus {
             software: *b"V02.30 ",
             operating_mode: ON_REQUEST,

@@ -438,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn items_leave_no_gap() {
+    fn status_items_are_contiguous() {
         let end = ITEMS.iter().fold(0, |at, item| {
             assert_eq!(item.at, at, "{}", item.name);
             at + item.len

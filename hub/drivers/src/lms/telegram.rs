@@ -265,7 +265,7 @@ mod tests {
     use super::{crc, *};
 
     #[test]
-    fn a_view_exists_only_if_the_checksum_is_right() {
+    fn view_exists_only_if_the_checksum_is_right() {
         let good = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
         let telegram = Telegram::check(&good).unwrap();
         assert_eq!((telegram.address(), telegram.command(), telegram.length()), (0x80, 0xA0, 3));
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn writing_and_reading_agree() {
+    fn written_telegram_passes_the_check() {
         let encoded = Writer::new(0x00, 0x20).byte(0x24).finish();
         assert_eq!(encoded.bytes(), [0x02, 0x00, 0x02, 0x00, 0x20, 0x24, 0x34, 0x08]);
         assert_eq!(Telegram::check(encoded.bytes()), Some(encoded.telegram()));
@@ -290,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn printed_telegrams() {
+    fn crc_matches_printed_telegrams() {
         assert_eq!(crc(&[0x02, 0x00, 0x01, 0x00, 0x31]), 0x1215);
         assert_eq!(crc(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10]), 0x0A16);
         assert_eq!(crc(&[0x02, 0x81, 0x03, 0x00, 0xA0, 0x00, 0x10]), 0x1A36);

@@ -274,7 +274,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn beams_and_periods_of_the_listing() {
+    fn beams_and_periods_match_the_listing() {
         assert_eq!(Variant::ALL.map(Variant::beams), [181, 361, 101, 201, 401]);
         assert_eq!(Variant::of_beams(361), Some(Variant::HALF));
         assert_eq!(Variant::new(180, 25), None);
@@ -286,14 +286,14 @@ mod tests {
     }
 
     #[test]
-    fn modes_split_a_value() {
+    fn mode_determines_bits_of_a_value() {
         assert_eq!((Mode(1).range_bits(), Mode(1).intensity_bits(), Mode(1).max_value()), (13, 3, 8191));
         assert_eq!((Mode(4).range_bits(), Mode(4).intensity_bits()), (14, 0));
         assert_eq!((Mode(5).range_bits(), Mode(5).intensity_bits()), (15, 1));
     }
 
     #[test]
-    fn codes_of_the_listing() {
+    fn codes_match_the_listing() {
         // 13, 14 and 15 bits; the listing prints 16385 for 16375.
         for (mode, words) in [
             (Mode(0), [8191, 8190, 8189, 8187, 8186, 8183]),
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn upper_bits() {
+    fn splits_upper_bits_from_the_range() {
         assert_eq!(Mode(1).split(0xA3E8), Value { range: Ok(1000), upper: 5 });
         assert_eq!(Mode(4).split(0xC3E8), Value { range: Ok(1000), upper: 3 });
         assert_eq!(Mode(5).split(0x83E8), Value { range: Ok(1000), upper: 1 });

@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_by_itself() {
+    fn decodes_standard_points() {
         // Quality 15, 90 degrees, 2 m.
         let node = [0x3D, 0x01, 0x2D, 0x40, 0x1F];
         assert!(PacketFormat::Standard.is_valid(&node));
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn express_points_lie_before_their_places() {
+    fn express_points_have_angle_corrections() {
         // 1,234 mm with 37/8 degrees, and 40 mm with 26/8 degrees.
         let [a, b] = [1_234 << 2 | 2u16, 40 << 2 | 1].map(u16::to_le_bytes);
         let bytes = packet(PacketFormat::Express, &[0x80, 0x16, a[0], a[1], b[0], b[1], 0xA5]);
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn ultra_points_differ_from_their_neighbours() {
+    fn ultra_points_are_differences_from_major_points() {
         let three = |major: u32, first: i32, second: i32| {
             (major | (first as u32 & 0x3FF) << 12 | (second as u32 & 0x3FF) << 22).to_le_bytes()
         };
@@ -313,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn dense_ranges_are_plain() {
+    fn dense_ranges_are_in_millimeters() {
         let bytes = packet(PacketFormat::Dense, &[0, 0, 0x10, 0x27, 0, 0]);
         let ranges = [0, 1].map(|i| PacketFormat::Dense.point(&bytes, &bytes, i).range);
         assert_eq!((ranges, PacketFormat::Dense.start_angle(&bytes)), ([10_000, 0], 0.0));
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn every_bit_of_a_packet_with_a_checksum_counts() {
+    fn checksum_detects_every_flipped_bit() {
         for kind in PacketFormat::ALL.into_iter().filter(|kind| kind.is_checked()) {
             let right = packet(kind, &[0x80, 0x16, 1, 2, 3, 4, 0x80, 0x16, 7, 8, 9]);
             assert!(kind.is_valid(&right[..kind.byte_len()]));

@@ -348,7 +348,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn requests_as_the_maker_writes_them() {
+    fn requests_match_the_manufacturers_examples() {
         assert_eq!(Request::STOP.bytes(), [0xA5, 0x25]);
         assert_eq!(Request::express(0).bytes(), [0xA5, 0x82, 5, 0, 0, 0, 0, 0, 0x22]);
         assert_eq!(Request::set_motor_pwm(660).bytes(), [0xA5, 0xF0, 2, 0x94, 0x02, 0xC1]);
@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn heads_of_answers() {
+    fn parses_and_encodes_response_descriptors() {
         let info = [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04];
         assert_eq!(ResponseDescriptor::parse(&info), Some(ResponseDescriptor::Reply(ResponseType::Info, 20)));
         let express = [0xA5, 0x5A, 0x54, 0, 0, 0x40, 0x82];
@@ -378,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn identity_of_a_status() {
+    fn identity_is_restored_from_a_status() {
         let info = Info::of_status(Some(Model::S2), "S2 denseboost 1.02").unwrap();
         assert_eq!((info.id, info.firmware), (0x71, (1, 2)));
         assert_eq!(Info::parse(&info.encode()), Some(info));

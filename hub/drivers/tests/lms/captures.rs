@@ -138,7 +138,7 @@ fn finds_all_telegrams_without_knowing_the_mode() {
 }
 
 #[test]
-fn seven_sessions_as_a_session_listens_to_them() {
+fn finds_telegrams_of_seven_captured_sessions() {
     let (Some(bytes), Some(csv)) = (capture("lms200_38400.bin"), capture("lms200_38400.csv")) else { return };
     let places = telegram_ranges(&csv, (2, Some(3)), 0);
     let command = |&(at, _): &(usize, usize)| bytes[at + 4];
@@ -172,7 +172,7 @@ fn seven_sessions_as_a_session_listens_to_them() {
 }
 
 #[test]
-fn scans_with_reflector_levels() {
+fn finds_captured_scans_with_reflector_levels() {
     let (Some(bytes), Some(csv)) =
         (capture("reflector_levels_cm_18s.bin"), capture("reflector_levels_cm_18s.csv"))
     else {
@@ -196,7 +196,7 @@ fn scans_with_reflector_levels() {
 }
 
 #[test]
-fn a_wrong_rate_looks_like_no_telegram() {
+fn capture_at_a_wrong_rate_has_no_telegram() {
     let Some(bytes) = capture("host19200_while_sensor_38400.bin") else { return };
     let header = [0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41];
     for expect in [ExpectedHeaders::Anything, ExpectedHeaders::Stream { header, reply: None }] {
@@ -215,7 +215,7 @@ fn a_wrong_rate_looks_like_no_telegram() {
 }
 
 #[test]
-fn a_scan_broken_off_by_a_reply() {
+fn captured_scan_aborted_by_a_reply_is_counted() {
     let Some(bytes) = capture("scan_interrupted_by_reply.bin") else { return };
     let header = header_of(&bytes);
     for expect in [ExpectedHeaders::Anything, ExpectedHeaders::Stream { header, reply: Some(0xBA) }] {

@@ -55,7 +55,7 @@ fn assert_bytes_conserved(framer: &Framer) {
 }
 
 #[test]
-fn the_six_states_in_their_order() {
+fn framer_visits_six_states_in_order() {
     let mut framer = framer(STREAM_EXPECT);
     let mut states = vec![framer.state()];
     for byte in scan(|_| 3000) {
@@ -69,7 +69,7 @@ fn the_six_states_in_their_order() {
 }
 
 #[test]
-fn a_telegram_behind_a_shortened_one_is_not_lost() {
+fn telegram_after_a_shortened_telegram_is_found() {
     for lost in 1..=20 {
         let mut bytes = scan(|i| 2000 + i as u16);
         bytes.drain(300..300 + lost);
@@ -118,7 +118,7 @@ fn frame_ending_in_stx_waits_for_the_next_byte() {
 }
 
 #[test]
-fn a_frame_with_a_header_inside_waits_for_it_to_fail() {
+fn frame_is_held_until_the_inner_header_fails() {
     // The values of this scan look like a header. A scan of a real room may have these values, too.
     let spelled = scan(|i| match i {
         200 => 0x8002,
@@ -178,7 +178,7 @@ fn acknowledgements_count_only_while_they_are_awaited() {
 }
 
 #[test]
-fn every_refusal_has_its_reason() {
+fn every_rejected_frame_is_counted_by_reason() {
     let mut framer = framer(STREAM_EXPECT);
     feed(&mut framer, &[0x02, 0x02, 0x80, 0xD7, 0x02, 0x02, 0x80, 0xD6, 0x02, 0xB1], 3);
     feed(&mut framer, &[0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x40, 0, 0, 0, 0], 3);
@@ -198,7 +198,7 @@ fn every_refusal_has_its_reason() {
 }
 
 #[test]
-fn a_flood_of_headers_is_bounded() {
+fn flood_of_headers_is_bounded() {
     let mut framer = framer(ExpectedHeaders::Anything);
     let flood: Vec<u8> = [0x02, 0x80, 0x03].into_iter().cycle().take(100_000).collect();
     for piece in [1, 7, 814, 1628] {
@@ -210,7 +210,7 @@ fn a_flood_of_headers_is_bounded() {
 }
 
 #[test]
-fn frames_that_refute_each_other_leave_room() {
+fn overlapping_frames_do_not_fill_the_buffer() {
     // The longest frames. Each has a valid checksum, and each begins eight bytes before the end of the previous frame.
     let header = [0x02, 0x80, 0x28, 0x03, 0xB1];
     let frame = |begins_with: &[u8]| {
@@ -272,7 +272,7 @@ prop_compose! {
 
 proptest! {
     #[test]
-    fn the_cut_into_reads_changes_nothing((bytes, _) in damaged_stream(), piece in 1usize..1628, any in any::<bool>()) {
+    fn result_does_not_depend_on_read_boundaries((bytes, _) in damaged_stream(), piece in 1usize..1628, any in any::<bool>()) {
         let expect = if any { ExpectedHeaders::Anything } else { STREAM_EXPECT };
         let (mut whole, mut cut) = (framer(expect), framer(expect));
         prop_assert_eq!(feed(&mut whole, &bytes, 1), feed(&mut cut, &bytes, piece));
@@ -296,7 +296,7 @@ proptest! {
     }
 
     #[test]
-    fn garbage_is_never_an_error(bytes in prop::collection::vec(prop_oneof![Just(0x02u8), Just(0x80), any::<u8>()], 0..5000)) {
+    fn garbage_is_discarded_and_counted(bytes in prop::collection::vec(prop_oneof![Just(0x02u8), Just(0x80), any::<u8>()], 0..5000)) {
         for expect in [ExpectedHeaders::Anything, STREAM_EXPECT] {
             let mut framer = framer(expect);
             feed(&mut framer, &bytes, 16);

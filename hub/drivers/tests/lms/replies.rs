@@ -31,7 +31,7 @@ fn bytes(text: &str) -> Vec<u8> {
 const ZERO_BYTES: &str = "00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00";
 
 #[test]
-fn printed_and_captured_replies_both_ways() {
+fn printed_and_captured_replies_round_trip() {
     let f4 = format!("02 80 24 00 F4 00 00 70 00 00 04 01 00 00 02 02 {ZERO_BYTES} 02 00 10 36 FE");
     let f7 = format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {ZERO_BYTES} 02 00 10 C5 7A");
     let (f4, f7) = (bytes(&f4), bytes(&f7));
@@ -80,7 +80,7 @@ fn printed_and_captured_replies_both_ways() {
 
 /// Misprints in the documents. The right bytes were found by calculating the checksums.
 #[test]
-fn misprints_are_refused() {
+fn misprinted_telegrams_are_refused() {
     let a_zero_lost =
         format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {} 02 00 10 C5 7A", &ZERO_BYTES[3..]);
     for text in [
@@ -111,7 +111,7 @@ fn encode_and_decode(reply: &Reply<'_>) -> EncodedTelegram {
 }
 
 #[test]
-fn every_other_reply_both_ways() {
+fn unprinted_replies_round_trip() {
     let span = SubRange { first: 27, last: 28 };
     let scan = measured::encode_with(
         0,
@@ -214,14 +214,14 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 4000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn bytes_without_a_checksum(bytes in proptest::collection::vec(any::<u8>(), 0..900)) {
+    fn decoding_of_any_bytes_does_not_panic(bytes in proptest::collection::vec(any::<u8>(), 0..900)) {
         if let Some(telegram) = Telegram::check(&bytes) {
             let _ = (Request::decode(telegram), Reply::decode(telegram));
         }
     }
 
     #[test]
-    fn explanations(
+    fn every_telegram_has_an_explanation(
         address in any::<u8>(),
         command in commands(),
         data in data(),
@@ -231,7 +231,7 @@ proptest! {
     }
 
     #[test]
-    fn requests(address in 0u8..0x80, command in commands(), data in data()) {
+    fn any_decoded_request_round_trips(address in 0u8..0x80, command in commands(), data in data()) {
         let encoded = telegram(address, command, &data);
         let telegram = encoded.telegram();
         prop_assert_eq!(Reply::decode(telegram), None);
@@ -242,7 +242,7 @@ proptest! {
     }
 
     #[test]
-    fn replies(address in 0x80u8.., command in commands(), data in data(), status in any::<u8>()) {
+    fn any_decoded_reply_round_trips(address in 0x80u8.., command in commands(), data in data(), status in any::<u8>()) {
         let encoded = Writer::new(address, command).slice(&data).byte(status).finish();
         let telegram = encoded.telegram();
         prop_assert_eq!(Request::decode(telegram), None);

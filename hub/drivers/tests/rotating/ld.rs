@@ -350,7 +350,7 @@ fn revolution_cut_by_a_gap_keeps_previous_period() {
 }
 
 #[test]
-fn a_second_without_a_packet_begins_again() {
+fn session_recovers_from_a_second_without_packets() {
     let mut bench = TestBench::new(
         settings_of(Model::Ld19),
         SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default()),
@@ -392,7 +392,7 @@ fn reports_a_silent_line_in_steps() {
 }
 
 #[test]
-fn a_pause_is_quiet_and_ends() {
+fn paused_session_delivers_nothing_until_resumed() {
     let mut bench = TestBench::new(
         settings_of(Model::Ld19),
         SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default()),

@@ -479,7 +479,7 @@ mod tests {
     const BEAMS: usize = 19;
 
     #[test]
-    fn the_short_path_of_a_settled_block_changes_nothing() {
+    fn fast_path_of_a_settled_block_is_equivalent() {
         let mut random = fastrand::Rng::with_seed(1);
         let limits =
             Limits { scans: 300, ..Limits::of(&Settings::default(), &ScanHead::lms(BEAMS, 0, 500, 1, 13)) };

@@ -98,7 +98,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn eigenvectors_are_those_of_the_matrix() {
+    fn eigenvectors_satisfy_their_equation() {
         let mut random = fastrand::Rng::with_seed(3);
         for _ in 0..500 {
             let mut m = [[0.0; 3]; 3];

@@ -45,7 +45,7 @@ fn messages(bytes: &[u8]) -> Vec<(String, u32, u64, u64, Vec<u8>)> {
 }
 
 #[test]
-fn an_mcap_file_keeps_all_messages_of_all_channels() {
+fn mcap_file_keeps_all_messages_of_all_channels() {
     let folder = TempDir::new().unwrap();
     let written = crate::written::recording(20, 11);
     let (whole, copy) = (file(&folder, "whole.mcap", &written.bytes), folder.path().join("copy.mcap"));
@@ -64,7 +64,7 @@ fn an_mcap_file_keeps_all_messages_of_all_channels() {
 }
 
 #[test]
-fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
+fn conversion_repairs_cut_and_damaged_files() {
     let folder = TempDir::new().unwrap();
     let written = crate::written::recording(20, 12);
     let all = messages(&written.bytes);
@@ -92,7 +92,7 @@ fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
 }
 
 #[test]
-fn stream_gains_times_and_loses_no_telegrams() {
+fn stream_conversion_adds_times_and_keeps_telegrams() {
     let folder = TempDir::new().unwrap();
     let mut scans: Vec<Vec<u8>> =
         vec![reply::configuration_reply(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec()];
@@ -277,7 +277,7 @@ fn recorded_marks_become_rows() {
 }
 
 #[test]
-fn a_stream_of_a_real_sensor_comes_back() {
+fn captured_stream_round_trips_through_mcap() {
     let Some(data) = real::recordings() else { return };
     let folder = TempDir::new().unwrap();
     let capture = data.join("captures/lms200_38400.bin");

@@ -82,7 +82,7 @@ fn read(folder: &TempDir, bytes: &[u8]) -> (Vec<WrittenTelegram>, Damage) {
 }
 
 #[test]
-fn cut_at_any_byte_is_read_to_the_last_whole_chunk() {
+fn truncated_file_is_read_to_last_complete_chunk() {
     let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Zstd] {
         let whole = IntactRecording::new(12, compression);
@@ -193,7 +193,7 @@ fn flipped_opcode_bit_costs_at_most_one_chunk() {
 }
 
 #[test]
-fn chunk_that_the_file_has_twice_is_read_once() {
+fn duplicated_chunk_is_read_once() {
     let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Zstd] {
         let whole = IntactRecording::new(20, compression);
@@ -311,7 +311,7 @@ fn refuses_too_large_chunk_but_not_a_wrong_length() {
 }
 
 #[test]
-fn sensors_with_lost_names_are_called_by_number() {
+fn sensors_with_lost_names_are_numbered() {
     let folder = TempDir::new().unwrap();
     let whole = IntactRecording::new(20, Compression::Zstd);
     // Only the first chunk and the index name the sensors.
@@ -328,7 +328,7 @@ fn sensors_with_lost_names_are_called_by_number() {
 }
 
 #[test]
-fn nothing_is_invented_whatever_is_damaged() {
+fn damaged_file_yields_only_original_telegrams() {
     let folder = TempDir::new().unwrap();
     for seed in 0..300 {
         let mut random = Rng::with_seed(seed);
@@ -372,7 +372,7 @@ fn nothing_is_invented_whatever_is_damaged() {
 }
 
 #[test]
-fn file_without_its_beginning_is_refused() {
+fn file_without_a_beginning_is_refused() {
     let folder = TempDir::new().unwrap();
     let bytes = &IntactRecording::new(20, Compression::None).bytes;
     for begin in [1, MAGIC_LEN, bytes.len() / 3] {

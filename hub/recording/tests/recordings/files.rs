@@ -62,7 +62,7 @@ fn stream_file_has_exact_telegrams_and_settings() {
 }
 
 #[test]
-fn a_log_becomes_telegrams() {
+fn log_scans_are_read_as_telegrams() {
     let mut log = String::from("# message formats defined: PARAM FLASER\nODOM 0 0 0 0 0 0 1.5 host 1.5\n");
     for count in [360, 361] {
         log += &format!("FLASER {count} {} 0 0 0 0 0 0 12.25 host 1\n", vec!["1.234"; count].join(" "));
@@ -90,7 +90,7 @@ fn a_log_becomes_telegrams() {
 }
 
 #[test]
-fn refuses_a_non_recording_with_place_and_remedy() {
+fn non_recording_is_refused_with_location_and_remedy() {
     let missing = Recording::open("/nonexistent/a.bin").unwrap_err();
     assert_eq!(missing.kind.exit_code(), 66);
     assert!(missing.message.contains("/nonexistent/a.bin") && !missing.hint.is_empty(), "{missing}");
@@ -151,7 +151,7 @@ fn reads_the_intact_start_of_a_truncated_gzip_file() {
 }
 
 #[test]
-fn a_log_with_harmed_lines_gives_the_others() {
+fn intact_lines_of_a_damaged_log_are_read() {
     let line = |at: u32, range: &str| {
         format!("FLASER 181 {} 0 0 0 0 0 0 {at} host {at}\n", vec![range; 181].join(" "))
     };
@@ -175,7 +175,7 @@ fn a_log_with_harmed_lines_gives_the_others() {
 }
 
 #[test]
-fn recordings_of_real_sensors() {
+fn reads_captures_and_logs_of_real_scanners() {
     let Some(data) = real::recordings() else { return };
     let capture = Recording::open(data.join("captures/lms200_38400.bin")).unwrap();
     assert_eq!((capture.contents().telegrams, capture.contents().scans), (427, 354));

@@ -15,7 +15,7 @@ use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_recording::{Encoding, Frame, Recording, UnreadLines};
 
 #[test]
-fn a_log_comes_back_from_an_mcap_file() {
+fn log_round_trips_through_mcap() {
     let folder = TempDir::new().unwrap();
     let log: String = (0..5)
         .map(|scan| {
@@ -101,7 +101,7 @@ fn log(count: usize, ranges: &[&str]) -> String {
 }
 
 #[test]
-fn ranges_and_codes_of_every_kind_of_log_come_back() {
+fn ranges_and_codes_of_every_log_form_round_trip() {
     let folder = TempDir::new().unwrap();
     for (name, count, ranges) in [
         ("cm-far", 180, &["20.00", "81.91", "81.90", "81.87", "81.83", "81.82", "0.00"][..]),
@@ -134,7 +134,7 @@ fn ranges_and_codes_of_every_kind_of_log_come_back() {
 }
 
 #[test]
-fn times_come_back_to_the_microsecond() {
+fn log_times_round_trip_to_the_microsecond() {
     let folder = TempDir::new().unwrap();
     let mut random = fastrand::Rng::with_seed(40);
     let mut at_us = 1_071_078_720_000_000_u64;
@@ -269,7 +269,7 @@ fn mcap_from_log_has_the_period_of_each_scan() {
 }
 
 #[test]
-fn logs_of_real_sensors_come_back() {
+fn logs_of_real_scanners_round_trip() {
     let Some(data) = real::recordings() else { return };
     let folder = TempDir::new().unwrap();
     for name in ["aces", "freiburg-079", "intel", "orebro"] {

@@ -29,7 +29,7 @@ fn read(recording: &Recording, sensor: &'static str) -> Vec<WrittenTelegram> {
 }
 
 #[test]
-fn each_sensor_has_its_telegrams() {
+fn mcap_file_has_telegrams_of_each_sensor() {
     let written = crate::written::recording(20, 1);
     let file = file(&written.bytes);
     let recording = Recording::open(file.path()).unwrap();
@@ -51,7 +51,7 @@ fn each_sensor_has_its_telegrams() {
 }
 
 #[test]
-fn a_sensor_has_to_be_chosen_of_several() {
+fn several_sensors_require_a_choice() {
     let file = file(&crate::written::recording(4, 2).bytes);
     let recording = Recording::open(file.path()).unwrap();
     let refused =
@@ -75,7 +75,7 @@ fn reads_a_recording_truncated_by_a_kill() {
 }
 
 #[test]
-fn telegrams_alone_are_a_stream() {
+fn file_of_bare_telegrams_is_a_stream() {
     let written = crate::written::recording(40, 3);
     // Other bytes may precede each telegram.
     let telegrams = |before: &[u8]| {

@@ -47,7 +47,7 @@ fn messages(bytes: &[u8]) -> Vec<(String, String, Vec<u8>)> {
 }
 
 #[test]
-fn its_telegrams_are_all_there() {
+fn version_1_file_has_all_telegrams() {
     let folder = TempDir::new().unwrap();
     let (old, new) = (written::recording_of_version_1(20, 21, &Topic::ALL), written::recording(20, 21));
     assert_eq!(old.telegrams, new.telegrams, "both say the same");
@@ -71,7 +71,7 @@ fn its_telegrams_are_all_there() {
 }
 
 #[test]
-fn its_scans_are_those_of_its_telegrams() {
+fn version_1_scans_are_derived_from_telegrams() {
     let folder = TempDir::new().unwrap();
     let payload = written::version_1_scan();
     assert!(Scan::room(&payload).is_some(), "nothing but the encoding says that it is none of today");
@@ -97,7 +97,7 @@ fn its_scans_are_those_of_its_telegrams() {
 }
 
 #[test]
-fn without_telegrams_there_is_nothing_to_convert() {
+fn version_1_file_without_telegrams_is_refused() {
     let folder = TempDir::new().unwrap();
     let old = file(
         &folder,

@@ -79,7 +79,7 @@ fn received_packets_match_the_truth_file() {
 
 /// The host opens the port after both restarts, so a delay of the host has no influence.
 #[test]
-fn it_restarts_after_a_dip_and_a_power_cycle() {
+fn rplidar_restarts_after_brownout_and_power_cycle() {
     for model in [Model::A1, Model::S2] {
         let folder = TestFolder::new();
         let port = folder.path("front");

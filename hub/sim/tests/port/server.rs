@@ -38,7 +38,7 @@ fn read(stream: &mut TcpStream, len: usize) -> Vec<u8> {
 }
 
 #[test]
-fn every_family_speaks_over_tcp_as_the_truth_says() {
+fn every_family_sends_true_telegrams_over_tcp() {
     let rplidar = Scanner::Rplidar { model: Model::A1, mode: 1 };
     for (scanner, request) in [
         (None, Request::Stream.encode(0).bytes().to_vec()),
@@ -62,7 +62,7 @@ fn every_family_speaks_over_tcp_as_the_truth_says() {
 }
 
 #[test]
-fn one_host_at_a_time_and_the_next_when_it_has_left() {
+fn second_host_is_refused_until_the_first_leaves() {
     let simulator = Simulator::start(options(Some(Scanner::Rplidar { model: Model::A1, mode: 1 })));
     let ask = |host: &mut TcpStream| {
         host.write_all(&[0xA5, 0x52]).expect("written");

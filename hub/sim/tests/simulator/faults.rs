@@ -57,14 +57,14 @@ macro_rules! scenes {
 
 #[test]
 #[ignore = "takes minutes: each scene with five times as many seeds, for five times as long"]
-fn everything_for_longer() {
+fn long_fault_scenes_pass_all_checks() {
     for (faults, span_ms, _) in SCENES {
         run_scene(faults, 5 * span_ms, 5 * SEED_COUNT);
     }
 }
 
 #[test]
-fn no_scene_is_about_nothing() {
+fn every_fault_scene_has_an_effect() {
     let mut healthy: HashMap<(bool, u64), SceneResult> = HashMap::new();
     for &(faults, span_ms, has_effect) in SCENES.iter().filter(|(faults, ..)| !faults.is_empty()) {
         let FaultScene { is_idle, .. } = FaultScene::new(faults.parse().expect("faults"), span_ms);

@@ -294,7 +294,7 @@ fn stamps_stay_right_after_the_line_stalls() {
 }
 
 #[test]
-fn a_power_cycle_is_a_silence_and_a_new_beginning() {
+fn power_cycle_is_a_silence_and_one_restart() {
     let mut bench = Bench::new(LdSettings::of(Model::Ld19), &noiseless_world("wall640"), "", 3);
     bench.run(3 * ONE_SECOND);
     let revolutions = bench.revolutions.len();
@@ -446,7 +446,7 @@ fn beam_counts(bench: &Bench) -> Vec<usize> {
 }
 
 #[test]
-fn a_power_cycle_does_not_change_the_number_of_beams() {
+fn power_cycle_does_not_change_the_number_of_beams() {
     for model in Model::ALL {
         for spin_up_s in SPIN_UP_TIMES_S {
             for seed in 0..2 {
@@ -483,7 +483,7 @@ fn scanner_powered_on_later_has_its_beams_at_once() {
 }
 
 #[test]
-fn beams_are_the_points_that_a_revolution_has() {
+fn beam_count_matches_points_per_revolution() {
     let sold = LdSettings { points_per_second: 5_000.0, ..LdSettings::of(Model::Stl19p) };
     let slow = LdSettings { revolutions_per_second: 4.0, ..LdSettings::of(Model::Ld14p) };
     for (settings, beams) in [(sold, 500), (slow, 1_000)] {

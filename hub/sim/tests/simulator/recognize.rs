@@ -66,7 +66,7 @@ fn scanners() -> Vec<(Family, String, Box<dyn Device>)> {
 }
 
 #[test]
-fn family_of_every_scanner_in_every_mode() {
+fn recognizes_every_family_in_every_mode() {
     for (family, name, mut scanner) in scanners() {
         let bytes = first_bytes(&mut *scanner, "", EXAMINED_BYTES + 1_000);
         assert!(bytes.len() > 5_000, "{name}: {} bytes", bytes.len());
@@ -78,7 +78,7 @@ fn family_of_every_scanner_in_every_mode() {
 }
 
 #[test]
-fn family_on_a_line_that_loses_bytes() {
+fn recognizes_every_family_on_a_lossy_line() {
     for (family, name, mut scanner) in scanners() {
         let bytes = first_bytes(&mut *scanner, "loss=0.00135,burst=1.89", EXAMINED_BYTES);
         assert_eq!(family_of(&bytes), Some(family), "{name}");

@@ -239,7 +239,7 @@ fn room() -> Room {
 }
 
 #[test]
-fn every_rplidar_in_every_mode_has_the_same_scans() {
+fn rplidar_stream_files_have_the_same_scans() {
     for model in Model::ALL {
         let fastest = Settings { is_found: true, ..Settings::default() };
         let modes = model.modes().iter().map(|mode| {
@@ -255,7 +255,7 @@ fn every_rplidar_in_every_mode_has_the_same_scans() {
 }
 
 #[test]
-fn every_ldrobot_has_the_same_scans() {
+fn ldrobot_stream_files_have_the_same_scans() {
     for model in ld::Model::ALL {
         for settings in [Settings::default(), Settings { model: Some(model.name()), ..Settings::default() }] {
             let mut head = LdSimulator::new(LdSettings::of(model), room());
@@ -292,7 +292,7 @@ fn refuses_stream_file_without_status_and_responses() {
 /// A stream file without the responses of the scanner can be read: its packets are found. Its scans need the model or
 /// the mode if the packets may be of two kinds.
 #[test]
-fn ambiguous_stream_needs_the_model_or_mode() {
+fn ambiguous_stream_requires_model_or_mode() {
     let folder = TempDir::new().unwrap();
     let settings = Settings { model: Some("s1"), ..Settings::default() };
     let live = LiveStream::run_session(

@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_hub_port_with_the_hubs_own_report() {
+    fn port_held_by_the_hub_is_refused_with_link_state() {
         let error = "1,200 bytes/s arrive, but no LMS replies; is it another scanner?";
         let hub = hub(State::Probing, "/dev/x", error);
         let source = PortSpec::Tty("/dev/x".into());
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_is_found_by_any_name_of_its_port() {
+    fn link_is_found_by_any_name_of_its_port() {
         let directory = tempfile::tempdir().expect("a directory");
         let name = directory.path().join("lidar");
         std::os::unix::fs::symlink("/dev/null", &name).expect("a link");

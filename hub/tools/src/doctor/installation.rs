@@ -466,7 +466,7 @@ mod tests {
     const SERVICE: &str = include_str!("../../../dist/scanhub.service");
 
     #[test]
-    fn judges_installed_service() {
+    fn checks_installed_service() {
         let temp = TempRoot::new(0, &[]);
         let of = |hub| service(&temp.system, hub);
         assert_eq!(of(None).state, State::Skipped);
@@ -501,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn judges_installed_udev_rule() {
+    fn checks_installed_udev_rule() {
         let temp = TempRoot::new(0, &[("dev/ttyUSB0", ""), ("sys/usb/idVendor", "0403\n")]);
         fs::create_dir_all(temp.path("sys/class/tty/ttyUSB0")).unwrap();
         temp.link(temp.path("sys/usb").to_str().unwrap(), "sys/class/tty/ttyUSB0/device");
@@ -547,7 +547,7 @@ mod tests {
     }
 
     #[test]
-    fn judges_program_of_hub() {
+    fn checks_program_of_hub() {
         let of = |build, is_replaced| {
             version_finding("own".to_owned(), Some((7, Some(RunningProgram { build, is_replaced }))))
         };

@@ -437,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn warns_of_name_that_may_change() {
+    fn warns_of_port_name_that_may_change() {
         // Files that exist everywhere stand for the names.
         let [device, by_path, shared] = ["/dev/null", "/dev/zero", "/dev/full"].map(Path::new);
         let twin = SerialPortInfo {
@@ -491,7 +491,7 @@ mod tests {
     }
 
     #[test]
-    fn judges_errors_by_time_and_number() {
+    fn checks_line_errors_by_growth_and_share() {
         let healthy = UartCounters { received: 100_000_000, framing: 900, ..UartCounters::default() };
         let of = |counts: UartCounters, now| line_errors(Some(counts), now);
         assert_eq!(line_errors(None, 0).state, State::Skipped);
@@ -532,7 +532,7 @@ mod tests {
     }
 
     #[test]
-    fn judges_errors_of_hub_by_its_bytes() {
+    fn checks_line_errors_of_hub_per_byte() {
         let mut status = Status::default();
         status.counters[Counter::BytesRead] = 1_000_000;
         status.counters[Counter::LineErrors] = 10;

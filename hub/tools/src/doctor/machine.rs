@@ -459,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn judges_location_of_domain() {
+    fn checks_location_of_domain() {
         let root: PathBuf = facts().root;
         let there = |mode| MachineState {
             directory: ExistingDirectory { path: root.clone(), mode, writable: mode & 0o200 != 0 },
@@ -533,7 +533,7 @@ mod tests {
     }
 
     #[test]
-    fn judges_interface_of_gateway() {
+    fn checks_interface_of_gateway() {
         let head = "Inter-|   Receive\n face |bytes\n";
         let files = [("sys/class/net/lo/flags", "0x9\n"), ("proc/net/dev", &format!("{head}    lo: 1 2\n"))];
         let temp = TempRoot::new(7, &files);

@@ -398,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn reports_complaints_of_scanner() {
+    fn reports_problems_of_scanner() {
         let (state, text) = verdict("health", 8, 0, 0x10, &[]);
         assert_eq!(state, Verdict::Ok, "{text}");
         let (state, text) = verdict("health", 8, 0, 0x11, &[0x84, 22, 1, 49]);

@@ -309,7 +309,7 @@ mod tests {
     use scanhub_drivers::identity_probe;
 
     #[test]
-    fn a_link_names_only_a_rate_below_the_highest() {
+    fn link_names_only_a_rate_below_the_highest() {
         let report = identity_probe(Family::Lms, None, 0).unwrap().report().clone();
         let family = ("family", "lms".to_owned());
         assert_eq!(link_settings(&report, 38_400), [family.clone(), ("baud", "38400".to_owned())]);
@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn a_family_has_an_inquiry_if_it_says_so() {
+    fn family_has_a_probe_exactly_if_its_features_say_so() {
         for family in Family::ALL {
             assert_eq!(identity_probe(family, None, 0).is_some(), features(family).has_probe, "{family:?}");
         }

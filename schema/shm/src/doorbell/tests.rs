@@ -258,7 +258,7 @@ fn subscriber_wakes_at_each_of_two_doorbells() {
 }
 
 #[test]
-fn a_hub_that_wakes_before_it_counts_is_found() {
+fn model_detects_a_hub_that_wakes_before_it_counts() {
     let lost = count_lost_wakeups(|| {
         let sensor = new_sensor();
         let hub = spawn_hub(&sensor, |sensor| {

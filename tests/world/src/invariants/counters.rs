@@ -209,8 +209,8 @@ impl Invariant for ListenerCounters {
                 let head = &datagram.head;
                 let key = |topic| (head.epoch, head.sensor, topic);
                 let is_new = self.row(key(head.topic), head.sequence).take(head.sequence);
-                let is_told_new = outcome != DatagramOutcome::Duplicate;
-                if head.topic != Announce::NUMBER && is_new != is_told_new {
+                let is_reported_new = outcome != DatagramOutcome::Duplicate;
+                if head.topic != Announce::NUMBER && is_new != is_reported_new {
                     reporter.report(format!("{outcome:?}, although is_new is {is_new}: {head:?}"));
                 }
                 if let Some(announce) = announce(datagram) {

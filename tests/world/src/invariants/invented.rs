@@ -276,7 +276,7 @@ impl Invariant for RemoteNothingInvented {
             }
             Event::Republished { sensor, topic, header, payload } => {
                 let is_published = self.published.contains(&key(sensor, topic, header, payload));
-                let is_said = match topic {
+                let is_listener_report = match topic {
                     Topic::Zones => payload == self.unknown,
                     Topic::Status => {
                         let arrived_ns = header.stamp_last_ns.saturating_sub(self.clock_offset);
@@ -287,7 +287,7 @@ impl Invariant for RemoteNothingInvented {
                     }
                     _ => false,
                 };
-                if !is_published && !is_said {
+                if !is_published && !is_listener_report {
                     reporter.report(format!(
                         "sensor {sensor}: {topic:?} was not published by the hub: {header:?}"
                     ));

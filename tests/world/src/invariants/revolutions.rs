@@ -553,7 +553,8 @@ impl Point {
 
 impl RevolutionFigures {
     fn from_scan(scan: &Scan, reported: &[ReportedPoint], points: &[Option<&Point>]) -> RevolutionFigures {
-        let pairs = || reported.iter().zip(points).filter_map(|(told, point)| Some((told, (*point)?)));
+        let pairs =
+            || reported.iter().zip(points).filter_map(|(measured, point)| Some((measured, (*point)?)));
         let worst = |off: &dyn Fn((&ReportedPoint, &Point)) -> f64| pairs().map(off).fold(0.0, f64::max);
         let range_mm = |(reported, point): (&ReportedPoint, &Point)| {
             reported
@@ -565,7 +566,7 @@ impl RevolutionFigures {
             scans: 1,
             incomplete: scan.is_incomplete().into(),
             points: pairs().count() as u64,
-            angle_deg: worst(&|(told, point)| point.deviation_deg(told.clockwise_deg)),
+            angle_deg: worst(&|(measured, point)| point.deviation_deg(measured.clockwise_deg)),
             range_mm: worst(&range_mm),
             ..RevolutionFigures::default()
         }

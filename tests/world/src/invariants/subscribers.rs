@@ -122,9 +122,11 @@ impl SensorSubscribers {
         if AFTER_ZONES.contains(&topic) && self.due[DoorbellWord::First as usize] == Some(seq) {
             broken.push(format!("First was not rung before {topic:?} of {seq}"));
         }
-        if let Some(unheard) = self.unnotified.filter(|&unheard| is_next && unheard < seq) {
+        if let Some(unnotified_seq) =
+            self.unnotified.filter(|&unnotified_seq| is_next && unnotified_seq < seq)
+        {
             self.unnotified = None;
-            broken.push(format!("listeners got no event after {unheard}, before {topic:?} of {seq}"));
+            broken.push(format!("listeners got no event after {unnotified_seq}, before {topic:?} of {seq}"));
         }
         let is_of_scan = sample.header.hub_time_ns().is_some();
         if topic == Topic::Zones && self.scan != Some(seq) {
@@ -148,8 +150,8 @@ impl SensorSubscribers {
                 self.due[ring as usize].get_or_insert(seq);
             }
         }
-        let is_heard = |of: &AttachedSubscriber| of.is_listener && of.topic == topic;
-        if is_of_scan && self.subscribers.values().any(is_heard) {
+        let has_listener = |of: &AttachedSubscriber| of.is_listener && of.topic == topic;
+        if is_of_scan && self.subscribers.values().any(has_listener) {
             self.unnotified.get_or_insert(seq);
         }
         broken

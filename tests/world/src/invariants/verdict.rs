@@ -78,9 +78,9 @@ impl SensorVerdict {
 /// Returns the maximum time for which a robot may accept a clear verdict of sensor `number` while an object is inside a
 /// zone.
 fn max_clear_time(setup: &Setup, number: usize) -> Nanos {
-    let (period, told_after) = setup.sensors[number].scan_times();
+    let (period, scan_delay) = setup.sensors[number].scan_times();
     let in_hub = 2 * period + STALENESS_MARGIN;
-    told_after + setup.min_scans * in_hub + STALENESS_MARGIN + TIMER_DELAY
+    scan_delay + setup.min_scans * in_hub + STALENESS_MARGIN + TIMER_DELAY
 }
 
 /// Margin that is added to two periods in the hub, and once more in a subscriber.

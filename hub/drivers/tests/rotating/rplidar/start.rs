@@ -39,7 +39,7 @@ fn every_model_streams_within_2_s_from_any_state() {
 }
 
 #[test]
-fn every_rate_is_sought() {
+fn finds_scanner_at_every_rate() {
     for (model, baud) in
         [(Model::A1, 115_200), (Model::S1, 256_000), (Model::C1, 460_800), (Model::S2, 1_000_000)]
     {
@@ -68,7 +68,7 @@ fn text_like_stream_is_not_taken_for_a_boot_message() {
 }
 
 #[test]
-fn where_the_rate_is_fixed_it_stays() {
+fn fixed_rate_is_never_changed() {
     let settings = Settings { fixed_rate: true, ..settings_of(Model::S1) };
     let mut head = SimulatedScanner::new(Model::S1, 1);
     head.is_on = false;
@@ -119,7 +119,7 @@ fn repeats_an_ignored_stop_request() {
 }
 
 #[test]
-fn a_scanner_that_is_not_well_is_booted_once() {
+fn unhealthy_scanner_is_reset_once() {
     for model in [Model::A1, Model::S2] {
         let mut head = SimulatedScanner::new(model, 1);
         head.health = (2, 0x8001);
@@ -177,7 +177,7 @@ fn pause_and_resume_control_the_motor_by_model() {
 }
 
 #[test]
-fn the_motor_rests_when_the_hub_ends() {
+fn motor_stops_when_the_session_ends() {
     for (model, duty) in [(Model::A1, None), (Model::A2m8, Some(0)), (Model::S2, Some(0))] {
         let mut bench = TestBench::new(settings_of(model), SimulatedScanner::new(model, 1));
         bench.run_until(3 * ONE_SECOND, is_streaming);
@@ -211,7 +211,7 @@ fn reports_mode_firmware_and_unexpected_model() {
 }
 
 #[test]
-fn one_answer_may_be_missing() {
+fn starts_although_one_reply_is_missing() {
     for request in [0x50, 0x52, 0x82, 0x84, 0xFF] {
         let mut head = SimulatedScanner::new(Model::A2m8, 1);
         head.ignored_requests = vec![request];
@@ -263,7 +263,7 @@ fn idle_motor_stops_only_if_configured() {
 }
 
 #[test]
-fn the_fastest_mode_or_the_wanted_one() {
+fn uses_configured_mode_or_else_the_fastest() {
     let run = |model, mode: Option<Mode>| {
         let mut bench = TestBench::new(
             Settings { mode: mode.map(Mode::name), ..settings_of(model) },
@@ -322,7 +322,7 @@ fn discovered_scanner_has_the_beams_it_reports() {
 }
 
 #[test]
-fn a_second_without_data_begins_again() {
+fn session_recovers_from_a_second_without_data() {
     let mut bench = TestBench::new(settings_of(Model::A1), SimulatedScanner::new(Model::A1, 1));
     bench.run(3 * ONE_SECOND);
     bench.scanner.is_on = false;
@@ -371,7 +371,7 @@ fn identifies_a_scanner_streaming_during_spin_up() {
 }
 
 #[test]
-fn accepts_a_stream_that_is_announced_twice() {
+fn accepts_a_repeated_stream_descriptor() {
     let mut bench = spinning_up(Model::A1);
     let kind = bench.scanner.kind().expect("measuring");
     bench.scanner.reply(descriptor_type(kind), 0x40, &[kind.byte_len() as u8], bench.now + 70 * MILLIS);
@@ -393,7 +393,7 @@ fn power_on_with_the_session_is_not_a_restart() {
 }
 
 #[test]
-fn a_cable_that_is_plugged_in_again_is_not_a_restart() {
+fn replugged_cable_is_not_a_restart() {
     let mut bench = TestBench::new(settings_of(Model::A1), SimulatedScanner::new(Model::A1, 1));
     bench.run(3 * ONE_SECOND);
     bench.scanner.is_on = false;
@@ -423,7 +423,7 @@ fn boot_message_during_a_stream_restarts_at_once() {
 }
 
 #[test]
-fn a_greeting_after_other_bytes_is_a_restart() {
+fn boot_message_after_other_bytes_is_a_restart() {
     // A dip of the supply makes the scanner send other bytes first. Some of these bytes are text.
     let junk = [vec![0x00; 1], vec![0xFF, 0x00, 0x80], vec![0xA5; 300], vec![b'x'; 45], vec![0xF0; 2_000]];
     for (model, junk) in
@@ -440,7 +440,7 @@ fn a_greeting_after_other_bytes_is_a_restart() {
 }
 
 #[test]
-fn ranges_that_are_text_are_no_greeting() {
+fn text_like_ranges_are_no_boot_message() {
     // A single point counts if another point follows it.
     for (mode, lost) in [(Mode::Standard, 65), (Mode::DenseBoost, 60)] {
         let mut bench = TestBench::new(

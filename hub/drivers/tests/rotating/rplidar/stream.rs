@@ -245,7 +245,7 @@ fn damaged_bytes_cost_only_damaged_packets() {
 }
 
 #[test]
-fn revolutions_resume_after_the_head_stood_still() {
+fn revolutions_resume_after_a_head_standstill() {
     for kind in PACKET_KINDS {
         let mut bench = in_mode(kind, 1);
         bench.run(20 * ONE_SECOND);
@@ -362,7 +362,7 @@ fn replayed_recording_yields_the_same_revolutions() {
 }
 
 #[test]
-fn one_that_begins_in_the_midst_has_turns_soon() {
+fn recording_from_mid_stream_has_revolutions_soon() {
     for (model, mode) in STREAM_MODES {
         let live = record(model, mode, 8);
         let from = live.log.outputs.iter().position(|output| output.first > 3 * ONE_SECOND).expect("some");
@@ -440,7 +440,7 @@ fn backlogged_packets_do_not_change_time_per_point() {
 
 /// If the ranges of one format are decoded as the other format, they are meaningless.
 #[test]
-fn refuses_packets_that_may_be_of_two_kinds() {
+fn refuses_packets_of_ambiguous_format() {
     let live = record(Model::S1, Mode::DenseBoost, 4);
     let from = live.log.outputs.iter().position(|output| output.first > 2 * ONE_SECOND).expect("some");
     let (session, revolutions) = replay(Settings::default(), &live.log.outputs[from..]);

@@ -72,7 +72,7 @@ fn configuration_is_written_once_and_stream_resumes() {
 }
 
 #[test]
-fn the_rate_after_power_on() {
+fn changes_the_rate_after_power_on() {
     let (mut first, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
     first.power_on = Some(PowerOn::KeepBaud);
     let mut bench = change(first, machine, now);
@@ -132,7 +132,7 @@ fn refused_write_keeps_the_old_configuration() {
 }
 
 #[test]
-fn another_unit_may_take_seven_seconds() {
+fn write_that_takes_seven_seconds_succeeds() {
     let (mut plan, mut machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
     set_other_values(&mut plan);
     machine.set_quirks(ProtocolQuirks { late_write_ns: 6_000 * MILLIS, ..ProtocolQuirks::default() });
@@ -144,7 +144,7 @@ fn another_unit_may_take_seven_seconds() {
 }
 
 #[test]
-fn a_reply_that_was_lost_costs_no_second_write() {
+fn lost_write_reply_causes_no_second_write() {
     let (mut plan, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
     set_other_values(&mut plan);
     let mut bench = change(plan, machine, now);
@@ -179,7 +179,7 @@ fn silent_scanner_has_an_unknown_operating_mode() {
 }
 
 #[test]
-fn bad_habits_and_lossy_lines_never_lie() {
+fn outcome_is_right_despite_quirks_and_losses() {
     let mut done = 0;
     for seed in 0..60 {
         let baud = Baud::ALL[seed as usize % 4];
@@ -254,7 +254,7 @@ fn leaves_installation_mode_although_stops_are_lost() {
 }
 
 #[test]
-fn a_stray_nak_is_not_believed_where_it_does_harm() {
+fn stray_nak_does_not_repeat_an_eeprom_write() {
     // In the first case, the change fails before the first reply. In the second case, it fails while the scanner
     // writes: after an ACK and F4h of 42 bytes, and an ACK and A0h of 9 bytes.
     for after in [0, 53] {
@@ -278,7 +278,7 @@ fn a_stray_nak_is_not_believed_where_it_does_harm() {
 }
 
 #[test]
-fn a_reply_that_cannot_be_read_is_no_refusal() {
+fn unreadable_write_reply_is_no_refusal() {
     let (mut plan, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
     set_other_values(&mut plan);
     let mut bench = change(plan, machine, now);

@@ -244,7 +244,7 @@ fn sends_only_requests_that_change_nothing() {
 }
 
 #[test]
-fn found_in_every_operating_mode_and_left_in_it() {
+fn probe_keeps_every_operating_mode() {
     for operating in [
         OperatingMode::All,
         OperatingMode::Partial,
@@ -298,7 +298,7 @@ fn reports_faults_and_settings_of_a_used_scanner() {
 }
 
 #[test]
-fn an_address_of_its_own_is_learned_and_used() {
+fn scanner_address_is_read_and_used() {
     let settings = Settings { address: 5, baud: Baud::B19200, ..Settings::default() };
     let mut bench = Bench::new(IdentityProbe::new(Baud::B9600, 0), Baud::B9600, machine(settings), 0);
     bench.finish(5_000 * MILLIS);
@@ -307,7 +307,7 @@ fn an_address_of_its_own_is_learned_and_used() {
 }
 
 #[test]
-fn a_rate_that_cannot_be_changed_is_not() {
+fn probe_keeps_a_fixed_rate() {
     let mut bench =
         Bench::new(IdentityProbe::at_fixed_rate(Baud::B38400, 0), Baud::B38400, sensor(Baud::B38400), 0);
     bench.finish(5_000 * MILLIS);
@@ -320,7 +320,7 @@ fn a_rate_that_cannot_be_changed_is_not() {
 }
 
 #[test]
-fn the_answers_are_those_to_the_questions() {
+fn report_has_replies_only_to_sent_requests() {
     let mut bench = Bench::new(IdentityProbe::new(Baud::B9600, 0), Baud::B9600, sensor(Baud::B9600), 0);
     bench.finish(5_000 * MILLIS);
     let report = bench.protocol.report();
@@ -375,7 +375,7 @@ fn repeats_an_overlooked_request() {
 }
 
 #[test]
-fn late_doubled_and_refused_replies() {
+fn probe_handles_late_repeated_and_refused_replies() {
     for (word, quirks) in [
         ("late", ProtocolQuirks { late_reply_ns: 250 * MILLIS, ..ProtocolQuirks::default() }),
         ("late ACK", ProtocolQuirks { late_acknowledge_ns: 120 * MILLIS, ..ProtocolQuirks::default() }),

@@ -99,7 +99,7 @@ fn are_bytes_conserved(tally: &FramerCounters, open: usize) -> bool {
 }
 
 #[test]
-fn an_inquiry_ends_and_only_asks() {
+fn probe_ends_and_sends_only_queries() {
     for seed in 0..200 {
         let mut probe = IdentityProbe::new(Baud::ALL[seed as usize % 4], 0);
         for telegram in drive(&mut probe, seed) {

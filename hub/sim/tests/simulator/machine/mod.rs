@@ -86,7 +86,7 @@ pub(crate) fn fast_settings() -> Settings {
 }
 
 #[test]
-fn a_start_up_at_9600_to_a_stream_at_500k() {
+fn scanner_starts_at_9600_and_streams_at_500k() {
     let mut bench = Bench::new(Settings::default());
     bench.run_until(5_000 * MILLIS);
     assert!(bench.chunks.is_empty(), "streams unasked");
@@ -126,7 +126,7 @@ fn a_start_up_at_9600_to_a_stream_at_500k() {
 }
 
 #[test]
-fn the_times_of_an_answer() {
+fn reply_times_are_within_their_limits() {
     for (request, min, max) in
         [(Request::Status, 55 * MILLIS, 160 * MILLIS), (Request::Stop, 55 * MILLIS, 100 * MILLIS)]
     {
@@ -145,7 +145,7 @@ fn the_times_of_an_answer() {
 }
 
 #[test]
-fn a_stream_keeps_its_grid_and_pauses_with_the_mirror() {
+fn stream_keeps_its_grid_and_pauses_with_the_mirror() {
     let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
     bench.run_until(60_000 * MILLIS);
@@ -314,7 +314,7 @@ proptest! {
     /// Without faults, everything that the scanner sends is intact, byte for byte. This is true for any settings, even
     /// if the scanner is polled late.
     #[test]
-    fn everything_sent_is_intact(
+    fn sent_telegrams_without_faults_are_intact(
         seed in any::<u64>(),
         world in 0..World::names().count(),
         variant in 0..Variant::ALL.len(),
@@ -395,7 +395,7 @@ fn contains(bytes: &[u8], part: &[u8]) -> bool {
 }
 
 #[test]
-fn fault_is_set_exactly_for_telegrams_not_intact() {
+fn truth_has_a_fault_for_each_damaged_telegram() {
     for (faults, named) in [
         ("", None),
         ("loss=0.001,burst=2", Some(Fault::Loss)),
@@ -426,7 +426,7 @@ fn fault_is_set_exactly_for_telegrams_not_intact() {
 }
 
 #[test]
-fn a_seed_damages_the_same_bytes_however_they_are_cut() {
+fn damage_depends_on_seed_and_not_on_chunk_size() {
     let faults =
         "loss=0.001,burst=2,flip=0.0005,flip_bits=3,insert=0.0005,double=0.0005,truncate=0.1,length=0.1";
     let cut = |chunk, seed| -> Vec<(Vec<u8>, Option<Fault>)> {
@@ -439,7 +439,7 @@ fn a_seed_damages_the_same_bytes_however_they_are_cut() {
 }
 
 #[test]
-fn a_repeated_telegram_has_a_truth_of_its_own() {
+fn repeated_telegram_has_a_separate_truth_record() {
     let transmitted = transmit("repeat=0.5", 3, ChunkSize::Uart, 3_000 * MILLIS);
     let repeated = transmitted.windows(2).filter(|pair| pair[0].telegram == pair[1].telegram).count();
     assert!((30..80).contains(&repeated), "{repeated} of {}", transmitted.len());

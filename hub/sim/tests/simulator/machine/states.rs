@@ -40,7 +40,7 @@ fn assert_stream(telegrams: &[(Nanos, Vec<u8>)], command: u8, len: usize, mirror
 }
 
 #[test]
-fn every_mode_streams_telegrams_of_its_own() {
+fn every_operating_mode_streams_its_telegrams() {
     assert_stream(&streamed_telegrams(OperatingMode::All, fast_settings()), 0xB0, 732, 2);
     assert_stream(&streamed_telegrams(OperatingMode::Means(5), fast_settings()), 0xB6, 733, 10);
     assert_stream(
@@ -67,7 +67,7 @@ fn every_mode_streams_telegrams_of_its_own() {
 }
 
 #[test]
-fn partial_scans_take_turns() {
+fn partial_scans_alternate() {
     for (variant, quarters) in
         [(Variant::ALL[0], &[0u8][..]), (Variant::HALF, &[0, 2]), (Variant::ALL[4], &[0, 1, 2, 3])]
     {
@@ -83,7 +83,7 @@ fn partial_scans_take_turns() {
 }
 
 #[test]
-fn partial_scans_begin_with_the_first() {
+fn partial_scans_start_with_the_first_part() {
     let mut bench = Bench::new(fast_settings());
     bench.ask(Writer::new(0, 0x30).byte(1).finish().bytes());
     bench.ask(Writer::new(0, 0x20).byte(0x2A).finish().bytes());
@@ -113,7 +113,7 @@ fn indices_count_mirror_turns_and_telegrams() {
 }
 
 #[test]
-fn one_telegram_may_be_asked_for() {
+fn single_telegrams_can_be_requested() {
     let mut bench = Bench::new(Settings { unit: Unit::Cm, ..fast_settings() });
     for (request, command, len) in [
         (Writer::new(0, 0x30).byte(1), 0xB0, 732),
@@ -178,7 +178,7 @@ fn power_cycle_aborts_resets_and_sends_boot_message() {
 }
 
 #[test]
-fn a_reset_says_that_it_comes_and_that_it_is_over() {
+fn reset_sends_a_reply_and_a_boot_message() {
     let errors = vec![(0x84, 22), (1, 49)];
     let mut bench = Bench::new(Settings { boot_ns: BOOT_TIME, errors, ..fast_settings() });
     let errors_reply = bench.ask(&[0x02, 0, 1, 0, 0x32, 0x16, 0x12]);
@@ -197,7 +197,7 @@ fn a_reset_says_that_it_comes_and_that_it_is_over() {
 }
 
 #[test]
-fn a_sensor_may_start_with_the_simulation() {
+fn scanner_can_power_on_at_simulation_start() {
     let mut bench =
         Bench::new(Settings { start: StartState::PowerOn, boot_ns: BOOT_TIME, ..Settings::default() });
     bench.run_until(BOOT_TIME - 1);
@@ -272,7 +272,7 @@ fn replies_of_200(quirks: ProtocolQuirks, first: Option<u8>) -> usize {
 }
 
 #[test]
-fn some_requests_are_ignored_or_answered_with_nak() {
+fn share_of_requests_is_ignored_or_gets_a_nak() {
     let overlooked =
         replies_of_200(ProtocolQuirks { overlooked_share: 0.3, ..ProtocolQuirks::default() }, None);
     assert!((40..80).contains(&overlooked), "{overlooked}");
@@ -282,7 +282,7 @@ fn some_requests_are_ignored_or_answered_with_nak() {
 }
 
 #[test]
-fn a_command_may_be_refused() {
+fn configured_command_is_refused() {
     let mut bench =
         bench_with_quirks(ProtocolQuirks { refused_commands: vec![0x3A], ..ProtocolQuirks::default() });
     assert_eq!(reply(&bench.ask(Request::Type.encode(0).bytes())), Reply::Refused);
@@ -292,7 +292,7 @@ fn a_command_may_be_refused() {
 }
 
 #[test]
-fn replies_come_twice() {
+fn repeated_replies_are_equal() {
     let mut bench = bench_with_quirks(ProtocolQuirks { doubled_share: 1.0, ..ProtocolQuirks::default() });
     bench.ask(Request::Type.encode(0).bytes());
     let sent = bench.sent();
@@ -335,7 +335,7 @@ fn mode_change_is_slow_but_status_is_immediate() {
 }
 
 #[test]
-fn writing_the_eeprom_takes_its_time() {
+fn eeprom_write_delays_the_reply() {
     let mut bench =
         bench_with_quirks(ProtocolQuirks { late_write_ns: 6_000 * MILLIS, ..ProtocolQuirks::default() });
     assert_eq!(
@@ -422,7 +422,7 @@ fn strict_scanner_ignores_requests_without_byte_gaps() {
 }
 
 #[test]
-fn a_sensor_may_think_as_long_each_time() {
+fn reply_delay_is_constant() {
     let mut bench =
         bench_with_quirks(ProtocolQuirks { reply_delay_ns: 60 * MILLIS, ..ProtocolQuirks::default() });
     for request in [Request::Type, Request::Stop, Request::Variant(Variant::HALF)] {

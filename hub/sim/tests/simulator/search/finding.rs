@@ -95,7 +95,7 @@ fn round_starts(bench: &Bench) -> Vec<Nanos> {
 }
 
 #[test]
-fn rounds_take_their_time_on_a_silent_line() {
+fn search_rounds_have_pauses_on_a_silent_line() {
     let mut bench = Bench::new(None, PortKind::Serial, None, 1);
     assert!(bench.find(12_000 * MILLIS).is_none());
     let begins = round_starts(&bench);
@@ -109,7 +109,7 @@ fn rounds_take_their_time_on_a_silent_line() {
 }
 
 #[test]
-fn rounds_take_their_time_on_a_noisy_line() {
+fn search_rounds_take_longer_on_a_noisy_line() {
     let mut bench = Bench::new(None, PortKind::Serial, None, 1).with_noise(MILLIS);
     assert!(bench.find(30_000 * MILLIS).is_none());
     let begins = round_starts(&bench);
@@ -122,7 +122,7 @@ fn rounds_take_their_time_on_a_noisy_line() {
 }
 
 #[test]
-fn hands_over_every_read_of_the_last_step() {
+fn passes_all_reads_of_the_last_step_to_the_session() {
     for port in [PortKind::Serial, PortKind::Server] {
         for (name, _, create) in scanners() {
             for seed in 0..5 {
@@ -151,7 +151,7 @@ fn hands_over_every_read_of_the_last_step() {
 }
 
 #[test]
-fn leaves_out_rates_that_the_port_cannot_have() {
+fn skips_rates_that_the_port_rejects() {
     for (name, expected, create) in scanners() {
         let rate = expected.rate.expect("a serial line");
         let impossible = [230_400, 500_000, 921_600, 1_000_000, 9_600];
@@ -213,7 +213,7 @@ fn max_extra_time(
 }
 
 #[test]
-fn finds_a_remembered_lms_soon() {
+fn finds_a_saved_lms_soon() {
     let memory =
         |stream, reply: Baud| Memory { family: Family::Lms, stream_rate: stream, reply_rate: reply.rate() };
     let named = |first: Baud| {
@@ -253,7 +253,7 @@ fn finds_a_remembered_lms_soon() {
 }
 
 #[test]
-fn finds_a_remembered_rotating_scanner_soon() {
+fn finds_a_saved_rotating_scanner_soon() {
     for model in ld::Model::ALL {
         let rate = model.baud();
         let memory = Memory { family: Family::Ld, stream_rate: rate, reply_rate: rate };
@@ -288,7 +288,7 @@ fn finds_a_remembered_rotating_scanner_soon() {
 }
 
 #[test]
-fn finds_another_scanner_than_the_remembered_one() {
+fn finds_a_replaced_scanner_despite_saved_state() {
     let mut worst = 0;
     for (family, stream_rate, reply_rate) in [
         (Family::Lms, 500_000, 9_600),
@@ -531,7 +531,7 @@ fn no_request_is_accepted_at_another_rate() {
 }
 
 #[test]
-fn a_stop_for_an_lms_would_disturb_an_rplidar() {
+fn stop_for_an_lms_would_disturb_an_rplidar() {
     // The search never sends this request to an unknown scanner, because an RPLIDAR takes its bytes for the start of a
     // long request.
     let stop = [0x02, 0x00, 0x02, 0x00, 0x20, 0x25, 0x35, 0x08];

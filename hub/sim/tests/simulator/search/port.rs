@@ -111,7 +111,7 @@ fn scanners() -> Vec<(&'static str, Family, CreateScanner)> {
 }
 
 #[test]
-fn finds_every_family_and_remembers_the_scanner() {
+fn finds_every_family_and_saves_the_scanner() {
     for (name, family, create) in scanners() {
         let (mut times, mut remembered) = (Vec::new(), Vec::new());
         for seed in 0..8 {
@@ -135,7 +135,7 @@ fn finds_every_family_and_remembers_the_scanner() {
 }
 
 #[test]
-fn the_telegrams_of_the_search_reach_the_session() {
+fn telegrams_of_the_search_reach_the_session() {
     for seed in 0..20 {
         // Both scanners are found by their streams, so they get no byte before the session starts.
         for (name, device, most_lost) in [
@@ -225,7 +225,7 @@ fn restored_beams_stay_unless_the_rate_differs() {
 }
 
 #[test]
-fn a_paused_search_sends_nothing() {
+fn paused_search_sends_nothing() {
     let mut bench = open(Some(super::lms(Baud::B9600, false, 3)), None, 3);
     bench.host.session.control(line::Control::Pause, bench.now);
     bench.run(bench.now + 5_000 * MILLIS);
@@ -235,7 +235,7 @@ fn a_paused_search_sends_nothing() {
 }
 
 #[test]
-fn a_silent_line_has_a_message() {
+fn silent_line_is_reported_with_families_and_time() {
     let mut bench = open(None, None, 4);
     bench.run(bench.now + 13_000 * MILLIS);
     let problem = bench.host.session.problem().map(|problem| problem.to_string());
@@ -244,7 +244,7 @@ fn a_silent_line_has_a_message() {
 }
 
 #[test]
-fn bytes_of_no_scanner_have_a_message() {
+fn unrecognized_bytes_are_reported() {
     let mut bench = open(None, None, 5).with_noise(200 * MICROS);
     bench.run(bench.now + 13_000 * MILLIS);
     let problem = bench.host.session.problem().map(|problem| problem.to_string()).unwrap_or_default();

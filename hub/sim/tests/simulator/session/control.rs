@@ -21,7 +21,7 @@ fn bytes_sent_since(bench: &Bench, since: Nanos) -> usize {
 }
 
 #[test]
-fn a_pause_stops_the_stream_and_a_resume_starts_it() {
+fn pause_stops_the_stream_and_a_resume_starts_it() {
     let mut bench = Bench::new(sensor(Baud::B9600), 0);
     bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
@@ -47,7 +47,7 @@ fn a_pause_stops_the_stream_and_a_resume_starts_it() {
 }
 
 #[test]
-fn a_pause_may_come_at_any_moment() {
+fn pause_works_at_any_time() {
     for baud in [Baud::B9600, Baud::B38400, Baud::B500000] {
         for streams in [false, true] {
             for at in 0..60 {
@@ -78,7 +78,7 @@ fn a_pause_may_come_at_any_moment() {
 }
 
 #[test]
-fn an_absent_sensor_is_paused_in_peace() {
+fn paused_session_sends_nothing_to_absent_scanner() {
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
     bench.to_scanner = Box::new(|_, _| None);
     bench.control(Control::Pause);
@@ -159,7 +159,7 @@ fn resync_restarts_and_is_counted() {
 }
 
 #[test]
-fn a_recording_is_not_controlled() {
+fn recording_ignores_control_requests() {
     let settings = lms::Settings { listen_only: true, ..super::SESSION_SETTINGS };
     let mut machine = sensor(Baud::B500000);
     let started = make_stream(&mut machine);

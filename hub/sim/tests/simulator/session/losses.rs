@@ -52,7 +52,7 @@ fn losses_as_in_the_paper_cost_only_damaged_scans() {
 }
 
 #[test]
-fn long_bursts_and_single_bytes_too() {
+fn long_and_single_losses_cost_only_some_scans() {
     for (loss, burst) in [(0.0005, 1.0), (0.002, 3.34), (0.02, 200.0), (0.1, 1000.0)] {
         let (sent, intact) = run_with_losses(Faults { loss, burst, ..Faults::default() }, 9, 20_000 * MILLIS);
         assert!(intact > 0 && intact < sent, "{loss} {burst}: {intact} of {sent}");
@@ -74,7 +74,7 @@ fn sent_and_damaged(bench: &Bench, since: Nanos) -> (u64, u64) {
 }
 
 #[test]
-fn ten_minutes_of_the_bursts_of_the_paper() {
+fn counts_lost_scans_over_ten_minutes_of_bursts() {
     let mut bench = streaming(Baud::B500000);
     let started = bench.now;
     let mut loss = Loss::new(Faults { loss: 0.00135, burst: 1.89, ..Faults::default() }, 3);
@@ -253,7 +253,7 @@ fn is_held(telegram: &[u8]) -> bool {
 }
 
 #[test]
-fn a_telegram_is_there_soon_after_its_last_byte() {
+fn telegram_is_delivered_soon_after_its_last_byte() {
     for chunk in [ChunkSize::Uart, ChunkSize::Usb] {
         for variant in [Variant::HALF, Variant::ALL[0]] {
             let settings = Settings { baud: Baud::B500000, variant, chunk, ..Settings::default() };

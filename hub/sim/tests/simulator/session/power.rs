@@ -28,7 +28,7 @@ fn booting(boot_ns: Nanos) -> Settings {
 }
 
 #[test]
-fn in_the_middle_of_a_scan() {
+fn recovers_from_power_loss_during_a_scan() {
     let mut slowest = 0;
     for boot in [50, 300, 1_000, 1_500, 2_000, 3_333, 7_777, 20_000, 59_000] {
         for phase in [0, 5, 14, 22] {
@@ -52,7 +52,7 @@ fn in_the_middle_of_a_scan() {
 }
 
 #[test]
-fn at_any_moment_of_the_conversation() {
+fn recovers_from_power_loss_during_startup() {
     let mut slowest = 0;
     for baud in [Baud::B9600, Baud::B500000] {
         for at in 0..20 {
@@ -76,7 +76,7 @@ fn at_any_moment_of_the_conversation() {
 }
 
 #[test]
-fn boot_message_is_answered_at_once() {
+fn boot_message_causes_a_request_at_once() {
     // The power fails during a stream at 9600, and during the search, which is at 9600 in the pauses between its
     // rounds.
     let slow_settings = lms::Settings { baud: Baud::B9600, ..super::SESSION_SETTINGS };
@@ -103,7 +103,7 @@ fn boot_message_is_answered_at_once() {
 }
 
 #[test]
-fn a_mute_line_is_asked_rarely_and_for_ever() {
+fn mute_scanner_is_queried_rarely_without_end() {
     let settings = Settings {
         quirks: ProtocolQuirks { is_mute: true, ..ProtocolQuirks::default() },
         ..Settings::default()
@@ -131,7 +131,7 @@ fn a_mute_line_is_asked_rarely_and_for_ever() {
 }
 
 #[test]
-fn a_pause_outlasts_the_power() {
+fn pause_survives_a_power_cycle() {
     let settings = lms::Settings { baud: Baud::B9600, ..super::SESSION_SETTINGS };
     let mut bench = Bench::with_settings(settings, sensor_with(booting(300 * MILLIS)), 0);
     bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);
@@ -166,7 +166,7 @@ fn counts_each_restart_once_at_every_rate() {
 }
 
 #[test]
-fn a_cable_and_a_user_do_not_restart_a_sensor() {
+fn cable_and_a_user_do_not_restart_a_sensor() {
     let mut bench = Bench::new(sensor_with(Settings::default()), 0);
     bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.line = LineModel::new(&"silence=3,silence_every=6".parse().expect("faults"), 1);
@@ -385,7 +385,7 @@ fn pause_and_silence_keep_the_limit() {
 }
 
 #[test]
-fn messages_fit_into_a_status() {
+fn rate_messages_fit_into_a_status() {
     for problem in [SLOWER_RATE_PROBLEM, KEEPS_RATE] {
         let text = problem.map(|problem| problem.to_string()).unwrap_or_default();
         assert!(text.contains("RS-422") && text.len() <= scanhub_schema::Status::MAX_ERROR_LEN, "{text}");

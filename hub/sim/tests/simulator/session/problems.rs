@@ -14,7 +14,7 @@ use scanhub_sim::room::Room;
 use super::{Bench, HostFilter, SESSION_SETTINGS, make_stream, sensor, sensor_with};
 
 #[test]
-fn a_refused_variant_streams_as_it_is() {
+fn streams_the_current_variant_after_a_refusal() {
     let variant = Variant::ALL[0];
     let scan = |i: u16| lms::measured::encode(0, Unit::Cm, &[700 + i % 50; 181], 0x10).bytes().to_vec();
     let telegrams = Box::new((0..).map(scan));
@@ -127,7 +127,7 @@ fn silence_of_1_s_restarts_with_two_requests() {
 }
 
 #[test]
-fn a_longer_silence_is_followed_by_a_search() {
+fn longer_silence_is_followed_by_a_search() {
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
     bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     let cut = bench.now;
@@ -154,7 +154,7 @@ fn resumes_after_a_power_cycle() {
 }
 
 #[test]
-fn a_variant_that_gets_no_answer_is_done_without() {
+fn streams_after_variant_request_fails() {
     let settings =
         Settings { variant: Variant { angle_deg: 180, resolution_cdeg: 100 }, ..Settings::default() };
     let mut bench =
@@ -173,7 +173,7 @@ fn a_variant_that_gets_no_answer_is_done_without() {
 }
 
 #[test]
-fn a_sensor_that_was_swapped_may_have_another_address() {
+fn accepts_replaced_scanner_with_another_address() {
     let at = |address| {
         let settings = Settings { address, ..Settings::default() };
         LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 1)))
@@ -211,17 +211,17 @@ fn assert_all_stream(quirks: ProtocolQuirks, seeds: std::ops::Range<u64>, limit:
 }
 
 #[test]
-fn a_third_of_the_requests_is_overlooked() {
+fn streams_although_30_percent_of_requests_are_lost() {
     assert_all_stream(ProtocolQuirks { overlooked_share: 0.3, ..ProtocolQuirks::default() }, 0..4, 15_000);
 }
 
 #[test]
-fn a_third_of_the_requests_gets_a_nak() {
+fn streams_although_30_percent_of_requests_get_a_nak() {
     assert_all_stream(ProtocolQuirks { nak_share: 0.3, ..ProtocolQuirks::default() }, 0..3, 15_000);
 }
 
 #[test]
-fn replies_come_twice() {
+fn streams_although_replies_are_repeated() {
     assert_all_stream(ProtocolQuirks { doubled_share: 1.0, ..ProtocolQuirks::default() }, 0..1, 5_000);
     assert_all_stream(
         ProtocolQuirks { doubled_share: 0.5, overlooked_share: 0.2, ..ProtocolQuirks::default() },
@@ -231,7 +231,7 @@ fn replies_come_twice() {
 }
 
 #[test]
-fn acknowledgements_and_replies_are_late() {
+fn streams_although_acks_and_replies_are_late() {
     // The delays are as long as the listing allows, and longer.
     for late in [52, 100, 300] {
         let late_ns = late * MILLIS;
@@ -254,7 +254,7 @@ fn acknowledgements_and_replies_are_late() {
 }
 
 #[test]
-fn works_without_refused_requests_or_reports_them() {
+fn streams_despite_refused_requests_or_reports_them() {
     for (command, problem) in [(0x3A, None), (0x74, None), (0x3B, Some(Problem::VariantRefused))] {
         let variant = if problem.is_some() { Variant::ALL[0] } else { Variant::HALF };
         let quirks = ProtocolQuirks { refused_commands: vec![command], ..ProtocolQuirks::default() };
@@ -300,7 +300,7 @@ fn version_s14_streams_with_unknown_angles() {
 }
 
 #[test]
-fn a_mode_without_ranges_gives_no_scans() {
+fn mode_without_ranges_gives_no_scans() {
     for start in [StartState::Operating(OperatingMode::OnRequest), StartState::Operating(OperatingMode::All)]
     {
         let settings = Settings { mode: Mode(0x3F), baud: Baud::B500000, start, ..Settings::default() };
@@ -315,7 +315,7 @@ fn a_mode_without_ranges_gives_no_scans() {
 }
 
 #[test]
-fn a_stream_of_a_sensor_that_answers_nothing_is_taken() {
+fn takes_over_the_stream_of_a_mute_scanner() {
     let quirks = ProtocolQuirks { is_mute: true, ..ProtocolQuirks::default() };
     let start = StartState::Operating(OperatingMode::All);
     let settings = Settings { baud: Baud::B500000, start, quirks, ..Settings::default() };
@@ -352,7 +352,7 @@ fn streaming_bench(settings: Settings) -> Bench {
 }
 
 #[test]
-fn a_healthy_sensor_is_known_whole_and_says_nothing() {
+fn healthy_scanner_has_full_identity_and_no_notices() {
     for (baud, start) in [(Baud::B9600, OperatingMode::OnRequest), (Baud::B500000, OperatingMode::All)] {
         let bench =
             streaming_bench(Settings { baud, start: StartState::Operating(start), ..Settings::default() });
@@ -383,7 +383,7 @@ fn reports_dirty_windows_and_errors() {
 }
 
 #[test]
-fn a_condition_that_comes_and_goes_is_there() {
+fn intermittent_condition_is_reported_continuously() {
     let mut bench = streaming_bench(Settings { baud: Baud::B500000, ..Settings::default() });
     // Every fifth scan reports a dirty window.
     bench.to_host = scan_filter(|count, scan| with_dirty_window(scan, count % 5 == 0));
@@ -425,7 +425,7 @@ fn with_dirty_window(mut scan: Vec<u8>, is_dirty: bool) -> Vec<u8> {
 }
 
 #[test]
-fn single_complaint_on_a_damaging_line_is_ignored() {
+fn single_report_on_a_damaging_line_is_ignored() {
     let mut bench = streaming_bench(Settings { baud: Baud::B500000, ..Settings::default() });
     bench.to_host = scan_filter(|count, scan| match count % 4 {
         0 => scan[..700].to_vec(),

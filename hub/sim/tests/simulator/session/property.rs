@@ -177,7 +177,7 @@ fn telegrams(bytes: &[u8]) -> impl Iterator<Item = Telegram<'_>> {
 }
 
 #[test]
-fn a_write_would_be_seen() {
+fn embedded_eeprom_write_is_detected() {
     for write in [
         EepromWrite::Configuration(&[7; 34]),
         EepromWrite::Configuration2(&[2; 84]),

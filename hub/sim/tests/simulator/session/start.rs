@@ -14,7 +14,7 @@ use scanhub_sim::operating::OperatingMode;
 use super::{Bench, SESSION_SETTINGS, make_stream, sensor, sensor_with};
 
 #[test]
-fn from_each_rate_to_a_stream_within_three_seconds() {
+fn streams_from_each_rate_within_3_s() {
     for baud in Baud::ALL {
         let mut bench = Bench::new(sensor(baud), 0);
         bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
@@ -75,7 +75,7 @@ fn fast_settings(baud: Baud, start: StartState) -> Settings {
 }
 
 #[test]
-fn a_sensor_that_just_got_its_power_streams_soon() {
+fn scanner_just_powered_on_streams_within_500_ms() {
     // The rate is unknown, or saved from the last time.
     for (seed, first, within) in (0..20).flat_map(|seed| [(seed, None, 500), (seed, Some(Baud::B9600), 500)])
     {
@@ -113,7 +113,7 @@ fn starts_without_type_status_or_configuration() {
 }
 
 #[test]
-fn last_rate_is_tried_first_but_not_assumed() {
+fn saved_rate_is_tried_first_but_not_assumed() {
     for first in Baud::ALL {
         for baud in Baud::ALL {
             let mut bench = Bench::new(
@@ -186,7 +186,7 @@ fn scanner_that_refuses_a_rate_is_stopped_first() {
 }
 
 #[test]
-fn at_the_wanted_rate_it_is_taken_as_it_streams() {
+fn takes_over_stream_at_target_rate_without_requests() {
     // The session starts at different times within the period of a scan.
     for phase in 0..28 {
         let mut machine = sensor(Baud::B500000);
@@ -254,7 +254,7 @@ fn telegrams_at_another_rate_give_no_scans() {
 }
 
 #[test]
-fn on_a_slow_line_it_is_waited_for() {
+fn waits_for_a_telegram_on_a_slow_line() {
     // A telegram takes 0.19 s at 38400 and 0.76 s at 9600, and the period is 0.21 s and 0.77 s.
     for baud in [Baud::B9600, Baud::B38400] {
         let mut machine = sensor(baud);
@@ -321,7 +321,7 @@ fn restored_identity_of_another_scanner_is_replaced() {
 }
 
 #[test]
-fn another_one_is_not_taken_for_the_first() {
+fn replaced_scanner_is_not_mistaken_for_the_first() {
     for resync in [false, true] {
         let mut bench = Bench::new(sensor(Baud::B500000), 0);
         bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
@@ -424,7 +424,7 @@ fn takes_over_any_stream_at_500k_within_1_s() {
 }
 
 #[test]
-fn another_variant_is_switched_within_a_second() {
+fn switches_another_variant_within_1_s() {
     for variant in Variant::ALL {
         for operating in [OperatingMode::All, OperatingMode::Partial] {
             let settings = Settings { baud: Baud::B500000, variant, ..Settings::default() };
@@ -467,7 +467,7 @@ fn slow_link_takes_over_any_stream() {
 }
 
 #[test]
-fn the_installation_mode_is_left() {
+fn scanner_leaves_installation_mode() {
     for baud in Baud::ALL {
         for strict in [false, true] {
             let quirks = ProtocolQuirks { is_strict: strict, ..ProtocolQuirks::default() };
@@ -483,7 +483,7 @@ fn the_installation_mode_is_left() {
 }
 
 #[test]
-fn it_is_left_too_by_a_sensor_that_does_not_tell_it() {
+fn leaves_installation_mode_without_a_status_reply() {
     for baud in Baud::ALL {
         let quirks = ProtocolQuirks { refused_commands: vec![0x31], ..ProtocolQuirks::default() };
         let start = StartState::Operating(OperatingMode::Installation);
@@ -498,7 +498,7 @@ fn it_is_left_too_by_a_sensor_that_does_not_tell_it() {
 }
 
 #[test]
-fn a_permanent_rate_is_found_worked_with_and_kept() {
+fn permanent_rate_is_found_and_kept() {
     for permanent in Baud::ALL {
         let permanent_baud = (permanent != Baud::B9600).then_some(permanent);
         let settings = Settings { baud: permanent, permanent_baud, ..Settings::default() };
@@ -525,7 +525,7 @@ fn settings_at(baud: Baud) -> lms::Settings {
 }
 
 #[test]
-fn a_sensor_at_that_rate_streams() {
+fn scanner_at_the_fixed_rate_streams() {
     for baud in Baud::ALL {
         let mut bench = Bench::with_settings(settings_at(baud), sensor(baud), 0);
         bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);
@@ -551,7 +551,7 @@ fn fixed_rate_session_does_not_search_other_rates() {
 }
 
 #[test]
-fn twelve_of_twelve_stream_within_five_seconds() {
+fn every_rate_and_state_streams_within_5_s() {
     let left = [
         ("idle", OperatingMode::OnRequest),
         ("streaming", OperatingMode::All),

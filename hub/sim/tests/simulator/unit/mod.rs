@@ -206,7 +206,7 @@ fn descriptor_starts_a_stream_and_any_request_ends_it() {
 }
 
 #[test]
-fn a_motor_is_steered_as_its_model_wants() {
+fn motor_control_depends_on_the_model() {
     let pwm = |duty: u16| with_payload(0xF0, &duty.to_le_bytes());
     let rpm = |rpm: u16| with_payload(0xA8, &rpm.to_le_bytes());
     let board = with_payload(0xFF, &[0; 4]);
@@ -315,7 +315,7 @@ fn records_the_line_fault_of_each_packet() {
 }
 
 #[test]
-fn a_stall_delays_and_loses_nothing() {
+fn stall_delays_bytes_without_loss() {
     let mut smooth = streaming(Model::S1, 2, "");
     let mut stalled = streaming(Model::S1, 2, "stall=0.5,stall_at=1");
     for bench in [&mut smooth, &mut stalled] {
@@ -407,7 +407,7 @@ fn held_head_sends_no_points_and_spins_up_again() {
 }
 
 #[test]
-fn bad_habits_of_answering() {
+fn reply_quirks_change_the_number_of_replies() {
     let replies_with = |faults: &str| {
         let mut bench = Bench::new(RplidarSettings::of(Model::A1), &World::Empty, faults);
         (0..100).map(|_| bench.ask(&[0xA5, 0x52]).len()).sum::<usize>()

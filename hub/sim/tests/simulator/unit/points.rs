@@ -217,7 +217,7 @@ fn every_point_of_every_mode_matches_its_truth() {
 }
 
 #[test]
-fn an_a1_indoors_is_as_odd_as_a_real_one() {
+fn simulated_a1_points_match_a_real_a1() {
     let (mut in_all, mut invalid, mut backward, mut counts, mut flags) = (0, 0, 0, Vec::new(), Vec::new());
     for seed in 0..4 {
         let settings = RplidarSettings { seed, ..RplidarSettings::of(Model::A1) };
@@ -261,7 +261,7 @@ fn share(part: usize, of: usize) -> f64 {
 }
 
 #[test]
-fn the_same_seed_says_the_same_and_another_another() {
+fn points_depend_only_on_the_seed() {
     let world: World = "demo".parse().expect("a world");
     let points_of = |seed| {
         let settings = RplidarSettings { seed, ..RplidarSettings::of(Model::A1) };

@@ -138,7 +138,7 @@ fn selectable_modes(model: Model) -> impl Iterator<Item = Option<Mode>> {
 }
 
 #[test]
-fn every_mode_of_every_model_is_understood() {
+fn session_reads_every_mode_of_every_model() {
     for model in Model::ALL {
         for mode in selectable_modes(model) {
             let known = Known::from_name(model.name()).expect("known");

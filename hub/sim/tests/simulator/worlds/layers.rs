@@ -45,7 +45,7 @@ fn share(values: &[f64], is_counted: impl Fn(f64) -> bool) -> f64 {
 }
 
 #[test]
-fn range_words_without_noise_are_true_ranges() {
+fn noiseless_words_are_true_ranges() {
     let room = Room::new(&world(TEST_WORLD).with_noise(NO_NOISE), 9);
     for (unit, mm) in [(Unit::Mm, 1.0), (Unit::Cm, 10.0), (Unit::Dm, 100.0)] {
         let words = room.scan(Variant::HALF, unit, Mode(1), SCAN_PERIOD_NS);
@@ -58,7 +58,7 @@ fn range_words_without_noise_are_true_ranges() {
 }
 
 #[test]
-fn sigma_spreads_ranges() {
+fn sigma_is_the_standard_deviation_of_ranges() {
     let deviations = deviations_mm(&words(NoiseModel { sigma_mm: 5.0, ..NO_NOISE }, 1, 100));
     let mean = deviations.iter().sum::<f64>() / deviations.len() as f64;
     let variance = deviations.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / deviations.len() as f64;
@@ -67,7 +67,7 @@ fn sigma_spreads_ranges() {
 }
 
 #[test]
-fn bias_is_one_for_a_device_and_another_for_the_next() {
+fn bias_is_constant_per_device() {
     let mut met: Vec<i32> = Vec::new();
     for seed in 0..20 {
         let deviations = deviations_mm(&words(NoiseModel { bias_mm: 15.0, ..NO_NOISE }, seed, 2));
@@ -81,7 +81,7 @@ fn bias_is_one_for_a_device_and_another_for_the_next() {
 }
 
 #[test]
-fn the_tail_is_heavy_and_belongs_to_edges() {
+fn heavy_tail_occurs_only_at_edges() {
     let exact = &words(NO_NOISE, 1, 1)[0];
     let scans = words(NoiseModel { tail: 0.5, ..NO_NOISE }, 1, 400);
     let ranges = (0..361).filter(|&beam| exact[beam] < 8183);
@@ -157,7 +157,7 @@ fn values_between(depth_mm: f64, spot: bool) -> (f64, f64) {
 }
 
 #[test]
-fn spot_on_two_near_surfaces_reads_between_them() {
+fn spot_on_two_near_surfaces_gives_a_mixed_range() {
     assert_eq!(values_between(800.0, false).0, 0.0);
     let (share, deviation) = values_between(800.0, true);
     println!("{share:.3} of the beams, with a standard deviation of {deviation:.3} of the depth");
@@ -212,7 +212,7 @@ fn dark_and_oblique_surfaces_far_away_are_too_weak() {
 }
 
 #[test]
-fn the_sun_dazzles_a_sector_for_a_time() {
+fn sun_dazzles_its_sector_during_its_time() {
     let text =
         format!("{TEST_WORLD}[[sun]]\nfrom_deg = 0\nto_deg = 5\nfrom_s = 2\nuntil_s = 4\nshare = 0.5\n");
     let dazzled = |dazzle, end_s: u64, beams: std::ops::RangeInclusive<usize>| {

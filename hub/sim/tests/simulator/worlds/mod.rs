@@ -56,7 +56,7 @@ fn every_world_file_is_built_in() {
 }
 
 #[test]
-fn every_world_runs_for_a_minute_as_its_name_says() {
+fn every_world_shows_its_objects_within_a_minute() {
     let targets_of = |name: &str| {
         let world: World = name.parse().unwrap();
         let mut kinds = BTreeSet::new();
@@ -91,7 +91,7 @@ fn every_world_runs_for_a_minute_as_its_name_says() {
 }
 
 #[test]
-fn ten_seeds_are_ten_runs() {
+fn each_seed_gives_a_different_run() {
     for name in
         ["fig8", "standing", "approach", "door", "corridor", "glass", "faint", "sun", "chair", "crowd"]
     {
@@ -106,7 +106,7 @@ fn ten_seeds_are_ten_runs() {
 /// Two sensors at the same position see the same people, each with its own noise. A port beyond the last sensor belongs
 /// to another world.
 #[test]
-fn ports_share_a_world_until_its_sensors_are_taken() {
+fn ports_beyond_the_last_sensor_have_another_world() {
     let text = format!("{}[[sensor]]\npose = [0, 100, 90]\n", text("fig8"));
     let quiet = world(&text).with_noise(scanhub_sim::beam::NoiseModel::NONE);
     let noisy = world(&text);
@@ -119,7 +119,7 @@ fn ports_share_a_world_until_its_sensors_are_taken() {
 }
 
 #[test]
-fn a_world_without_anything_is_one() {
+fn empty_world_has_only_invalid_beams() {
     let look = scan_at(&room("", 1), SCAN_PERIOD_NS);
     assert!(
         look.words.iter().all(|&word| word == 8191)
@@ -128,7 +128,7 @@ fn a_world_without_anything_is_one() {
 }
 
 #[test]
-fn refuses_invalid_worlds_with_place_and_remedy() {
+fn refuses_invalid_worlds_with_location_and_remedy() {
     let refused = |text: &str| -> Failure { World::of_toml("w.toml", text).expect_err(text) };
     for (text, place, remedy) in [
         (
@@ -233,7 +233,7 @@ fn refuses_invalid_worlds_with_place_and_remedy() {
 }
 
 #[test]
-fn the_page_shows_a_world_with_every_key() {
+fn page_shows_a_world_with_every_key() {
     let page = include_str!("../../../../../docs/worlds.md");
     let example =
         page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
@@ -255,7 +255,7 @@ fn the_page_shows_a_world_with_every_key() {
 proptest! {
     /// Any damaged file is rejected with a position, or is a valid world.
     #[test]
-    fn a_damaged_file_is_refused_or_runs(
+    fn damaged_file_is_refused_or_runs(
         file in 0..13usize,
         at in any::<prop::sample::Index>(),
         cut in 0..12usize,
@@ -323,7 +323,7 @@ fn person_beams_differ_from_the_empty_room() {
 }
 
 #[test]
-fn a_box_says_since_when_it_stands() {
+fn truth_of_a_box_has_its_placement_time() {
     let room = Room::new(&"fig8".parse().unwrap(), 2);
     let boxes = |end_ns| {
         scan_at(&room, end_ns).truth.into_iter().filter(|target| matches!(target, BeamTarget::Box { .. }))
@@ -361,7 +361,7 @@ fn surface_uncovered_by_a_box_is_static_and_new() {
 }
 
 #[test]
-fn a_door_is_a_box_while_it_turns_and_since_it_rests() {
+fn truth_of_a_door_has_its_last_motion_time() {
     let room = Room::new(
         &world(&without_randomness("door")).with_noise(NoiseModel { comb: false, ..WIDE_BEAMS }),
         1,
@@ -398,7 +398,7 @@ fn receding_box_is_static_and_approaching_one_a_box() {
 }
 
 #[test]
-fn a_code_is_invalid_whatever_the_beam_met() {
+fn truth_of_a_code_is_invalid() {
     let mut codes = 0;
     let room = Room::new(&"sun".parse().unwrap(), 1);
     for end_ns in (13..40).map(|s| s * ONE_SECOND) {
@@ -441,7 +441,7 @@ fn points(world: &World, end_ns: Nanos) -> Vec<(usize, [f64; 3], BeamTarget)> {
 }
 
 #[test]
-fn the_floor_is_at_nought_at_each_beams_own_time() {
+fn tilted_floor_points_have_height_zero() {
     let bare = tilted_world("");
     let mut count = 0;
     for tenth in 8..80 {
@@ -454,7 +454,7 @@ fn the_floor_is_at_nought_at_each_beams_own_time() {
 }
 
 #[test]
-fn things_have_a_height_and_boards_space_below() {
+fn objects_have_a_height_and_boards_a_gap_below() {
     let all = |things: &str| {
         let world = tilted_world(things);
         (0..160)
@@ -491,7 +491,7 @@ fn ground_truth_marks_people_and_placed_boxes() {
 }
 
 #[test]
-fn refuses_invalid_mounts_by_name_and_place() {
+fn refuses_invalid_mounts_with_name_and_location() {
     let refused = |mount: &str| {
         let text = format!("[[sensor]]\npose = [0, 0]\n[sensor.mount]\nheight_mm = 900\n{mount}\n");
         World::of_toml("w.toml", &text).expect_err("it is none").to_string()
@@ -507,7 +507,7 @@ fn refuses_invalid_mounts_by_name_and_place() {
 }
 
 #[test]
-fn without_a_mount_heights_change_nothing() {
+fn heights_have_no_effect_without_a_mount() {
     let low = text("fig8").replace("[[thing]]", "[[thing]]\nheight_mm = 10");
     let of = |text: &str| scan_at(&Room::new(&world(text), 3), 20 * ONE_SECOND);
     assert_eq!(of(&low), of(&text("fig8")));
