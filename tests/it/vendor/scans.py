@@ -16,6 +16,7 @@ while len(scans) < int(sys.argv[3]) and tries < 100:
     scan = driver.get_scan_data()
     if scan and scan[0]:
         scans.append([scan[0], scan[1]])
+# Before the end, where the driver can crash on a busy machine.
+print(json.dumps({"model": info.model, "health": str(health.status), "scans": scans}), flush=True)
 driver.stop_scan()
 driver.disconnect()
-print(json.dumps({"model": info.model, "health": str(health.status), "scans": scans}))
