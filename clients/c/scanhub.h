@@ -68,13 +68,13 @@ enum scanhub_verdict {
 
 /* Method by which a step was found. */
 enum scanhub_method {
-    SCANHUB_MOTION_FIRST = 0, /* The scan is the first one, so it has no step. */
+    SCANHUB_MOTION_FIRST = 0, /* The first scan, which has no step. */
     /* No step explains the scan. Step and summed pose are unknown, and their numbers are 0. */
     SCANHUB_MOTION_REFUSED = 1,
-    SCANHUB_MOTION_BEAMS = 2, /* Beams alone: no corner and no line was found in both scans. */
-    SCANHUB_MOTION_POINTS = 3, /* Corners that are in both scans. */
-    SCANHUB_MOTION_LINES = 4, /* Lines that are in both scans. */
-    SCANHUB_MOTION_BOTH = 5 /* Corners and lines that are in both scans. */
+    SCANHUB_MOTION_BEAMS = 2, /* Beams alone, without a common corner or line. */
+    SCANHUB_MOTION_POINTS = 3, /* Corners in both scans. */
+    SCANHUB_MOTION_LINES = 4, /* Lines in both scans. */
+    SCANHUB_MOTION_BOTH = 5 /* Corners and lines in both scans. */
 };
 
 /* State of a track. */
@@ -390,26 +390,22 @@ static inline int scanhub_are_finite(const uint8_t *at, size_t size, size_t coun
 
 /* A scan. 64 bytes. */
 struct scanhub_scan {
-    /* Angle of beam 0 in radians. 0 is ahead of the sensor, and angles are counterclockwise as seen from above. */
-    double first_angle;
-    double step; /* Angle from one beam to the next in radians; negative for a scanner that rotates clockwise. */
-    /* Angle between two points that the sensor measures, in radians. The grid of beams may have another step. */
-    float spacing;
+    double first_angle; /* Angle of beam 0 in radians; 0 is ahead of the sensor, counterclockwise is positive. */
+    double step; /* Radians from one beam to the next; negative for a scanner that rotates clockwise. */
+    float spacing; /* Radians between two measured points; `step` may be different. */
     uint32_t beam_time_ns; /* Time from one beam to the next in ns. */
-    int32_t first_beam_ns; /* Time at which beam 0 was measured, in ns after the sample's stamp; mostly negative. */
+    int32_t first_beam_ns; /* Time of beam 0, in ns after the sample's first stamp; mostly negative. */
     uint32_t unit_um; /* Micrometers per device unit. */
-    uint16_t count; /* Number of beams, at most 8192. They are in the order in which they were measured. */
+    uint16_t count; /* Number of beams, at most 8192; they are in the order of their measurement. */
     uint16_t valid_to; /* Highest value that is a range; all higher values are codes. */
     uint16_t no_return; /* Code of a beam without an echo. */
     uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has none. */
-    /* Number of points that were dropped because another point has the same beam. Points without a return count,
-     * too. */
+    /* Number of points that were dropped because another point has the same beam; also points without a return. */
     uint16_t collisions;
     uint8_t family; /* Family of the scanner: enum scanhub_family. */
     uint8_t incomplete; /* 1: Packets of the revolution are missing. */
     uint8_t intensity_bits; /* Bits of an intensity; 0 if there are none. */
-    /* Number of revolutions in which the beams were measured: beam i in revolution i modulo this number. 0 means 1. */
-    uint8_t turns;
+    uint8_t turns; /* Number of revolutions in the scan: beam i is from revolution i modulo this number. 0 means 1. */
     uint32_t turn_ns; /* Time of a revolution in ns if there are several; otherwise 0. */
     /* Exact angles in radians; NaN if nothing was measured. NULL if the scan does not have them. Each has 4 bytes. */
     const uint8_t *angles;
@@ -473,7 +469,7 @@ struct scanhub_mark {
     uint32_t range_dmm; /* Range in 1/10 mm. */
     uint16_t weight; /* Sum of the intensities. */
     uint8_t peak; /* Highest intensity. */
-    uint8_t edge; /* 1 if the mark touches the first or the last beam, so that a part of it may be outside. */
+    uint8_t edge; /* 1 if the mark touches the first or the last beam, so a part of it may be outside. */
     uint16_t first_beam; /* First beam. */
     uint16_t last_beam; /* Last beam. */
 };
@@ -517,7 +513,7 @@ struct scanhub_zones {
     uint16_t nearest_beam; /* Beam of the point nearest to the robot's center; 65535 if no beam has a valid reading. */
     uint32_t nearest_mm; /* Distance of that point from the center in mm, rounded down; 4294967295 if there is none. */
     uint16_t invalid_beams; /* Number of beams without a valid reading among those that cross the largest zone. */
-    uint8_t provisional; /* 1: There were fewer scans than a violation requires, so no zone can be violated yet. */
+    uint8_t provisional; /* 1: There were fewer scans than a violation requires. */
     const uint8_t *zones; /* The zones, the largest first. See scanhub_zone. */
 };
 /* One zone: a circle around the robot's center. */
@@ -559,14 +555,13 @@ static inline enum scanhub_result scanhub_read_zones(const struct scanhub_datagr
 
 /* A foreground. 24 bytes. */
 struct scanhub_foreground {
-    uint32_t generation; /* Generation of the background model that the scan was compared with. */
+    uint32_t generation; /* Generation of the compared background. */
     uint32_t unit_um; /* Micrometers per device unit. */
     uint16_t count; /* Number of beams of the scan. */
     uint16_t beams; /* Number of beams in the foreground. */
     uint16_t segment_count; /* Number of segments, at most 64. */
     uint16_t dropped; /* Number of segments that did not fit. */
-    /* Bit i is set if segment i is supported: it has several beams, or the foreground of the previous scan was near
-     * it. */
+    /* Bit i is set if segment i is supported: it has several beams, or is near the previous scan's foreground. */
     uint64_t supported;
     const uint8_t *bits; /* The beams in the foreground: beam i is bit i % 8 of byte i / 8. */
     const uint8_t *ranges; /* Ranges of these beams in device units, in the same order. Each has 2 bytes. */
@@ -578,8 +573,8 @@ struct scanhub_segment {
     uint16_t last; /* Last beam. */
     uint16_t nearest; /* Lowest range in device units. */
     uint16_t width; /* Distance from the first to the last point, in device units. */
-    int32_t x_mm; /* Mean of the points in the robot's frame: mm ahead of the center. */
-    int32_t y_mm; /* Mean of the points in the robot's frame: mm to the left of the center. */
+    int32_t x_mm; /* Mean of the points: mm ahead of the robot's center. */
+    int32_t y_mm; /* Mean of the points: mm to the left of the center. */
     /* 1 if it is supported: it has several beams, or the foreground of the previous scan was near it. */
     uint8_t support;
 };
@@ -628,9 +623,7 @@ static inline enum scanhub_result scanhub_read_foreground_arrays(const struct sc
 struct scanhub_background {
     double first_angle; /* Angle of beam 0 in radians, as in a scan. */
     double step; /* Angle from one beam to the next in radians; 0 before the first scan. */
-    /* Number of the model in this run of the hub. It increases by 1 after a reset, a load, and a change of beams or
-     * unit. */
-    uint32_t generation;
+    uint32_t generation; /* Generation of the background, counted in this run of the hub. */
     uint32_t unit_um; /* Micrometers per device unit. */
     uint16_t known_beams; /* Number of beams whose background is known. */
     uint16_t count; /* Number of beams of the model; 0 before the first scan. */
@@ -670,7 +663,7 @@ struct scanhub_status {
     uint8_t unit_mm; /* Millimeters per device unit: 1, 10 or 100; 0 if unknown. */
     uint8_t family; /* Family of the scanner: enum scanhub_family; 255 while the hub searches for it. */
     uint32_t baud; /* Baud rate of the line; 0 if unknown. */
-    uint64_t since_ns; /* Stamp of the start of the state, in ns of CLOCK_MONOTONIC. */
+    uint64_t since_ns; /* Stamp of the start of the state, in ns. */
     uint32_t rate_mhz; /* Scans per second in 1/1000; 0 while they are not measured. */
     uint16_t angle_deg; /* Field of view in degrees: 100 or 180; 0 if unknown. */
     uint16_t resolution_cdeg; /* Angle between two beams in 1/100 degree; 0 if unknown. */
@@ -683,9 +676,9 @@ struct scanhub_status {
      * rejected_vetoed, 19 rejected_superseded, 20 line_errors, 21 bytes_damaged, 22 damaged_ppm, 23 due_on_line, 24
      * lost_on_line, 25 lost_ppm, 26 scanner_restarts. */
     uint64_t counters[28];
-    double x_m; /* Position of the sensor, in meters ahead of the robot's center. */
-    double y_m; /* Position of the sensor, in meters to the left of the robot's center. */
-    double yaw_rad; /* Direction of the sensor, in radians counterclockwise from ahead. */
+    double x_m; /* Meters ahead of the robot's center. */
+    double y_m; /* Meters to the left of the robot's center. */
+    double yaw_rad; /* Direction in radians, counterclockwise from ahead. */
     uint8_t upside_down; /* 1 if the sensor is mounted upside down, so that its first beam is the leftmost. */
 };
 static inline enum scanhub_result scanhub_read_status(const struct scanhub_datagram *datagram,
@@ -721,7 +714,7 @@ static inline enum scanhub_result scanhub_read_status(const struct scanhub_datag
 struct scanhub_lines {
     uint8_t count; /* Number of lines, at most 64. */
     uint8_t corner_count; /* Number of corners, at most 64. */
-    uint8_t overflow; /* 1: There were too many lines; the others were joined or left out. */
+    uint8_t overflow; /* 1: There are more lines than `lines.max`; the others were joined or dropped. */
     uint16_t readings; /* Number of beams of the scan that have a range. */
     uint16_t on_lines; /* Number of those beams that end on a line. */
     float noise_m; /* Standard deviation of the ranges in meters, estimated from this scan. */
@@ -730,10 +723,10 @@ struct scanhub_lines {
 };
 /* A line feature: a straight surface that neighboring beams end on. */
 struct scanhub_line {
-    float x1_m; /* Point at which the first beam meets the line, in meters ahead of the robot's center. */
-    float y1_m; /* Point at which the first beam meets the line, in meters to the left of the center. */
-    float x2_m; /* Point at which the last beam meets the line, in meters ahead of the robot's center. */
-    float y2_m; /* Point at which the last beam meets the line, in meters to the left of the center. */
+    float x1_m; /* Point on the first beam: meters ahead of the robot's center. */
+    float y1_m; /* Point on the first beam: meters to the left of the center. */
+    float x2_m; /* Point on the last beam: meters ahead of the robot's center. */
+    float y2_m; /* Point on the last beam: meters to the left of the center. */
     float r_m; /* Distance of the infinite line from the center in meters: x cos alpha + y sin alpha = r. */
     float alpha_rad; /* Direction from the center to the line's nearest point, in radians from -pi to pi. */
     float sd_r_m; /* Standard deviation of `r_m` in meters. */
@@ -818,8 +811,7 @@ static inline enum scanhub_result scanhub_read_lines(const struct scanhub_datagr
 
 /* The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame. */
 struct scanhub_motion {
-    /* Summed pose: meters ahead of the robot's center at the first scan. It is the sum of all steps, and it drifts. */
-    double x_m;
+    double x_m; /* Summed pose: meters ahead of the robot's center at the first scan. It drifts. */
     double y_m; /* Summed pose: meters to the left of the center at the first scan. */
     /* Summed pose: radians counterclockwise from the robot's direction at the first scan, from -pi to pi. */
     double yaw_rad;
@@ -827,17 +819,16 @@ struct scanhub_motion {
     float dy_m; /* Step: meters to the left. */
     float dyaw_rad; /* Step: radians counterclockwise. */
     float covariance[9]; /* Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2. */
-    /* Share of this scan's readings that are on surfaces of the scan that it was compared with, 0 to 1. */
-    float overlap;
+    float overlap; /* Share of this scan's readings on surfaces of the compared scan, 0 to 1. */
     uint8_t method; /* Method: enum scanhub_method. Treat every other number as refused. */
     uint8_t valid; /* 1: the summed pose is known, and none of its steps was degenerate. */
     /* 1: The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is
      * large there. */
     uint8_t degenerate;
-    /* Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out. */
+    /* Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them. */
     uint16_t refused_steps;
-    /* Covariance of the summed pose in the frame of the start, in the layout of `covariance`. Refused steps add nothing
-     * to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has revision 1. */
+    /* Covariance of the summed pose in the frame of the start, in the layout of `covariance`, without refused steps. It
+     * is 0 for the first scan, for an invalid pose, and from a sender with revision 1. */
     float pose_covariance[9];
 };
 static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datagram *datagram,
@@ -877,7 +868,7 @@ static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datag
 /* The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first zones with
  * the same or a higher number belong to its scan and confirm it. A sample with `withdrawn` withdraws it. */
 struct scanhub_early {
-    uint8_t verdict; /* Verdict: enum scanhub_verdict. An early warning is slow or stop, never clear or unknown. */
+    uint8_t verdict; /* Verdict: enum scanhub_verdict. It is slow or stop, never clear or unknown. */
     uint8_t withdrawn; /* 1: The warning with this number is withdrawn. */
     uint16_t beam; /* Beam of the nearest point so far. */
     uint32_t distance_mm; /* Distance of that point from the robot's center, in mm. */
@@ -1003,8 +994,8 @@ struct scanhub_events {
     uint8_t kind; /* Kind of the event: enum scanhub_event_kind. */
     char room[25]; /* Name of the room after the event; empty outside of all rooms. */
     char door[25]; /* Name of the door; empty for other events. */
-    char from[25]; /* Name of the room that the person came from, or `outside`; empty for other events. */
-    char to[25]; /* Name of the room that the person went to, or `outside`; empty for other events. */
+    char from[25]; /* Room that the person came from, or `outside`; empty for other events. */
+    char to[25]; /* Room that the person went to, or `outside`; empty for other events. */
 };
 static inline enum scanhub_result scanhub_read_events(const struct scanhub_datagram *datagram,
     struct scanhub_events *out)
@@ -1047,15 +1038,13 @@ static inline enum scanhub_result scanhub_read_tilt(const struct scanhub_datagra
 
 /* A cloud. 16 bytes. */
 struct scanhub_cloud {
-    uint32_t sweep; /* Number of the sweep that the points belong to, from 0. */
-    /* Generation of the background that the points were compared with. Each reset increases it by 1. */
-    uint32_t generation;
+    uint32_t sweep; /* Number of the sweep, from 0. */
+    uint32_t generation; /* Generation of the compared background; each reset increases it by 1. */
     uint16_t count; /* Number of points, at most 8192. */
     uint8_t first; /* 1: The first sample of its sweep. */
     uint8_t last; /* 1: The last sample of its sweep. */
-    uint8_t complete; /* 1: The sweep went from one reversal of the mount to the next, and no angle was missing. */
-    /* 1: The sweep is unreliable, because its angles contradict the background. The class of all points is unknown. */
-    uint8_t unreliable;
+    uint8_t complete; /* 1: The sweep has all angles from one reversal of the mount to the next. */
+    uint8_t unreliable; /* 1: The angles of the sweep contradict the background. The class of all points is unknown. */
     const uint8_t *points; /* The points. See scanhub_point. */
 };
 /* One point. 16 bytes. */
@@ -1112,9 +1101,8 @@ struct scanhub_obstacles {
     uint32_t generation; /* Generation of the background, as in topic `cloud`. */
     uint32_t dropped; /* Number of obstacles that did not fit. */
     uint8_t count; /* Number of obstacles, at most 64. */
-    uint8_t complete; /* 1: The sweep went from one reversal of the mount to the next, and no angle was missing. */
-    /* 1: The sweep is unreliable, because its angles contradict the background. The list is empty, whatever the scene
-     * contains. */
+    uint8_t complete; /* 1: The sweep has all angles from one reversal of the mount to the next. */
+    /* 1: The angles of the sweep contradict the background. The list is empty, whatever the scene contains. */
     uint8_t unreliable;
     const uint8_t *obstacles; /* The obstacles, the nearest first. See scanhub_obstacle. */
 };

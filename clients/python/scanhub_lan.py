@@ -122,19 +122,19 @@ class _ScanHead:
     unit_um: int
     """Micrometers per device unit."""
     count: int
-    """Number of beams, at most 8192. They are in the order in which they were measured."""
+    """Number of beams, at most 8192; they are in the order of their measurement."""
     first_angle: float
-    """Angle of beam 0 in radians. 0 is ahead of the sensor, and angles are counterclockwise as seen from above."""
+    """Angle of beam 0 in radians; 0 is ahead of the sensor, counterclockwise is positive."""
     step: float
-    """Angle from one beam to the next in radians; negative for a scanner that rotates clockwise."""
+    """Radians from one beam to the next; negative for a scanner that rotates clockwise."""
     spacing: float
-    """Angle between two points that the sensor measures, in radians. The grid of beams may have another step."""
+    """Radians between two measured points; `step` may be different."""
     beam_time_ns: int
     """Time from one beam to the next in ns."""
     first_beam_ns: int
-    """Time at which beam 0 was measured, in ns after the sample's stamp; mostly negative."""
+    """Time of beam 0, in ns after the sample's first stamp; mostly negative."""
     turns: int
-    """Number of revolutions in which the beams were measured: beam i in revolution i modulo this number. 0 means 1."""
+    """Number of revolutions in the scan: beam i is from revolution i modulo this number. 0 means 1."""
     turn_ns: int
     """Time of a revolution in ns if there are several; otherwise 0."""
     valid_to: int
@@ -144,8 +144,7 @@ class _ScanHead:
     beyond: int
     """Code of an echo from beyond the range limit; `no_return` if the family has none."""
     collisions: int
-    """Number of points that were dropped because another point has the same beam. Points without a return count,
-    too."""
+    """Number of points that were dropped because another point has the same beam; also points without a return."""
     incomplete: bool
     """Packets of the revolution are missing."""
     intensity_bits: int
@@ -165,7 +164,7 @@ class Mark:
     peak: int
     """Highest intensity."""
     edge: int
-    """1 if the mark touches the first or the last beam, so that a part of it may be outside."""
+    """1 if the mark touches the first or the last beam, so a part of it may be outside."""
     first_beam: int
     """First beam."""
     last_beam: int
@@ -210,7 +209,7 @@ class Zones:
     invalid_beams: int
     """Number of beams without a valid reading among those that cross the largest zone."""
     provisional: bool
-    """There were fewer scans than a violation requires, so no zone can be violated yet."""
+    """There were fewer scans than a violation requires."""
     zones: "tuple[Zone, ...]"
     """The zones, the largest first."""
 
@@ -228,9 +227,9 @@ class Segment:
     width: int
     """Distance from the first to the last point, in device units."""
     x_mm: int
-    """Mean of the points in the robot's frame: mm ahead of the center."""
+    """Mean of the points: mm ahead of the robot's center."""
     y_mm: int
-    """Mean of the points in the robot's frame: mm to the left of the center."""
+    """Mean of the points: mm to the left of the center."""
     support: bool
     """Whether it has several beams, or the foreground of the previous scan was near it."""
 
@@ -240,7 +239,7 @@ class _ForegroundHead:
     """Head of a foreground, before the arrays. 24 bytes."""
 
     generation: int
-    """Generation of the background model that the scan was compared with."""
+    """Generation of the compared background."""
     count: int
     """Number of beams of the scan."""
     unit_um: int
@@ -254,8 +253,7 @@ class Background:
     """Head of a background model, before the ranges. 32 bytes."""
 
     generation: int
-    """Number of the model in this run of the hub. It increases by 1 after a reset, a load, and a change of beams or
-    unit."""
+    """Generation of the background, counted in this run of the hub."""
     known_beams: int
     """Number of beams whose background is known."""
     count: int
@@ -277,11 +275,11 @@ class Pose:
     """A sensor's pose in the robot's frame: x ahead, y left, the origin at the robot's center. 32 bytes."""
 
     x_m: float
-    """Position of the sensor, in meters ahead of the robot's center."""
+    """Meters ahead of the robot's center."""
     y_m: float
-    """Position of the sensor, in meters to the left of the robot's center."""
+    """Meters to the left of the robot's center."""
     yaw_rad: float
-    """Direction of the sensor, in radians counterclockwise from ahead."""
+    """Direction in radians, counterclockwise from ahead."""
     upside_down: bool
     """True if the sensor is mounted upside down, so that its first beam is the leftmost."""
 
@@ -302,7 +300,7 @@ class Status:
     baud: int
     """Baud rate of the line; 0 if unknown."""
     since_ns: int
-    """Stamp of the start of the state, in ns of CLOCK_MONOTONIC."""
+    """Stamp of the start of the state, in ns."""
     rate_mhz: int
     """Scans per second in 1/1000; 0 while they are not measured."""
     angle_deg: int
@@ -326,13 +324,13 @@ class Line:
     """A line feature: a straight surface that neighboring beams end on."""
 
     x1_m: float
-    """Point at which the first beam meets the line, in meters ahead of the robot's center."""
+    """Point on the first beam: meters ahead of the robot's center."""
     y1_m: float
-    """Point at which the first beam meets the line, in meters to the left of the center."""
+    """Point on the first beam: meters to the left of the center."""
     x2_m: float
-    """Point at which the last beam meets the line, in meters ahead of the robot's center."""
+    """Point on the last beam: meters ahead of the robot's center."""
     y2_m: float
-    """Point at which the last beam meets the line, in meters to the left of the center."""
+    """Point on the last beam: meters to the left of the center."""
     r_m: float
     """Distance of the infinite line from the center in meters: x cos alpha + y sin alpha = r."""
     alpha_rad: float
@@ -368,7 +366,7 @@ class Lines:
     """The payload of topic `lines`, 3340 bytes: one sample per scan, in the robot's frame."""
 
     overflow: bool
-    """There were too many lines; the others were joined or left out."""
+    """There are more lines than `lines.max`; the others were joined or dropped."""
     readings: int
     """Number of beams of the scan that have a range."""
     on_lines: int
@@ -386,7 +384,7 @@ class Motion:
     """The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame."""
 
     x_m: float
-    """Summed pose: meters ahead of the robot's center at the first scan. It is the sum of all steps, and it drifts."""
+    """Summed pose: meters ahead of the robot's center at the first scan. It drifts."""
     y_m: float
     """Summed pose: meters to the left of the center at the first scan."""
     yaw_rad: float
@@ -400,7 +398,7 @@ class Motion:
     covariance: "tuple[float, ...]"
     """Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2."""
     overlap: float
-    """Share of this scan's readings that are on surfaces of the scan that it was compared with, 0 to 1."""
+    """Share of this scan's readings on surfaces of the compared scan, 0 to 1."""
     method: str
     """Method: one of METHODS."""
     valid: bool
@@ -409,10 +407,10 @@ class Motion:
     """The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is large
     there."""
     refused_steps: int
-    """Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out."""
+    """Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them."""
     pose_covariance: "tuple[float, ...]"
-    """Covariance of the summed pose in the frame of the start, in the layout of `covariance`. Refused steps add nothing
-    to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has revision 1."""
+    """Covariance of the summed pose in the frame of the start, in the layout of `covariance`, without refused steps. It
+    is 0 for the first scan, for an invalid pose, and from a sender with revision 1."""
 
 
 @dataclass(frozen=True)
@@ -421,7 +419,7 @@ class Early:
     with the same or a higher number belong to its scan and confirm it. A sample with `withdrawn` withdraws it."""
 
     verdict: str
-    """Verdict: one of VERDICTS. An early warning is slow or stop, never clear or unknown."""
+    """Verdict: one of VERDICTS. It is slow or stop, never clear or unknown."""
     withdrawn: bool
     """The warning with this number is withdrawn."""
     beam: int
@@ -502,9 +500,9 @@ class Event:
     door: str
     """Name of the door; empty for other events."""
     from_room: str
-    """Name of the room that the person came from, or `outside`; empty for other events."""
+    """Room that the person came from, or `outside`; empty for other events."""
     to_room: str
-    """Name of the room that the person went to, or `outside`; empty for other events."""
+    """Room that the person went to, or `outside`; empty for other events."""
 
 
 @dataclass(frozen=True)
@@ -539,17 +537,17 @@ class Cloud:
     """Head of a cloud, before the points. 16 bytes."""
 
     sweep: int
-    """Number of the sweep that the points belong to, from 0."""
+    """Number of the sweep, from 0."""
     generation: int
-    """Generation of the background that the points were compared with. Each reset increases it by 1."""
+    """Generation of the compared background; each reset increases it by 1."""
     first: bool
     """The first sample of its sweep."""
     last: bool
     """The last sample of its sweep."""
     complete: bool
-    """The sweep went from one reversal of the mount to the next, and no angle was missing."""
+    """The sweep has all angles from one reversal of the mount to the next."""
     unreliable: bool
-    """The sweep is unreliable, because its angles contradict the background. The class of all points is unknown."""
+    """The angles of the sweep contradict the background. The class of all points is unknown."""
     points: "tuple[Point, ...]"
     """The points."""
 
@@ -589,10 +587,9 @@ class Obstacles:
     generation: int
     """Generation of the background, as in topic `cloud`."""
     complete: bool
-    """The sweep went from one reversal of the mount to the next, and no angle was missing."""
+    """The sweep has all angles from one reversal of the mount to the next."""
     unreliable: bool
-    """The sweep is unreliable, because its angles contradict the background. The list is empty, whatever the scene
-    contains."""
+    """The angles of the sweep contradict the background. The list is empty, whatever the scene contains."""
     dropped: int
     """Number of obstacles that did not fit."""
     obstacles: "tuple[Obstacle, ...]"

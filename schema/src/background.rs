@@ -20,8 +20,7 @@ pub struct BackgroundHead {
     pub first_angle: f64,
     /// Angle from one beam to the next in radians; 0 before the first scan.
     pub step: f64,
-    /// Number of the model in this run of the hub. It increases by 1 after a reset, a load, and a change of beams or
-    /// unit.
+    /// Generation of the background, counted in this run of the hub.
     pub generation: u32,
     /// Micrometers per device unit.
     pub unit_um: u32,
@@ -134,7 +133,7 @@ pub const MAX_SEGMENTS: usize = 64;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ForegroundHead {
-    /// Generation of the background model that the scan was compared with.
+    /// Generation of the compared background.
     pub generation: u32,
     /// Micrometers per device unit.
     pub unit_um: u32,
@@ -146,8 +145,7 @@ pub struct ForegroundHead {
     pub segments: u16,
     /// Number of segments that did not fit.
     pub dropped: u16,
-    /// Bit i is set if segment i is supported: it has several beams, or the foreground of the previous scan was near
-    /// it.
+    /// Bit i is set if segment i is supported: it has several beams, or is near the previous scan's foreground.
     pub supported: u64,
 }
 
@@ -176,9 +174,9 @@ pub struct Segment {
     pub nearest: u16,
     /// Distance from the first to the last point, in device units.
     pub width: u16,
-    /// Mean of the points in the robot's frame: mm ahead of the center.
+    /// Mean of the points: mm ahead of the robot's center.
     pub x_mm: i32,
-    /// Mean of the points in the robot's frame: mm to the left of the center.
+    /// Mean of the points: mm to the left of the center.
     pub y_mm: i32,
 }
 

@@ -12,7 +12,7 @@ use crate::Family;
 #[repr(C)]
 pub struct Header {
     /// Number of the telegram that the sample was computed from, per sensor and run of the hub, from 0. A sample
-    /// without a telegram has the number of the last telegram; before the first telegram 0, like the first one.
+    /// without a telegram has the number of the last one; 0 before the first one.
     pub seq: u64,
     /// Number of the sample in its topic, from 0. A gap means that the subscriber missed samples.
     pub topic_seq: u64,
@@ -40,8 +40,8 @@ pub struct Header {
     /// Reasons why the telegram is suspect: [`Reasons`]; 0 if it is clean.
     pub reasons: u8,
     /// Time from the telegram's last byte until the sample was sent, in units of 256 ns, rounded up; the low byte is
-    /// first. FFFFFFh means 4.3 s or more. 0 means unknown: the sample has no telegram or comes from another machine.
-    /// See [`hub_time_ns`](Self::hub_time_ns).
+    /// first. FFFFFFh means 4.3 s or more; 0 means unknown, because the sample has no telegram or is remote. See
+    /// [`hub_time_ns`](Self::hub_time_ns).
     pub hub_time: [u8; 3],
 }
 
@@ -111,7 +111,7 @@ impl Quality {
 pub struct Reasons;
 
 impl Reasons {
-    /// The driver counted line errors while this telegram or the previous one was read.
+    /// The driver counted line errors during this telegram or the previous one.
     pub const LINE_ERROR: u8 = 1;
     /// The bytes just before the telegram belong to no telegram.
     pub const NEIGHBOUR: u8 = 2;
@@ -139,11 +139,11 @@ impl Reasons {
 pub struct Flags;
 
 impl Flags {
-    /// The scanner is simulated: the port is a pty.
+    /// The scanner is simulated, with a pty as its port.
     pub const SIMULATED: u8 = 2;
     /// The link plays a recording.
     pub const REPLAYED: u8 = 4;
-    /// The stamps were computed instead of taken when the bytes arrived.
+    /// The stamps were computed, not taken when the bytes arrived.
     pub const STAMP_ESTIMATED: u8 = 8;
     /// The sample comes from another machine.
     pub const REMOTE: u8 = 32;

@@ -37,7 +37,7 @@ pub struct Mark {
     pub weight: u16,
     /// Highest intensity.
     pub peak: u8,
-    /// 1 if the mark touches the first or the last beam, so that a part of it may be outside.
+    /// 1 if the mark touches the first or the last beam, so a part of it may be outside.
     pub edge: u8,
     /// First beam.
     pub first_beam: u16,
@@ -60,8 +60,8 @@ impl Marks {
     pub const OVERFLOW: u8 = 1;
     /// Flag: marks are unknown, because the measuring mode has no reflector bits or [`Marks::NO_LEVEL`] is set.
     pub const UNAVAILABLE: u8 = 2;
-    /// Flag, set together with [`Marks::UNAVAILABLE`]: the sensor measures the intensity of every surface, and no
-    /// threshold for reflectors is configured.
+    /// Flag, set together with [`Marks::UNAVAILABLE`]: the sensor measures intensities, and no threshold for reflectors
+    /// is configured.
     pub const NO_LEVEL: u8 = 4;
 
     /// Returns the used marks.
@@ -119,13 +119,13 @@ pub struct Lines {
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Line.v2"))]
 #[repr(C)]
 pub struct Line {
-    /// Point at which the first beam meets the line, in meters ahead of the robot's center.
+    /// Point on the first beam: meters ahead of the robot's center.
     pub x1_m: f32,
-    /// Point at which the first beam meets the line, in meters to the left of the center.
+    /// Point on the first beam: meters to the left of the center.
     pub y1_m: f32,
-    /// Point at which the last beam meets the line, in meters ahead of the robot's center.
+    /// Point on the last beam: meters ahead of the robot's center.
     pub x2_m: f32,
-    /// Point at which the last beam meets the line, in meters to the left of the center.
+    /// Point on the last beam: meters to the left of the center.
     pub y2_m: f32,
     /// Distance of the infinite line from the center in meters: x cos alpha + y sin alpha = r.
     pub r_m: f32,
@@ -186,7 +186,7 @@ impl FixedPayload for Lines {
 }
 
 impl Lines {
-    /// Flag: there were too many lines; the others were joined or left out.
+    /// Flag: there are more lines than `lines.max`; the others were joined or dropped.
     pub const OVERFLOW: u8 = 1;
 
     /// Returns the used lines.

@@ -17,7 +17,7 @@ use crate::text::named;
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Motion.v2"))]
 #[repr(C)]
 pub struct Motion {
-    /// Summed pose: meters ahead of the robot's center at the first scan. It is the sum of all steps, and it drifts.
+    /// Summed pose: meters ahead of the robot's center at the first scan. It drifts.
     pub x_m: f64,
     /// Summed pose: meters to the left of the center at the first scan.
     pub y_m: f64,
@@ -31,19 +31,19 @@ pub struct Motion {
     pub dyaw_rad: f32,
     /// Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2.
     pub covariance: [f32; 9],
-    /// Share of this scan's readings that are on surfaces of the scan that it was compared with, 0 to 1.
+    /// Share of this scan's readings on surfaces of the compared scan, 0 to 1.
     pub overlap: f32,
     /// Method: [`MotionMethod`]. Treat every other number as refused.
     pub method: u8,
     /// Flags: [`Motion::DEGENERATE`], [`Motion::OPEN`].
     pub flags: u8,
-    /// Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out.
+    /// Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them.
     pub refused_steps: u16,
-    /// Covariance of the summed pose in the frame of the start, in the layout of [`Motion::covariance`]. Refused steps
-    /// add nothing to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has
-    /// revision 1. See [`Motion::sum_covariance`].
+    /// Covariance of the summed pose in the frame of the start, in the layout of [`Motion::covariance`], without
+    /// refused steps. It is 0 for the first scan, for an invalid pose, and from a sender with revision 1. See
+    /// [`Motion::sum_covariance`].
     pub pose_covariance: [f32; 9],
-    /// Always 0.
+    /// 0.
     pub reserved: u32,
 }
 
@@ -51,17 +51,17 @@ pub struct Motion {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum MotionMethod {
-    /// The scan is the first one, so it has no step.
+    /// The first scan, which has no step.
     First,
     /// No step explains the scan. Step and summed pose are unknown, and their numbers are 0.
     Refused,
-    /// Beams alone: no corner and no line was found in both scans.
+    /// Beams alone, without a common corner or line.
     Beams,
-    /// Corners that are in both scans.
+    /// Corners in both scans.
     Points,
-    /// Lines that are in both scans.
+    /// Lines in both scans.
     Lines,
-    /// Corners and lines that are in both scans.
+    /// Corners and lines in both scans.
     Both,
 }
 

@@ -20,11 +20,11 @@ pub const MAX_BEAMS: usize = 8192;
 pub struct ArrayFlags;
 
 impl ArrayFlags {
-    /// One byte: intensities, or the field bits above the range in some modes of an LMS.
+    /// Intensities of at most 8 bits, or field bits in some modes of an LMS.
     pub const UPPER: u8 = 1;
-    /// Two bytes: intensities.
+    /// Intensities of more than 8 bits.
     pub const WIDE: u8 = 2;
-    /// The exact angle in radians, a 32-bit float; NaN if nothing was measured.
+    /// Exact angles in radians, as 32-bit floats.
     pub const ANGLES: u8 = 4;
     /// Arrays of a revolution on a grid of beams.
     pub const REVOLUTION: u8 = ArrayFlags::UPPER | ArrayFlags::ANGLES;
@@ -36,19 +36,19 @@ impl ArrayFlags {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ScanHead {
-    /// Angle of beam 0 in radians. 0 is ahead of the sensor, and angles are counterclockwise as seen from above.
+    /// Angle of beam 0 in radians; 0 is ahead of the sensor, counterclockwise is positive.
     pub first_angle: f64,
-    /// Angle from one beam to the next in radians; negative for a scanner that rotates clockwise.
+    /// Radians from one beam to the next; negative for a scanner that rotates clockwise.
     pub step: f64,
-    /// Angle between two points that the sensor measures, in radians. The grid of beams may have another step.
+    /// Radians between two measured points; `step` may be different.
     pub spacing: f32,
     /// Time from one beam to the next in ns.
     pub beam_time_ns: u32,
-    /// Time at which beam 0 was measured, in ns after the sample's stamp; mostly negative.
+    /// Time of beam 0, in ns after the sample's first stamp; mostly negative.
     pub first_beam_ns: i32,
     /// Micrometers per device unit.
     pub unit_um: u32,
-    /// Number of beams, at most [`MAX_BEAMS`]. They are in the order in which they were measured.
+    /// Number of beams, at most [`MAX_BEAMS`]; they are in the order of their measurement.
     pub count: u16,
     /// Highest value that is a range; all higher values are codes.
     pub valid_to: u16,
@@ -56,7 +56,7 @@ pub struct ScanHead {
     pub no_return: u16,
     /// Code of an echo from beyond the range limit; [`no_return`](Self::no_return) if the family has none.
     pub beyond: u16,
-    /// Number of points that were dropped because another point has the same beam. Points without a return count, too.
+    /// Number of points that were dropped because another point has the same beam; also points without a return.
     pub collisions: u16,
     /// Family of the scanner: [`Family`].
     pub family: u8,
@@ -66,7 +66,7 @@ pub struct ScanHead {
     pub contents: u8,
     /// Bits of an intensity; 0 if there are none.
     pub intensity_bits: u8,
-    /// Number of revolutions in which the beams were measured: beam i in revolution i modulo this number. 0 means 1.
+    /// Number of revolutions in the scan: beam i is from revolution i modulo this number. 0 means 1.
     pub turns: u8,
     /// 0.
     pub reserved: u8,

@@ -30,7 +30,7 @@ pub struct Status {
     pub family: u8,
     /// Baud rate of the line; 0 if unknown.
     pub baud: u32,
-    /// Stamp of the start of the state, in ns of CLOCK_MONOTONIC.
+    /// Stamp of the start of the state, in ns.
     pub since_ns: u64,
     /// Scans per second in 1/1000; 0 while they are not measured. See [`Status::rate_hz`].
     pub rate_mhz: u32,
@@ -346,11 +346,11 @@ counters! {
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Pose.v2"))]
 #[repr(C)]
 pub struct Pose {
-    /// Position of the sensor, in meters ahead of the robot's center.
+    /// Meters ahead of the robot's center.
     pub x_m: f64,
-    /// Position of the sensor, in meters to the left of the robot's center.
+    /// Meters to the left of the robot's center.
     pub y_m: f64,
-    /// Direction of the sensor, in radians counterclockwise from ahead.
+    /// Direction in radians, counterclockwise from ahead.
     pub yaw_rad: f64,
     /// 1 if the sensor is mounted upside down, so that its first beam is the leftmost.
     pub upside_down: u8,

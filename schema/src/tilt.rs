@@ -51,9 +51,9 @@ impl Tilt {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct CloudHead {
-    /// Number of the sweep that the points belong to, from 0.
+    /// Number of the sweep, from 0.
     pub sweep: u32,
-    /// Generation of the background that the points were compared with. Each reset increases it by 1.
+    /// Generation of the compared background; each reset increases it by 1.
     pub generation: u32,
     /// Number of points, at most [`MAX_BEAMS`](crate::MAX_BEAMS).
     pub count: u16,
@@ -128,9 +128,9 @@ impl Cloud {
     pub const FIRST: u8 = 1;
     /// Flag: the last sample of its sweep.
     pub const LAST: u8 = 2;
-    /// Flag: the sweep went from one reversal of the mount to the next, and no angle was missing.
+    /// Flag: the sweep has all angles from one reversal of the mount to the next.
     pub const COMPLETE: u8 = 4;
-    /// Flag: the sweep is unreliable, because its angles contradict the background. The class of all points is unknown.
+    /// Flag: the angles of the sweep contradict the background. The class of all points is unknown.
     pub const UNRELIABLE: u8 = 8;
 
     /// Returns the length in bytes of a cloud of `points` points.
@@ -317,10 +317,9 @@ impl FixedPayload for Obstacles {
 }
 
 impl Obstacles {
-    /// Flag: the sweep went from one reversal of the mount to the next, and no angle was missing.
+    /// Flag: the sweep has all angles from one reversal of the mount to the next.
     pub const COMPLETE: u8 = 4;
-    /// Flag: the sweep is unreliable, because its angles contradict the background. The list is empty, whatever the
-    /// scene contains.
+    /// Flag: the angles of the sweep contradict the background. The list is empty, whatever the scene contains.
     pub const UNRELIABLE: u8 = 8;
 
     /// Returns the obstacles, the nearest first.

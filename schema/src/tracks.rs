@@ -222,9 +222,9 @@ pub struct Event {
     pub room_text: [u8; 24],
     /// Name of the door; empty for other events.
     pub door_text: [u8; 24],
-    /// Name of the room that the person came from, or `outside`; empty for other events.
+    /// Room that the person came from, or `outside`; empty for other events.
     pub from_text: [u8; 24],
-    /// Name of the room that the person went to, or `outside`; empty for other events.
+    /// Room that the person went to, or `outside`; empty for other events.
     pub to_text: [u8; 24],
 }
 

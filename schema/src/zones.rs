@@ -63,7 +63,7 @@ impl Zones {
     pub const NO_BEAM: u16 = u16::MAX;
     /// Value of [`Zones::nearest_mm`] if there is none.
     pub const NO_DISTANCE: u32 = u32::MAX;
-    /// Flag: there were fewer scans than a violation requires, so no zone can be violated yet.
+    /// Flag: there were fewer scans than a violation requires.
     pub const PROVISIONAL: u8 = 1;
 
     /// Returns a payload without zones, with verdict unknown.
@@ -150,7 +150,7 @@ impl Verdict {
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Early.v2"))]
 #[repr(C)]
 pub struct Early {
-    /// Verdict: [`Verdict`]. An early warning is slow or stop, never clear or unknown.
+    /// Verdict: [`Verdict`]. It is slow or stop, never clear or unknown.
     pub verdict: u8,
     /// Flags: [`Early::WITHDRAWN`].
     pub flags: u8,

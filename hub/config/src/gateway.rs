@@ -26,29 +26,36 @@ section! {
     pub struct Gateway: "keys of gateway, as { interface = \"eth0\" }" {
         /// for the multicast groups; no default
         ///
-        /// Network interface on which the multicast groups are sent.
+        /// Network interface for the multicast groups. Without it, nothing is sent to groups.
         interface: Option<String> = None, example "\"eth0\"";
         /// default: all but telegram, lines, motion, early and cloud
         ///
-        /// Topics to send: `SENSOR/TOPIC`, `SENSOR/*` or `*/TOPIC`, possibly with `:every=N`, see below.
+        /// Topics to send: `SENSOR/TOPIC`, `SENSOR/*` or `*/TOPIC`, each possibly with `:every=N`. The most specific
+        /// entry wins.
         topics: Option<Vec<String>> = None, example "[\"*/zones\", \"*/scan:every=4\"]";
         /// receivers of copies; default: none
         ///
-        /// Hosts that receive copies: `HOST:PORT`, `[IPV6]:PORT` or `[fe80::7%eth0]:PORT`.
+        /// Hosts that receive copies: `HOST:PORT`, `[IPV6]:PORT` or `[fe80::7%eth0]:PORT`. Names are resolved again
+        /// while the gateway runs.
         to: Option<Vec<String>> = None, example "[\"10.0.0.7:22200\"]";
         /// whether to send only telegrams, without a header
         bare: Option<bool> = None;
         /// authenticates datagrams; no default
         ///
-        /// File with the key that authenticates datagrams.
+        /// File with the [key](datagram.md#keys) of the MAC of all datagrams, from `scanhub key new`.
         key_file: Option<PathBuf> = None, example "\"/etc/scanhub/lan.key\"";
         /// networks that a datagram to a group may cross
+        ///
+        /// Networks that a datagram to a group may cross, including the first one.
         ttl: Option<i64> = None, check optional(whole_or(0..=255, "0 to 255".into()));
         /// interval at which a background is sent again; default: only new ones are sent
         ///
-        /// Interval at which a background is sent again, such as `10s`. Default: only new ones are sent.
+        /// Interval at which a background is sent again, such as `10s`, at most once a second. Default: only new ones
+        /// are sent.
         background_every: Option<String> = None, example "\"10s\"";
         /// longest datagram in bytes, 576 to 1472
+        ///
+        /// Longest datagram in bytes, 576 to 1472, or less if the interface carries less.
         mtu: Option<i64> = None, check optional(whole_or(
             MIN_MTU as i64..=MTU_ETHERNET as i64,
             format!("{MIN_MTU} to {MTU_ETHERNET} bytes, which an Ethernet carries"),

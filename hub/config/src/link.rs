@@ -133,7 +133,7 @@ section! {
     pub(crate) struct LinkKeys: "keys of a link, as { name = \"front\", port = \"/dev/ttyUSB0\" }" {
         /// first part of topic names: a-z, 0-9, _ and -
         ///
-        /// The sensor's name in topics, at most 24 of a-z, 0-9, _ and -; not `robot`.
+        /// The sensor's name in topics: at most 24 of a-z, 0-9, _ and -, but not `robot`.
         name: String = String::new(), check name;
         /// better a permanent name: `scanhub probe` lists them; or tcp:HOST:PORT, or file:PATH
         ///
@@ -146,16 +146,15 @@ section! {
         expected_type ("type"): Option<String> = None;
         /// auto: the hub finds the scanner
         ///
-        /// The name of a family, see below, or `auto`, the default: the hub finds the scanner.
+        /// `lms`, `ld`, `rplidar`, or `auto`, the default: the hub finds the scanner.
         family: Option<String> = None, example "\"auto\"";
         /// auto, or the name of a model
         ///
-        /// The name of a model, see below, or `auto`, the default.
+        /// Model of a rotating scanner, or `auto`, the default.
         model: Option<String> = None, example "\"auto\"";
         /// beams per scan, 2 to 8192; default: as many points as the model measures per revolution
         ///
-        /// Beams per scan for a rotating scanner, 2 to 8192. Default: as many points as the model measures per
-        /// revolution.
+        /// Beams per scan of a rotating scanner, 2 to 8192. Default: as many as the model measures per revolution.
         beams: Option<i64> = None, example "450";
         /// degrees, 100 or 180
         ///
@@ -167,15 +166,15 @@ section! {
         resolution: Option<f64> = None, example "0.5";
         /// expected unit: mm or cm
         ///
-        /// Expected unit of an LMS: `mm` or `cm`. The hub compares it with the sensor's unit and never changes that.
+        /// Expected unit of an LMS: `mm` or `cm`. The hub never changes the sensor's unit.
         unit: Option<String> = None, example "\"mm\"";
         /// measuring mode, for a recording that does not contain it
         ///
-        /// Scan mode of an RPLIDAR, or measuring mode of a recording of an LMS, see below.
+        /// Scan mode of an RPLIDAR, or measuring mode of a recording of an LMS ([mode](#mode)).
         mode: Option<toml::Value> = None, example "0x01";
         /// run, or stop: the motor stops while no program subscribes
         ///
-        /// `run`; or `stop`: the motor of an RPLIDAR stops while no program subscribes.
+        /// `run`, or `stop`: the motor of an RPLIDAR stops while no program subscribes.
         idle: Option<String> = None, example "\"run\"";
         /// baud rate of the stream: 500000, 38400, 19200 or 9600
         ///

@@ -117,8 +117,7 @@ section! {
         y: f64 = 0.0, check within(-100.0..=100.0, OFFSET_REMEDY);
         /// radians, counterclockwise from ahead
         ///
-        /// Direction in which the sensor looks, in radians counterclockwise from ahead, at most 2 pi in either
-        /// direction.
+        /// Direction of the sensor in radians counterclockwise from ahead, at most 2 pi in either direction.
         yaw: f64 = 0.0, check within(-FULL_CIRCLE..=FULL_CIRCLE, "radians, counterclockwise: 90 degrees are 1.5708");
         /// whether the sensor hangs upside down
         ///
@@ -133,14 +132,13 @@ section! {
         /// meters around the robot's center: slow first, stop last
         ///
         /// 1 to 8 circles around the robot's center, the largest first, up to 65 m. A point inside the smallest circle
-        /// means stop; inside another circle, slow.
+        /// means stop, and inside another circle slow.
         radii: Vec<f64> = vec![1.0, 0.6], check radii;
         /// the robot's own body, such as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }
         ///
-        /// The robot's own body in the sensor's view, at most 64 sectors: between the sensor angles `from_deg` and
-        /// `to_deg` (degrees within -180 to 180: 0 ahead, 90 left, -90 right; `from_deg` is the smaller one), readings
-        /// nearer than `range` meters are ignored. `from` and `to`, which counted from the right, are refused, and the
-        /// message has the sector in the new keys. `scanhub zones SENSOR mask` learns these sectors.
+        /// The robot's own body, in at most 64 sectors. Readings nearer than `range` meters at sensor angles from
+        /// `from_deg` to `to_deg` are ignored (degrees from -180 to 180: 0 ahead, 90 left). `scanhub zones SENSOR mask`
+        /// learns these sectors.
         body_mask: Vec<SectorKeys> = Vec::new(), check sectors;
         /// meters added to each radius
         ///
@@ -148,12 +146,12 @@ section! {
         margin: f64 = 0.0, check meters(0.0..=10.0);
         /// beams inside a circle that violate it
         ///
-        /// A circle is violated if at least this number of beams is inside.
+        /// Minimum number of beams inside a circle that violate it.
         min_beams: i64 = 1, check whole(1..=MAX_BEAMS as i64);
         /// consecutive scans in which a circle must be violated
         ///
-        /// Number of consecutive scans in which a circle must be violated, at most 1000. The verdict is unknown until
-        /// this number of scans has followed a start, a silence or a scan with too many invalid beams.
+        /// Consecutive scans in which a circle must be violated, at most 1000. The verdict is unknown until this number
+        /// of scans has followed a start, a silence or a scan with too many invalid beams.
         min_scans: i64 = 1, check whole(1..=1000);
         /// the verdict is unknown if a larger share of the beams has no reading
         ///
@@ -165,7 +163,7 @@ section! {
         exact: bool = true;
         /// whether no echo means that nothing is near
         ///
-        /// If true, no echo means that nothing is near; if false, it counts as no reading.
+        /// Whether no echo means that nothing is near. If false, it counts as no reading.
         no_return_is_far: bool = true;
     }
 }
@@ -212,7 +210,7 @@ section! {
     pub(crate) struct LinesKeys: "keys of lines, as { max = 20, refine = true }" {
         /// lines of a scan, 1 to 64
         ///
-        /// Maximum number of lines of a scan, 1 to 64. If there are more, those that differ least are joined, and beams
+        /// Maximum number of lines of a scan, 1 to 64. Of more lines, those that differ least are joined, and beams
         /// that do not fit a line well are dropped.
         max: i64 = 64, check whole(1..=MAX_LINES as i64);
         /// beams of a line, at least 3
@@ -221,8 +219,8 @@ section! {
         min_points: i64 = 5, check whole(3..=MAX_BEAMS as i64);
         /// slower fit with a better result
         ///
-        /// Whether the cuts between lines are moved to their best positions, and the worst beams at the ends of lines
-        /// are dropped, at most one in twenty. This is slower.
+        /// Whether the cuts between lines are moved to their best positions, which is slower. The worst beams at the
+        /// ends of lines are then dropped, at most one in twenty.
         refine: bool = false;
     }
 }
@@ -232,11 +230,11 @@ section! {
     pub(crate) struct MotionKeys: "keys of motion, as { max_step = 0.5, max_turn = 30.0 }" {
         /// meters from one scan to the next
         ///
-        /// Maximum distance in meters from one scan to the next: 0.01 to 10. A longer step is rejected.
+        /// Maximum distance in meters from one scan to the next, 0.01 to 10. A longer step is rejected.
         max_step: f64 = 0.5, check within(0.01..=10.0, "meters from scan to scan, from 0.01 to 10");
         /// degrees from one scan to the next
         ///
-        /// Maximum turn in degrees from one scan to the next: 1 to 85.
+        /// Maximum turn in degrees from one scan to the next, 1 to 85.
         max_turn: f64 = 30.0, check within(1.0..=85.0, "degrees from scan to scan, from 1 to 85");
         /// share of readings on surfaces of the previous scan
         ///
@@ -251,13 +249,13 @@ section! {
     pub(crate) struct BackgroundKeys: "keys of background, as { method = \"multi\" }" {
         /// multi, paper, moving (for a robot that drives) or off
         ///
-        /// `multi`; `paper`, a simpler published method; `moving`, for a robot that drives, see below; `off`: the hub
-        /// publishes neither foreground nor background, and refuses requests.
+        /// `multi`; `paper`, a simpler published method; [`moving`](#moving), for a robot that drives; or `off`:
+        /// neither foreground nor background is published.
         method: MethodKey = MethodKey::Multi;
         /// distance from the background that still belongs to it; default: 30, 60 or 100, by the unit
         ///
-        /// Distance in mm from the background at which a reading still belongs to it, up to 10,000; at least one unit
-        /// of the sensor. Default: 30, 60 for units of cm, 100 for dm.
+        /// Distance in mm from the background at which a reading still belongs to it, from one unit of the sensor to
+        /// 10,000. Default: 30, 60 for units of cm, 100 for dm.
         threshold_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
         /// for paper: the same distance from a candidate, with the same default
         ///
@@ -265,9 +263,8 @@ section! {
         candidate_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
         /// scans until a surface is background; default: those of 10 s
         ///
-        /// Number of scans in which a surface must be seen before it is background, at most 8191; for `paper` they must
-        /// be consecutive. Default: the number of scans in 10 s at the full rate. With `multi`, a surface is known
-        /// after 5/8 of this number, even if you set it.
+        /// Number of scans in which a surface must be seen before it is background, at most 8191. For `paper`, they
+        /// must be consecutive; for `multi`, 5/8 of them are enough. Default: the scans of 10 s at the full rate.
         scans: Option<i64> = None, check optional(whole(1..=8_191)), example "375";
         /// for paper: first or latest
         ///
@@ -275,23 +272,22 @@ section! {
         candidate: CandidateKey = CandidateKey::First;
         /// empty, first-scan or a saved file; default: the saved background if it fits, or empty
         ///
-        /// Background to start with: `empty`; `first-scan`; or a file that `scanhub background SENSOR save` wrote for
-        /// this sensor. A relative path starts in the directory in which the hub was started. Default: the background
-        /// that an earlier hub saved, if it fits, otherwise `empty`.
+        /// Background to start with: `empty`, `first-scan`, or a file of this sensor from `scanhub background SENSOR
+        /// save`, relative to the directory in which the hub was started. Default: the background that an earlier hub
+        /// saved, if it fits, otherwise `empty`.
         start: Option<String> = None, check optional(start), example "\"empty\"";
         /// whether the next hub starts with this background
         ///
-        /// Whether the hub saves the learned background, so that the next hub starts with it. See below.
+        /// Whether the hub saves the learned background for the next hub ([keep](#keep)).
         keep: bool = true;
         /// whether no echo counts as a background far away; default: true, for paper false
         ///
-        /// If true, no echo counts as a background far away; if false, as no reading. Default: true for `multi`, false
-        /// for `paper`.
+        /// Whether no echo counts as a background far away. If false, it counts as no reading. Default: true, for
+        /// `paper` false.
         no_return_is_far: Option<bool> = None, example "true";
         /// on-demand or every-scan
         ///
-        /// `on-demand`: the background is published when a new generation begins, and after every `scans` scans from
-        /// which it learned; or `every-scan`.
+        /// `every-scan`; or `on-demand`: when a generation begins, and after every `scans` scans from which it learned.
         publish: PublishKey = PublishKey::OnDemand;
     }
 }

@@ -1,4 +1,4 @@
-//! Tables of `docs/topics.md` and `docs/datagram.md`.
+//! Lists and tables of `docs/topics.md` and `docs/datagram.md`.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -8,73 +8,83 @@ use scanhub_schema::{PublisherKind, Topic};
 
 use super::description::{Description, Field, Kind, Layout, Value, first_sentence, lower_first};
 use super::rules::{self, ArrayRule};
+use super::wrap;
 
 /// Maximum number of listed values. If a field has more values, only their names are listed.
 const MAX_VALUES: usize = 10;
-const TABLE_HEAD: &str = "| offset | type | field |\n|---|---|---|\n";
+const MAX_LINE_WIDTH: usize = 120;
 
-/// Returns the tables of the layout, of the layouts in it, and of the elements of its arrays.
-pub(crate) fn tables(description: &Description, layout: &Layout) -> String {
+/// Returns the lists of the layout, of the layouts in it, and of the elements of its arrays.
+pub(crate) fn lists(description: &Description, layout: &Layout) -> String {
     let tail = rules::arrays_of(&layout.name);
     let what = if tail.is_empty() { "" } else { " and arrays" };
-    let mut text = format!("\n`scanhub.{}.v2`, {} bytes{what}:\n\n{TABLE_HEAD}", layout.name, layout.size);
-    let mut inner = rows(description, layout, &mut text);
+    let mut text = format!("\n`scanhub.{}.v2`, {} bytes{what}:\n\n", layout.name, layout.size);
+    let mut inner = items(description, layout, &mut text);
     let mut at = Some(layout.size);
     for array in tail {
-        let offset = at.map_or(String::new(), |at| format!(" {at}"));
+        let offset = at.map_or("then".to_owned(), |at| at.to_string());
         let element = description.layouts.iter().find(|layout| layout.rust == array.kind);
-        let kind = match element {
-            Some(element) => format!("{} times {} bytes", array.count, element.size),
-            None => format!("{}[{}]", array.kind, array.count),
-        };
         let condition =
             array.only_if.map_or(String::new(), |(field, bit)| format!(", if `{field}` has bit {bit}"));
-        let doc = lower_first(array.doc.trim_end_matches('.'));
-        writeln!(text, "|{offset} | {kind} | `{}`{condition}: {doc} |", array.name).expect("a String");
+        let doc = lower_first(without_rest(array.doc));
+        let item = format!("{offset} {}[{}] `{}`{condition}: {doc}", array.kind, array.count, array.name);
+        text += &wrap("- ", "  ", &item, MAX_LINE_WIDTH);
         at = at
             .zip(array.count.parse::<usize>().ok())
             .zip(element)
             .map(|((at, count), of)| at + count * of.size);
         inner.extend(element);
     }
-    text += &values(description, layout);
     for layout in inner {
-        write!(text, "\n`scanhub.{}.v2`, {} bytes:\n\n{TABLE_HEAD}", layout.name, layout.size)
-            .expect("a String");
-        rows(description, layout, &mut text);
-        text += &values(description, layout);
+        write!(text, "\n`scanhub.{}.v2`, {} bytes:\n\n", layout.name, layout.size).expect("a String");
+        items(description, layout, &mut text);
     }
     text + "\n"
 }
 
-/// Writes the rows of all fields. Returns the layouts in them.
-fn rows<'a>(description: &'a Description, layout: &Layout, text: &mut String) -> Vec<&'a Layout> {
+/// Writes an item for each field that is not always 0, with the values that it can have. Returns the layouts in the
+/// fields.
+fn items<'a>(description: &'a Description, layout: &Layout, text: &mut String) -> Vec<&'a Layout> {
     let mut inner = Vec::new();
-    for field in &layout.fields {
+    for field in layout.fields.iter().filter(|field| field.doc("") != "0.") {
+        if let Kind::Layout(rust) = &field.kind {
+            inner.push(description.layout(rust));
+        }
         let kind = match (&field.kind, field.len) {
-            (Kind::Layout(rust), len) => {
-                inner.push(description.layout(rust));
-                len.map_or(String::new(), |len| format!("{len} times ")) + &format!("{} bytes", field.element)
-            }
             (Kind::Text, Some(len)) => format!("char[{len}]"),
             _ => field.kind_name(),
         };
-        let about = field_text(description, field);
-        writeln!(text, "| {} | {kind} | {about} |", field.offset).expect("a String");
+        let mut item = format!("{} {kind} {}", field.offset, field_text(description, field));
+        let set = field.set.as_ref().filter(|set| description.sets[*set].values.len() <= MAX_VALUES);
+        let first = set.map(|set| first_layout_with(description, set));
+        if let Some(first) = first.filter(|first| first.name != layout.name) {
+            let anchor = first.name.to_lowercase();
+            write!(item, "; values as in [{}](#{anchor})", first.name).expect("a String");
+        }
+        *text += &wrap("- ", "  ", &item, MAX_LINE_WIDTH);
+        if let Some(set) = set.filter(|_| first.is_some_and(|first| first.name == layout.name)) {
+            for Value { number, name, doc } in &description.sets[set].values {
+                let item = format!("{number} `{name}`: {}", first_sentence(doc));
+                *text += &wrap("  - ", "    ", &item, MAX_LINE_WIDTH);
+            }
+        }
     }
     inner
 }
 
-/// Returns name and meaning of a field. Its values are in a table below, unless they are too many.
+/// Returns the first layout with a field that can have the values of `set`. The page lists them only there.
+fn first_layout_with<'a>(description: &'a Description, set: &str) -> &'a Layout {
+    let has_set = |layout: &&Layout| layout.fields.iter().any(|field| field.set.as_deref() == Some(set));
+    description.layouts.iter().find(has_set).expect("a layout with the set")
+}
+
+/// Returns name and meaning of a field. Its values are in items below, unless they are too many.
 fn field_text(description: &Description, field: &Field) -> String {
     let set = field.set.as_ref().map(|set| &description.sets[set].values);
     let names = set.filter(|values| values.len() > MAX_VALUES).into_iter().flatten();
     let doc = field.doc(&names.map(|value| value.name.as_str()).collect::<Vec<_>>().join(", "));
-    if doc == "0." {
-        return "0".to_owned();
-    }
     let doc = doc.replace(": .", ".").replace(": ;", ";");
-    let doc = lower_first(doc.trim_end_matches(['.', ':', ' ']));
+    let doc = lower_first(without_rest(&doc));
     let more = doc.strip_prefix(&field.name).and_then(|more| more.strip_prefix([':', '.']));
     match more.unwrap_or(&doc).trim_start() {
         more if more == field.name => format!("`{}`", field.name),
@@ -82,17 +92,9 @@ fn field_text(description: &Description, field: &Field) -> String {
     }
 }
 
-/// Returns the table of the values that fields of the layout can have.
-fn values(description: &Description, layout: &Layout) -> String {
-    let mut text = String::new();
-    for field in &layout.fields {
-        let set = field.set.as_ref().map(|set| &description.sets[set].values);
-        for Value { number, name, doc } in set.filter(|set| set.len() <= MAX_VALUES).into_iter().flatten() {
-            let (name, doc) = (name.replace('_', " "), first_sentence(doc));
-            writeln!(text, "| `{}` | {number} {name} | {doc} |", field.name).expect("a String");
-        }
-    }
-    if text.is_empty() { text } else { format!("\n| field | value | meaning |\n|---|---|---|\n{text}") }
+/// Returns `doc` without its end: the full stop, and the value of unused elements, which the page has for all arrays.
+fn without_rest(doc: &str) -> &str {
+    doc.split("; 0 beyond").next().unwrap_or_default().trim_end_matches(['.', ':', ' '])
 }
 
 /// Returns the table of the payloads in datagrams.
@@ -135,7 +137,7 @@ pub(crate) fn payloads(description: &Description) -> String {
 
 /// Returns the table of the services of all topics.
 pub(crate) fn services() -> String {
-    let mut text = "\n| service | pattern, payload | history | buffer |\n|---|---|---|---|\n".to_owned();
+    let mut text = "\n| service | payload | history | buffer |\n|---|---|---|---|\n".to_owned();
     for topic in Topic::ALL {
         let owner = match topic.publisher_kind() {
             PublisherKind::Link => "SENSOR",
@@ -151,12 +153,8 @@ pub(crate) fn services() -> String {
             };
         let row = topic.spec();
         let service = topic.service(owner);
-        writeln!(
-            text,
-            "| `{service}` | publish-subscribe, {payload} | {} | {} |",
-            row.history_len, row.queue_len
-        )
-        .expect("a String");
+        writeln!(text, "| `{service}` | {payload} | {} | {} |", row.history_len, row.queue_len)
+            .expect("a String");
     }
     text + "\n"
 }

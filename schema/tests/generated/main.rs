@@ -50,13 +50,13 @@ fn check(path: &str, text: &str) {
     fs::write(file, text).expect("a writable file");
 }
 
-/// Compares or writes the blocks of the file. A block is between a line with `COMMAND: NAME` and the next one with
-/// `End of NAME`.
+/// Compares or writes the blocks of the file. A block is between a line with `generated: NAME`, which is also the end of
+/// [`WRITE_COMMAND`], and the next one with `End of NAME`.
 fn check_blocks(path: &str, blocks: &[(&str, String)]) {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path);
     let mut text = fs::read_to_string(file).expect("a committed file");
     for (name, block) in blocks {
-        let begin = format!("{WRITE_COMMAND}: {name}");
+        let begin = format!("generated: {name}");
         let line = |of: &str, from: usize| {
             let at = from + text[from..].find(of).unwrap_or_else(|| panic!("{path} has no line with {of:?}"));
             (text[..at].rfind('\n').map_or(0, |at| at + 1), at + text[at..].find('\n').expect("an end") + 1)
@@ -137,9 +137,9 @@ fn pages_are_up_to_date() {
     let description = Description::read();
     let layouts = ["Header"].into_iter().map(|rust| description.layout(rust));
     let layouts = layouts.chain(Topic::ALL.into_iter().filter_map(|topic| description.payload(topic)));
-    let tables: Vec<_> =
-        layouts.map(|layout| (layout.name.as_str(), docs::tables(&description, layout))).collect();
-    check_blocks("docs/topics.md", &tables);
+    let lists: Vec<_> =
+        layouts.map(|layout| (layout.name.as_str(), docs::lists(&description, layout))).collect();
+    check_blocks("docs/topics.md", &lists);
     check_blocks("docs/topics.md", &[("services", docs::services())]);
     let blocks = [
         ("header", wire::header(&description)),

@@ -71,7 +71,8 @@ const RECORDINGS: [&str; 5] = ["walk.mcap", "day-0001.mcap", "cut.mcap", "killed
 /// Range of a recording on a page, and the range that replaces it because the recording of this test is shorter.
 const SHORTENED_RANGE: (&str, &str) = ("--start 1m --end 90s", "--start 200ms --end 500ms");
 /// Ports that pages name.
-const PORTS: [&str; 3] = ["/dev/serial/by-id/usb-FTDI...", "/dev/ttyUSB0", "/tmp/lms"];
+const PORTS: [&str; 5] =
+    ["/dev/serial/by-id/usb-FTDI...", "/dev/ttyUSB0", "/tmp/lms", "/tmp/ld19", "/tmp/rplidar"];
 
 impl ShellEnv {
     /// Creates the environment, and returns it with its simulator and hub.

@@ -90,9 +90,9 @@ struct scanhub_publication;
 #define SCANHUB_QUALITY_SUSPECT 1 /* The telegram may be damaged. */
 
 /* Flags of a sample, with the same numbers as in datagrams. */
-#define SCANHUB_FLAG_SIMULATED       2 /* The scanner is simulated: the port is a pty. */
+#define SCANHUB_FLAG_SIMULATED       2 /* The scanner is simulated, with a pty as its port. */
 #define SCANHUB_FLAG_REPLAYED        4 /* The link plays a recording. */
-#define SCANHUB_FLAG_STAMP_ESTIMATED 8 /* The stamps were computed instead of taken when the bytes arrived. */
+#define SCANHUB_FLAG_STAMP_ESTIMATED 8 /* The stamps were computed, not taken when the bytes arrived. */
 #define SCANHUB_FLAG_REMOTE          32 /* The sample comes from another machine. */
 
 /* A family of scanners with one protocol. */
@@ -101,8 +101,7 @@ struct scanhub_publication;
 #define SCANHUB_FAMILY_RPLIDAR 2 /* Slamtec RPLIDAR A1, A2, A3, S1, S2, S3 and C1. */
 
 /* Reasons to suspect a telegram. */
-/* The driver counted line errors while this telegram or the previous one was read. */
-#define SCANHUB_REASON_LINE_ERROR     1
+#define SCANHUB_REASON_LINE_ERROR     1 /* The driver counted line errors during this telegram or the previous one. */
 #define SCANHUB_REASON_NEIGHBOUR      2 /* The bytes just before the telegram belong to no telegram. */
 #define SCANHUB_REASON_SLOW           4 /* The telegram took longer than usual. */
 #define SCANHUB_REASON_FORBIDDEN_BITS 8 /* Bits are set that the measuring mode never sets. */
@@ -111,7 +110,7 @@ struct scanhub_publication;
 /* Header of every sample, the same for all topics: the user header of the services in shared memory. 64 bytes. */
 struct scanhub_header_v2 {
     /* Number of the telegram that the sample was computed from, per sensor and run of the hub, from 0. A sample without
-     * a telegram has the number of the last telegram; before the first telegram 0, like the first one. */
+     * a telegram has the number of the last one; 0 before the first one. */
     uint64_t seq;
     uint64_t topic_seq; /* Number of the sample in its topic, from 0. A gap means that the subscriber missed samples. */
     uint64_t stamp_first_ns; /* Stamp of the telegram's first byte, in ns of CLOCK_MONOTONIC. */
@@ -128,7 +127,7 @@ struct scanhub_header_v2 {
     uint32_t hub_pid; /* Process ID of the hub. */
     uint8_t reasons; /* Reasons why the telegram is suspect: SCANHUB_REASON_..; 0 if it is clean. */
     /* Time from the telegram's last byte until the sample was sent, in units of 256 ns, rounded up; the low byte is
-     * first. FFFFFFh means 4.3 s or more. 0 means unknown: the sample has no telegram or comes from another machine. */
+     * first. FFFFFFh means 4.3 s or more; 0 means unknown, because the sample has no telegram or is remote. */
     uint8_t hub_time[3];
 };
 
@@ -136,34 +135,30 @@ struct scanhub_header_v2 {
 #define SCANHUB_SCAN_FLAG_INCOMPLETE 1 /* Packets of the revolution are missing. */
 
 /* Arrays that a scan has in addition to the ranges, each with a value for every beam. Bits of `contents`. */
-#define SCANHUB_SCAN_UPPER  1 /* One byte: intensities, or the field bits above the range in some modes of an LMS. */
-#define SCANHUB_SCAN_WIDE   2 /* Two bytes: intensities. */
-#define SCANHUB_SCAN_ANGLES 4 /* The exact angle in radians, a 32-bit float; NaN if nothing was measured. */
+#define SCANHUB_SCAN_UPPER  1 /* Intensities of at most 8 bits, or field bits in some modes of an LMS. */
+#define SCANHUB_SCAN_WIDE   2 /* Intensities of more than 8 bits. */
+#define SCANHUB_SCAN_ANGLES 4 /* Exact angles in radians, as 32-bit floats. */
 
 /* Head of a scan, before the arrays. 64 bytes. The arrays that follow: exact (float), ranges (uint16_t), wide
  * (uint16_t), upper (uint8_t). Use the functions below to read them. */
 struct scanhub_scan_v2 {
-    /* Angle of beam 0 in radians. 0 is ahead of the sensor, and angles are counterclockwise as seen from above. */
-    double first_angle;
-    double step; /* Angle from one beam to the next in radians; negative for a scanner that rotates clockwise. */
-    /* Angle between two points that the sensor measures, in radians. The grid of beams may have another step. */
-    float spacing;
+    double first_angle; /* Angle of beam 0 in radians; 0 is ahead of the sensor, counterclockwise is positive. */
+    double step; /* Radians from one beam to the next; negative for a scanner that rotates clockwise. */
+    float spacing; /* Radians between two measured points; `step` may be different. */
     uint32_t beam_time_ns; /* Time from one beam to the next in ns. */
-    int32_t first_beam_ns; /* Time at which beam 0 was measured, in ns after the sample's stamp; mostly negative. */
+    int32_t first_beam_ns; /* Time of beam 0, in ns after the sample's first stamp; mostly negative. */
     uint32_t unit_um; /* Micrometers per device unit. */
-    uint16_t count; /* Number of beams, at most 8192. They are in the order in which they were measured. */
+    uint16_t count; /* Number of beams, at most 8192; they are in the order of their measurement. */
     uint16_t valid_to; /* Highest value that is a range; all higher values are codes. */
     uint16_t no_return; /* Code of a beam without an echo. */
     uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has none. */
-    /* Number of points that were dropped because another point has the same beam. Points without a return count,
-     * too. */
+    /* Number of points that were dropped because another point has the same beam; also points without a return. */
     uint16_t collisions;
     uint8_t family; /* Family of the scanner: SCANHUB_FAMILY_... */
     uint8_t flags; /* Flags: SCANHUB_SCAN_FLAG_... */
     uint8_t contents; /* Arrays that follow the head: SCANHUB_SCAN_... */
     uint8_t intensity_bits; /* Bits of an intensity; 0 if there are none. */
-    /* Number of revolutions in which the beams were measured: beam i in revolution i modulo this number. 0 means 1. */
-    uint8_t turns;
+    uint8_t turns; /* Number of revolutions in the scan: beam i is from revolution i modulo this number. 0 means 1. */
     uint8_t reserved;
     uint32_t turn_ns; /* Time of a revolution in ns if there are several; otherwise 0. */
     uint8_t reserved2[12];
@@ -176,7 +171,7 @@ struct scanhub_mark_v2 {
     uint32_t range_dmm; /* Range in 1/10 mm. */
     uint16_t weight; /* Sum of the intensities. */
     uint8_t peak; /* Highest intensity. */
-    uint8_t edge; /* 1 if the mark touches the first or the last beam, so that a part of it may be outside. */
+    uint8_t edge; /* 1 if the mark touches the first or the last beam, so a part of it may be outside. */
     uint16_t first_beam; /* First beam. */
     uint16_t last_beam; /* Last beam. */
 };
@@ -185,7 +180,7 @@ struct scanhub_mark_v2 {
 #define SCANHUB_MARKS_OVERFLOW    1 /* There were more marks than fit. */
 /* Marks are unknown, because the measuring mode has no reflector bits or `no_level` is set. */
 #define SCANHUB_MARKS_UNAVAILABLE 2
-/* The sensor measures the intensity of every surface, and no threshold for reflectors is configured. */
+/* The sensor measures intensities, and no threshold for reflectors is configured. */
 #define SCANHUB_MARKS_NO_LEVEL    4
 
 /* The payload of topic `marks`, 1028 bytes: one sample per scan. */
@@ -211,8 +206,7 @@ struct scanhub_zone_v2 {
 #define SCANHUB_VERDICT_UNKNOWN 3 /* Too many beams have no reading, or there are no scans. Treat it as stop. */
 
 /* Flags of struct scanhub_zones_v2. */
-/* There were fewer scans than a violation requires, so no zone can be violated yet. */
-#define SCANHUB_ZONES_PROVISIONAL 1
+#define SCANHUB_ZONES_PROVISIONAL 1 /* There were fewer scans than a violation requires. */
 
 /* The payload of topic `zones`, 76 bytes. There is one sample per scan, and one with verdict unknown when scans
  * stop. */
@@ -233,21 +227,20 @@ struct scanhub_segment_v2 {
     uint16_t last; /* Last beam. */
     uint16_t nearest; /* Lowest range in device units. */
     uint16_t width; /* Distance from the first to the last point, in device units. */
-    int32_t x_mm; /* Mean of the points in the robot's frame: mm ahead of the center. */
-    int32_t y_mm; /* Mean of the points in the robot's frame: mm to the left of the center. */
+    int32_t x_mm; /* Mean of the points: mm ahead of the robot's center. */
+    int32_t y_mm; /* Mean of the points: mm to the left of the center. */
 };
 
 /* Head of a foreground, before the arrays. 24 bytes. The arrays that follow: segments (struct scanhub_segment_v2), bits
  * (uint8_t), ranges (uint16_t). Use the functions below to read them. */
 struct scanhub_foreground_v2 {
-    uint32_t generation; /* Generation of the background model that the scan was compared with. */
+    uint32_t generation; /* Generation of the compared background. */
     uint32_t unit_um; /* Micrometers per device unit. */
     uint16_t count; /* Number of beams of the scan. */
     uint16_t beams; /* Number of beams in the foreground. */
     uint16_t segments; /* Number of segments, at most 64. */
     uint16_t dropped; /* Number of segments that did not fit. */
-    /* Bit i is set if segment i is supported: it has several beams, or the foreground of the previous scan was near
-     * it. */
+    /* Bit i is set if segment i is supported: it has several beams, or is near the previous scan's foreground. */
     uint64_t supported;
 };
 
@@ -259,9 +252,7 @@ struct scanhub_foreground_v2 {
 struct scanhub_background_v2 {
     double first_angle; /* Angle of beam 0 in radians, as in a scan. */
     double step; /* Angle from one beam to the next in radians; 0 before the first scan. */
-    /* Number of the model in this run of the hub. It increases by 1 after a reset, a load, and a change of beams or
-     * unit. */
-    uint32_t generation;
+    uint32_t generation; /* Generation of the background, counted in this run of the hub. */
     uint32_t unit_um; /* Micrometers per device unit. */
     uint16_t known_beams; /* Number of beams whose background is known. */
     uint16_t count; /* Number of beams of the model; 0 before the first scan. */
@@ -271,9 +262,9 @@ struct scanhub_background_v2 {
 
 /* A sensor's pose in the robot's frame: x ahead, y left, the origin at the robot's center. 32 bytes. */
 struct scanhub_pose_v2 {
-    double x_m; /* Position of the sensor, in meters ahead of the robot's center. */
-    double y_m; /* Position of the sensor, in meters to the left of the robot's center. */
-    double yaw_rad; /* Direction of the sensor, in radians counterclockwise from ahead. */
+    double x_m; /* Meters ahead of the robot's center. */
+    double y_m; /* Meters to the left of the robot's center. */
+    double yaw_rad; /* Direction in radians, counterclockwise from ahead. */
     uint8_t upside_down; /* 1 if the sensor is mounted upside down, so that its first beam is the leftmost. */
     /* 0. In a status, the first one is 1 if a threshold for reflectors (`marks.level`) is configured. */
     uint8_t reserved[7];
@@ -328,7 +319,7 @@ struct scanhub_status_v2 {
     uint8_t unit_mm; /* Millimeters per device unit: 1, 10 or 100; 0 if unknown. */
     uint8_t family; /* Family of the scanner: SCANHUB_FAMILY_..; 255 while the hub searches for it. */
     uint32_t baud; /* Baud rate of the line; 0 if unknown. */
-    uint64_t since_ns; /* Stamp of the start of the state, in ns of CLOCK_MONOTONIC. */
+    uint64_t since_ns; /* Stamp of the start of the state, in ns. */
     uint32_t rate_mhz; /* Scans per second in 1/1000; 0 while they are not measured. */
     uint16_t angle_deg; /* Field of view in degrees: 100 or 180; 0 if unknown. */
     uint16_t resolution_cdeg; /* Angle between two beams in 1/100 degree; 0 if unknown. */
@@ -344,10 +335,10 @@ struct scanhub_status_v2 {
 
 /* A line feature: a straight surface that neighboring beams end on. */
 struct scanhub_line_v2 {
-    float x1_m; /* Point at which the first beam meets the line, in meters ahead of the robot's center. */
-    float y1_m; /* Point at which the first beam meets the line, in meters to the left of the center. */
-    float x2_m; /* Point at which the last beam meets the line, in meters ahead of the robot's center. */
-    float y2_m; /* Point at which the last beam meets the line, in meters to the left of the center. */
+    float x1_m; /* Point on the first beam: meters ahead of the robot's center. */
+    float y1_m; /* Point on the first beam: meters to the left of the center. */
+    float x2_m; /* Point on the last beam: meters ahead of the robot's center. */
+    float y2_m; /* Point on the last beam: meters to the left of the center. */
     float r_m; /* Distance of the infinite line from the center in meters: x cos alpha + y sin alpha = r. */
     float alpha_rad; /* Direction from the center to the line's nearest point, in radians from -pi to pi. */
     float sd_r_m; /* Standard deviation of `r_m` in meters. */
@@ -367,7 +358,7 @@ struct scanhub_corner_v2 {
 };
 
 /* Flags of struct scanhub_lines_v2. */
-#define SCANHUB_LINES_OVERFLOW 1 /* There were too many lines; the others were joined or left out. */
+#define SCANHUB_LINES_OVERFLOW 1 /* There are more lines than `lines.max`; the others were joined or dropped. */
 
 /* The payload of topic `lines`, 3340 bytes: one sample per scan, in the robot's frame. */
 struct scanhub_lines_v2 {
@@ -383,13 +374,13 @@ struct scanhub_lines_v2 {
 };
 
 /* Method by which a step was found. */
-#define SCANHUB_METHOD_FIRST   0 /* The scan is the first one, so it has no step. */
+#define SCANHUB_METHOD_FIRST   0 /* The first scan, which has no step. */
 /* No step explains the scan. Step and summed pose are unknown, and their numbers are 0. */
 #define SCANHUB_METHOD_REFUSED 1
-#define SCANHUB_METHOD_BEAMS   2 /* Beams alone: no corner and no line was found in both scans. */
-#define SCANHUB_METHOD_POINTS  3 /* Corners that are in both scans. */
-#define SCANHUB_METHOD_LINES   4 /* Lines that are in both scans. */
-#define SCANHUB_METHOD_BOTH    5 /* Corners and lines that are in both scans. */
+#define SCANHUB_METHOD_BEAMS   2 /* Beams alone, without a common corner or line. */
+#define SCANHUB_METHOD_POINTS  3 /* Corners in both scans. */
+#define SCANHUB_METHOD_LINES   4 /* Lines in both scans. */
+#define SCANHUB_METHOD_BOTH    5 /* Corners and lines in both scans. */
 
 /* Flags of struct scanhub_motion_v2. */
 /* The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is large
@@ -400,8 +391,7 @@ struct scanhub_lines_v2 {
 
 /* The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame. */
 struct scanhub_motion_v2 {
-    /* Summed pose: meters ahead of the robot's center at the first scan. It is the sum of all steps, and it drifts. */
-    double x_m;
+    double x_m; /* Summed pose: meters ahead of the robot's center at the first scan. It drifts. */
     double y_m; /* Summed pose: meters to the left of the center at the first scan. */
     /* Summed pose: radians counterclockwise from the robot's direction at the first scan, from -pi to pi. */
     double yaw_rad;
@@ -409,16 +399,15 @@ struct scanhub_motion_v2 {
     float dy_m; /* Step: meters to the left. */
     float dyaw_rad; /* Step: radians counterclockwise. */
     float covariance[9]; /* Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2. */
-    /* Share of this scan's readings that are on surfaces of the scan that it was compared with, 0 to 1. */
-    float overlap;
+    float overlap; /* Share of this scan's readings on surfaces of the compared scan, 0 to 1. */
     uint8_t method; /* Method: SCANHUB_METHOD_... Treat every other number as refused. */
     uint8_t flags; /* Flags: SCANHUB_MOTION_... */
-    /* Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out. */
+    /* Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them. */
     uint16_t refused_steps;
-    /* Covariance of the summed pose in the frame of the start, in the layout of `covariance`. Refused steps add nothing
-     * to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has revision 1. */
+    /* Covariance of the summed pose in the frame of the start, in the layout of `covariance`, without refused steps. It
+     * is 0 for the first scan, for an invalid pose, and from a sender with revision 1. */
     float pose_covariance[9];
-    uint32_t reserved; /* Always 0. */
+    uint32_t reserved;
 };
 
 /* Flags of struct scanhub_early_v2. */
@@ -427,7 +416,7 @@ struct scanhub_motion_v2 {
 /* The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first zones with
  * the same or a higher number belong to its scan and confirm it. A sample with `withdrawn` withdraws it. */
 struct scanhub_early_v2 {
-    uint8_t verdict; /* Verdict: SCANHUB_VERDICT_... An early warning is slow or stop, never clear or unknown. */
+    uint8_t verdict; /* Verdict: SCANHUB_VERDICT_... It is slow or stop, never clear or unknown. */
     uint8_t flags; /* Flags: SCANHUB_EARLY_... */
     uint16_t beam; /* Beam of the nearest point so far. */
     uint32_t distance_mm; /* Distance of that point from the robot's center, in mm. */
@@ -493,11 +482,11 @@ struct scanhub_event_v2 {
     char room_text[24];
     /* Name of the door; empty for other events. UTF-8, padded with 0; a text that fills it has no 0. */
     char door_text[24];
-    /* Name of the room that the person came from, or `outside`; empty for other events. UTF-8, padded with 0; a text
-     * that fills it has no 0. */
+    /* Room that the person came from, or `outside`; empty for other events. UTF-8, padded with 0; a text that fills it
+     * has no 0. */
     char from_text[24];
-    /* Name of the room that the person went to, or `outside`; empty for other events. UTF-8, padded with 0; a text that
-     * fills it has no 0. */
+    /* Room that the person went to, or `outside`; empty for other events. UTF-8, padded with 0; a text that fills it
+     * has no 0. */
     char to_text[24];
 };
 
@@ -525,17 +514,15 @@ struct scanhub_cloud_point_v2 {
 /* Flags of struct scanhub_cloud_v2. */
 #define SCANHUB_SWEEP_FIRST      1 /* The first sample of its sweep. */
 #define SCANHUB_SWEEP_LAST       2 /* The last sample of its sweep. */
-/* The sweep went from one reversal of the mount to the next, and no angle was missing. */
-#define SCANHUB_SWEEP_COMPLETE   4
-/* The sweep is unreliable, because its angles contradict the background. The class of all points is unknown. */
+#define SCANHUB_SWEEP_COMPLETE   4 /* The sweep has all angles from one reversal of the mount to the next. */
+/* The angles of the sweep contradict the background. The class of all points is unknown. */
 #define SCANHUB_SWEEP_UNRELIABLE 8
 
 /* Head of a cloud, before the points. 16 bytes. The arrays that follow: points (struct scanhub_cloud_point_v2). Use the
  * functions below to read them. */
 struct scanhub_cloud_v2 {
-    uint32_t sweep; /* Number of the sweep that the points belong to, from 0. */
-    /* Generation of the background that the points were compared with. Each reset increases it by 1. */
-    uint32_t generation;
+    uint32_t sweep; /* Number of the sweep, from 0. */
+    uint32_t generation; /* Generation of the compared background; each reset increases it by 1. */
     uint16_t count; /* Number of points, at most 8192. */
     uint8_t flags; /* Flags: SCANHUB_SWEEP_... */
     uint8_t reserved[5];

@@ -1,7 +1,7 @@
 //! Proof of the tracker: simulated people in a simulated house, scored by the package `motmetrics`.
 //!
 //! ```sh
-//! cargo run --release -p scanhub-perception --example proof -- --seeds 501..511
+//! cargo run --release -p scanhub-perception --example proof -- --seeds 601..611
 //! ```
 //!
 //! `PROOF_PYTHON` names a Python that has `motmetrics` and numpy below 2.

@@ -121,7 +121,7 @@ impl Invariant for Liveness {
 }
 
 /// Maximum time until the link streams, and maximum time until it publishes scans. After a second of silence, the hub
-/// searches for about 2.4 s (`docs/measured.md`), because the scanner may have another rate. If the scanner's last
+/// searches for about 2.4 s, because the scanner may have another rate. If the scanner's last
 /// bytes were damaged just before the faults were cleared, the session first repeats its requests for up to 3 s. If a
 /// scanner streams without reporting its settings, the session requests them every ten seconds.
 const RECOVERY_LIMITS: [Nanos; 2] = [5_500 * MILLIS, 11_000 * MILLIS];
