@@ -1,6 +1,6 @@
 /*
- * The datagrams of `scanhub gateway` for programs in C: functions that check and decode them. It opens no sockets
- * and counts no losses. C99, one header, no heap; docs/datagram.md has the bytes.
+ * Functions for programs in C that check and decode the datagrams of `scanhub gateway`. They open no sockets and count
+ * no losses. The code is C99 in one header, without heap. docs/datagram.md describes the bytes.
  *
  *     struct scanhub_datagram datagram;
  *     struct scanhub_scan scan;
@@ -8,8 +8,9 @@
  *         for (unsigned i = 0; i < scan.count; i++)
  *             use(scanhub_scan_m(&scan, i), scanhub_scan_angle(&scan, i));
  *
- * Results point into the datagram and are valid as long as its bytes. They are hostile input: nothing that a function
- * here answers with SCANHUB_OK leads outside of them, as long as an index is below the count that came with it.
+ * Results point into the bytes of the datagram, and are valid as long as these bytes. The bytes may come from an
+ * attacker: if a function returns SCANHUB_OK, no result points outside of them, as long as each index is below the
+ * count of its array.
  */
 #ifndef SCANHUB_H
 #define SCANHUB_H
@@ -58,7 +59,7 @@ enum scanhub_family {
     SCANHUB_RPLIDAR = 2 /* Slamtec RPLIDAR A1, A2, A3, S1, S2, S3 and C1. */
 };
 
-/* Result of all zones. */
+/* Result of checking a scan against all zones. */
 enum scanhub_verdict {
     SCANHUB_CLEAR = 0, /* Nothing is inside any zone. */
     SCANHUB_SLOW = 1, /* Something is inside a zone, but not inside the smallest one. */
@@ -139,9 +140,9 @@ enum scanhub_announce_at {
 /* Offsets in bytes. One topic of an announcement. */
 enum scanhub_announced_at {
     SCANHUB_ANNOUNCED_AT_TOPIC = 0, /* Number of the topic, as in the header. */
-    SCANHUB_ANNOUNCED_AT_GROUP = 1, /* Last byte of the address of its group. */
-    SCANHUB_ANNOUNCED_AT_PORT = 2, /* Port that it is sent to. */
-    SCANHUB_ANNOUNCED_AT_NEXT = 4, /* Sequence number that its next datagram will have. */
+    SCANHUB_ANNOUNCED_AT_GROUP = 1, /* Last byte of the address of the topic's group. */
+    SCANHUB_ANNOUNCED_AT_PORT = 2, /* Port that the topic is sent to. */
+    SCANHUB_ANNOUNCED_AT_NEXT = 4, /* Sequence number that the topic's next datagram will have. */
     SCANHUB_ANNOUNCED_AT_END = 8
 };
 
@@ -179,17 +180,17 @@ enum scanhub_result {
 struct scanhub_datagram {
     uint8_t topic;
     uint8_t flags;
-    uint64_t hub;       /* number of the gateway, random */
-    uint32_t epoch;     /* run of the gateway: a greater epoch ends the run before */
+    uint64_t hub;       /* random number of the gateway */
+    uint32_t epoch;     /* number of the gateway's run: a greater epoch means that the earlier run has ended */
     uint32_t sequence;  /* number of the sample in its sensor and topic; it wraps, and a gap means lost samples */
-    uint64_t stamp_ns;  /* wall clock of the telegram's first byte, ns since 1970; of sending for announce and status */
+    uint64_t stamp_ns;  /* wall clock in ns since 1970: of the telegram's first byte, or of sending (announce, status) */
     uint8_t sensor;     /* position of the sensor in the hub's configuration */
     uint8_t part;       /* index of this part of the sample, from 0 */
-    uint8_t parts;      /* number of parts, mostly 1. To read a sample of several parts, append the `payload` of
-                         * payloads with the same `sequence`, point `payload` and `payload_len` of one part to the
-                         * result, and set its `parts` to 1 */
+    uint8_t parts;      /* number of parts, mostly 1. To read a sample of several parts, join the payloads of the
+                         * datagrams with the same `sequence`, in the order of `part`. Then set `payload` and
+                         * `payload_len` of one of these datagrams to the joined payload, and its `parts` to 1 */
     uint8_t family;     /* family of the scanner, see enum scanhub_family */
-    uint16_t revision;  /* revision of the payload: a greater one only appends fields */
+    uint16_t revision;  /* revision of the payload: a greater revision only appends fields */
     uint32_t counter;   /* the same in all datagrams of one telegram */
     const uint8_t *payload;
     uint32_t payload_len;
@@ -222,7 +223,8 @@ static inline double scanhub_f64(const uint8_t *at)
 }
 
 /* Updates a CRC-32C (polynomial 1EDC6F41h, reflected) with `len` bytes. Start with FFFFFFFFh; the checksum is the
- * complement of the last result. It processes half a byte at a time, with a table of 64 bytes instead of 1024. */
+ * complement of the last result. The function processes half a byte at a time, so that its table has 64 bytes instead
+ * of 1024. */
 static inline uint32_t scanhub_crc(uint32_t crc, const uint8_t *bytes, size_t len)
 {
     static const uint32_t nibble[16] = {
@@ -289,7 +291,8 @@ static inline enum scanhub_result scanhub_expect(const struct scanhub_datagram *
     return datagram->payload_len < least ? SCANHUB_BAD_PAYLOAD : SCANHUB_OK;
 }
 
-/* Copies text, which may fill its field. `out` must have a byte more than the field. */
+/* Copies the text in a field of `len` bytes, which may have no 0 at its end. `out` must have one byte more than the
+ * field, for the 0. */
 static inline void scanhub_text(char *out, const uint8_t *field, size_t len)
 {
     memcpy(out, field, len);
@@ -308,7 +311,7 @@ struct scanhub_announced {
     uint8_t topic;
     uint8_t group; /* last byte of the group's address */
     uint16_t port;
-    uint32_t next; /* sequence number of its next datagram */
+    uint32_t next; /* sequence number that the topic's next datagram will have */
 };
 static inline enum scanhub_result scanhub_read_announce(const struct scanhub_datagram *datagram,
                                                         struct scanhub_announce *out)
@@ -347,12 +350,13 @@ static inline struct scanhub_announced scanhub_announced(const struct scanhub_an
     return out;
 }
 
-/* Bytes of a sensor: for an LMS a telegram, STX to CRC; for other families complete packets that arrived together. */
+/* Bytes of a sensor. For an LMS, they are a telegram from STX to CRC; for other families, complete packets that the hub
+ * received together. */
 struct scanhub_telegram {
     const uint8_t *bytes;
     uint16_t len;
     uint8_t family;
-    uint16_t packets; /* number of packets; 0 for an LMS, and if it is unknown */
+    uint16_t packets; /* number of packets; 0 for an LMS, and if the number is unknown */
 };
 static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_datagram *datagram,
                                                         struct scanhub_telegram *out)
@@ -399,14 +403,14 @@ struct scanhub_scan {
     uint16_t count; /* Number of beams, at most 8192; they are in the order of their measurement. */
     uint16_t valid_to; /* Highest value that is a range; all higher values are codes. */
     uint16_t no_return; /* Code of a beam without an echo. */
-    uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has none. */
+    uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has no such code. */
     /* Number of points that were dropped because another point has the same beam; also points without a return. */
     uint16_t collisions;
     uint8_t family; /* Family of the scanner: enum scanhub_family. */
     uint8_t incomplete; /* 1: Packets of the revolution are missing. */
-    uint8_t intensity_bits; /* Bits of an intensity; 0 if there are none. */
+    uint8_t intensity_bits; /* Bits of an intensity; 0 if the scan has no intensities. */
     uint8_t turns; /* Number of revolutions in the scan: beam i is from revolution i modulo this number. 0 means 1. */
-    uint32_t turn_ns; /* Time of a revolution in ns if there are several; otherwise 0. */
+    uint32_t turn_ns; /* Time of a revolution in ns if the scan took several revolutions; otherwise 0. */
     /* Exact angles in radians; NaN if nothing was measured. NULL if the scan does not have them. Each has 4 bytes. */
     const uint8_t *angles;
     const uint8_t *ranges; /* Ranges in device units, codes included. Each has 2 bytes. */
@@ -457,7 +461,7 @@ static inline enum scanhub_result scanhub_read_scan(const struct scanhub_datagra
 /* The payload of topic `marks`, 1028 bytes: one sample per scan. */
 struct scanhub_marks {
     uint8_t count; /* Number of marks, at most 64. */
-    uint8_t overflow; /* 1: There were more marks than fit. */
+    uint8_t overflow; /* 1: There were more marks than fit into the sample. */
     /* 1: Marks are unknown, because the measuring mode has no reflector bits or `no_level` is set. */
     uint8_t unavailable;
     const uint8_t *marks; /* The marks in the order of their beams. See scanhub_mark. */
@@ -511,16 +515,17 @@ struct scanhub_zones {
     uint8_t verdict; /* Verdict: enum scanhub_verdict. Treat unknown, and every other number, as stop. */
     uint8_t count; /* Number of zones, at most 8. */
     uint16_t nearest_beam; /* Beam of the point nearest to the robot's center; 65535 if no beam has a valid reading. */
-    uint32_t nearest_mm; /* Distance of that point from the center in mm, rounded down; 4294967295 if there is none. */
-    uint16_t invalid_beams; /* Number of beams without a valid reading among those that cross the largest zone. */
+    /* Distance of the nearest point from the center in mm, rounded down; 4294967295 if there is none. */
+    uint32_t nearest_mm;
+    uint16_t invalid_beams; /* Number of beams without a valid reading among the beams that cross the largest zone. */
     uint8_t provisional; /* 1: There were fewer scans than a violation requires. */
     const uint8_t *zones; /* The zones, the largest first. See scanhub_zone. */
 };
 /* One zone: a circle around the robot's center. */
 struct scanhub_zone {
     uint16_t radius_mm; /* Radius in mm. */
-    uint16_t beams; /* Number of beams of this scan that end inside. */
-    uint8_t violated; /* 1 if enough beams ended inside in enough scans. */
+    uint16_t beams; /* Number of beams of this scan that end inside the zone. */
+    uint8_t violated; /* 1 if enough beams ended inside the zone in enough scans. */
 };
 /* Returns element i of `zones`, i below `count`. */
 static inline struct scanhub_zone scanhub_zone(const struct scanhub_zones *zones, unsigned i)
@@ -560,7 +565,7 @@ struct scanhub_foreground {
     uint16_t count; /* Number of beams of the scan. */
     uint16_t beams; /* Number of beams in the foreground. */
     uint16_t segment_count; /* Number of segments, at most 64. */
-    uint16_t dropped; /* Number of segments that did not fit. */
+    uint16_t dropped; /* Number of segments that did not fit into the sample. */
     /* Bit i is set if segment i is supported: it has several beams, or is near the previous scan's foreground. */
     uint64_t supported;
     const uint8_t *bits; /* The beams in the foreground: beam i is bit i % 8 of byte i / 8. */
@@ -664,7 +669,7 @@ struct scanhub_status {
     uint8_t family; /* Family of the scanner: enum scanhub_family; 255 while the hub searches for it. */
     uint32_t baud; /* Baud rate of the line; 0 if unknown. */
     uint64_t since_ns; /* Stamp of the start of the state, in ns. */
-    uint32_t rate_mhz; /* Scans per second in 1/1000; 0 while they are not measured. */
+    uint32_t rate_mhz; /* Scans per second, in units of 1/1000; 0 while the rate is not measured. */
     uint16_t angle_deg; /* Field of view in degrees: 100 or 180; 0 if unknown. */
     uint16_t resolution_cdeg; /* Angle between two beams in 1/100 degree; 0 if unknown. */
     char type[25]; /* Type that the scanner reports; empty if unknown. */
@@ -716,7 +721,7 @@ struct scanhub_lines {
     uint8_t corner_count; /* Number of corners, at most 64. */
     uint8_t overflow; /* 1: There are more lines than `lines.max`; the others were joined or dropped. */
     uint16_t readings; /* Number of beams of the scan that have a range. */
-    uint16_t on_lines; /* Number of those beams that end on a line. */
+    uint16_t on_lines; /* Number of beams with a range that end on a line. */
     float noise_m; /* Standard deviation of the ranges in meters, estimated from this scan. */
     const uint8_t *lines; /* The lines in the order of their beams. See scanhub_line. */
     const uint8_t *corners; /* The corners in the order of their beams. See scanhub_corner. */
@@ -823,7 +828,7 @@ struct scanhub_motion {
     uint8_t method; /* Method: enum scanhub_method. Treat every other number as refused. */
     uint8_t valid; /* 1: the summed pose is known, and none of its steps was degenerate. */
     /* 1: The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is
-     * large there. */
+     * large in this direction. */
     uint8_t degenerate;
     /* Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them. */
     uint16_t refused_steps;
@@ -865,13 +870,14 @@ static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datag
     return SCANHUB_OK;
 }
 
-/* The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first zones with
- * the same or a higher number belong to its scan and confirm it. A sample with `withdrawn` withdraws it. */
+/* The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first sample of
+ * topic `zones` with the same or a higher `seq` belongs to the same scan and confirms the warning. A sample with
+ * `withdrawn` withdraws the warning. */
 struct scanhub_early {
     uint8_t verdict; /* Verdict: enum scanhub_verdict. It is slow or stop, never clear or unknown. */
-    uint8_t withdrawn; /* 1: The warning with this number is withdrawn. */
+    uint8_t withdrawn; /* 1: The warning with this `seq` is withdrawn. */
     uint16_t beam; /* Beam of the nearest point so far. */
-    uint32_t distance_mm; /* Distance of that point from the robot's center, in mm. */
+    uint32_t distance_mm; /* Distance of the nearest point so far from the robot's center, in mm. */
     uint16_t bytes_seen; /* Bytes of the telegram that had arrived; 0 for a revolution. */
     uint16_t beams_seen; /* Beams of the scan that had arrived. */
 };
@@ -904,7 +910,7 @@ struct scanhub_tracks {
 };
 /* One person. */
 struct scanhub_track {
-    uint64_t id; /* ID of the person, which no one else gets while the tracker runs. */
+    uint64_t id; /* ID of the person. No other person gets the same ID while the tracker runs. */
     float x_m; /* Midpoint between the legs, along x, in meters on the map. */
     float y_m; /* Midpoint between the legs, along y, in meters on the map. */
     float vx_m_s; /* Velocity along x, in meters per second. */
@@ -993,7 +999,7 @@ struct scanhub_events {
     uint64_t id; /* ID of the person in topic `tracks`. */
     uint8_t kind; /* Kind of the event: enum scanhub_event_kind. */
     char room[25]; /* Name of the room after the event; empty outside of all rooms. */
-    char door[25]; /* Name of the door; empty for other events. */
+    char door[25]; /* Name of the door; empty if the kind is not `door`. */
     char from[25]; /* Room that the person came from, or `outside`; empty for other events. */
     char to[25]; /* Room that the person went to, or `outside`; empty for other events. */
 };
@@ -1095,11 +1101,12 @@ static inline enum scanhub_result scanhub_read_cloud(const struct scanhub_datagr
     return SCANHUB_OK;
 }
 
-/* The payload of topic `obstacles`, 3088 bytes: the obstacles of one sweep. It is published even if there are none. */
+/* The payload of topic `obstacles`, 3088 bytes: the obstacles of one sweep. The sample is published even if there are
+ * no obstacles. */
 struct scanhub_obstacles {
     uint32_t sweep; /* Number of the sweep, as in topic `cloud`. */
     uint32_t generation; /* Generation of the background, as in topic `cloud`. */
-    uint32_t dropped; /* Number of obstacles that did not fit. */
+    uint32_t dropped; /* Number of obstacles that did not fit into the sample. */
     uint8_t count; /* Number of obstacles, at most 64. */
     uint8_t complete; /* 1: The sweep has all angles from one reversal of the mount to the next. */
     /* 1: The angles of the sweep contradict the background. The list is empty, whatever the scene contains. */
@@ -1166,24 +1173,25 @@ static inline enum scanhub_result scanhub_read_obstacles(const struct scanhub_da
 }
 /* End of payloads. */
 
-/* Returns the range of beam i in device units. Values above `valid_to` are codes. Here and below, i is below `count`. */
+/* Returns the range of beam i in device units. Values above `valid_to` are codes. In this function and the following
+ * ones, i must be below `count`. */
 static inline uint16_t scanhub_scan_range(const struct scanhub_scan *scan, unsigned i)
 {
     return scanhub_u16(scan->ranges + 2 * (size_t)i);
 }
-/* Returns the range of beam i in meters; NAN if it has no reading. */
+/* Returns the range of beam i in meters; NAN if the beam has no reading. */
 static inline double scanhub_scan_m(const struct scanhub_scan *scan, unsigned i)
 {
     uint16_t range = scanhub_scan_range(scan, i);
     return range <= scan->valid_to ? (double)range * scan->unit_um / 1e6 : NAN;
 }
-/* Returns the angle of beam i in radians: the exact one if the scan has it, otherwise that of the grid. */
+/* Returns the angle of beam i in radians: the exact angle if the scan contains it, otherwise the angle in the grid. */
 static inline double scanhub_scan_angle(const struct scanhub_scan *scan, unsigned i)
 {
     double exact = scan->angles ? (double)scanhub_f32(scan->angles + 4 * (size_t)i) : NAN;
     return isnan(exact) ? scan->first_angle + i * scan->step : exact;
 }
-/* Returns the reason why beam i has no reading; NULL if it has one. */
+/* Returns the reason why beam i has no reading; NULL if the beam has a reading. */
 static inline const char *scanhub_scan_code(const struct scanhub_scan *scan, unsigned i)
 {
     static const char *const words[8] = {
@@ -1197,7 +1205,7 @@ static inline const char *scanhub_scan_code(const struct scanhub_scan *scan, uns
         return words[range <= greatest && greatest - range < 9 ? lms[greatest - range] : 6];
     return words[0xFFFFu - range < 7 ? 0xFFFFu - range : 7];
 }
-/* Returns the intensity of beam i, or -1 if there are none. */
+/* Returns the intensity of beam i, or -1 if the scan has no intensities. */
 static inline int32_t scanhub_scan_intensity(const struct scanhub_scan *scan, unsigned i)
 {
     if (scan->intensity_bits == 0)
@@ -1211,12 +1219,12 @@ static inline int64_t scanhub_scan_beam_ns(const struct scanhub_scan *scan, unsi
     return scan->first_beam_ns + (int64_t)i * scan->beam_time_ns + turn * scan->turn_ns;
 }
 
-/* Returns whether beam i of the scan is in the foreground, i below `count`. */
+/* Returns whether beam i of the scan is in the foreground. i must be below `count`. */
 static inline int scanhub_is_foreground(const struct scanhub_foreground *foreground, unsigned i)
 {
     return foreground->bits[i / 8] >> (i % 8) & 1;
 }
-/* Returns the range of foreground beam n in device units, n below `beams`. */
+/* Returns the range of the foreground beam with index n, in device units. n must be below `beams`. */
 static inline uint16_t scanhub_foreground_range(const struct scanhub_foreground *foreground, unsigned n)
 {
     return scanhub_u16(foreground->ranges + 2 * (size_t)n);
@@ -1230,7 +1238,7 @@ static inline enum scanhub_result scanhub_read_foreground(const struct scanhub_d
         return result;
     if (out->beams > out->count || (out->segment_count < 64 && out->supported >> out->segment_count != 0))
         return SCANHUB_BAD_PAYLOAD;
-    /* As many beams as ranges, and none outside of the scan. */
+    /* There must be as many foreground beams as ranges, and no foreground beam outside of the scan. */
     for (i = 0; i < 8 * ((out->count + 7u) / 8); i++) {
         if (scanhub_is_foreground(out, i)) {
             members++;
@@ -1245,7 +1253,8 @@ static inline enum scanhub_result scanhub_read_foreground(const struct scanhub_d
     }
     return members == out->beams ? SCANHUB_OK : SCANHUB_BAD_PAYLOAD;
 }
-/* Returns the range of beam i in device units, i below `count`: 0 if it is unknown, FFFFh if it is beyond the maximum range. */
+/* Returns the range of beam i in device units: 0 if the background is unknown, FFFFh if it is beyond the maximum range.
+ * i must be below `count`. */
 static inline uint16_t scanhub_background_range(const struct scanhub_background *background, unsigned i)
 {
     return scanhub_u16(background->ranges + 2 * (size_t)i);

@@ -1,11 +1,12 @@
--- Dissector of the datagrams of `scanhub gateway` for Wireshark and tshark. It shows all fields, and checks checksums
--- and MACs. It flags gaps, duplicates and datagrams out of order, for each hub, epoch, sensor and topic.
+-- Dissector of the datagrams of `scanhub gateway` for Wireshark and tshark. The dissector shows all fields, and checks
+-- checksums and MACs. For each hub, epoch, sensor and topic, it flags gaps, duplicates and datagrams out of order.
 -- docs/datagram.md describes the bytes.
 --
 --   tshark -X lua_script:scanhub.lua -f 'udp port 22200' -Y scanhub.lost
 --   tshark -X lua_script:scanhub.lua -o scanhub.key_file:KEY -Y 'scanhub.mac_status == "wrong"'
 --
--- Or copy it to the directory of personal Lua plugins, which Help > About > Folders shows.
+-- Instead of the option -X, you can copy this file to the directory of personal Lua plugins, which Help > About >
+-- Folders shows.
 
 local PORT = 22200
 local WINDOW = 1024
@@ -77,10 +78,10 @@ local FOREGROUND_HEAD = 24
 local SEGMENT = 16
 -- End of wire.
 
--- Length of a packet in bytes, by family.
+-- Length of a packet in bytes, by the number of the family, for families whose packets have a fixed length.
 local PACKET = { 47 }
 local CODES = { [0] = "not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error" }
--- Codes of an LMS, by their distance from the highest value of its measuring mode.
+-- Codes of an LMS, by their distance from the highest value of the measuring mode.
 local OF_LMS = { [0] = "no_return", [1] = "too_bright", [4] = "weak", [5] = "error", [8] = "beyond" }
 
 -- Fields -----------------------------------------------------------------------------------------------------------
@@ -166,7 +167,7 @@ field("scan.incomplete", "uint8", "Incomplete", base.DEC, nil, 1)
 field("scan.contents", "uint8", "Arrays that follow the head", base.HEX)
 field("scan.intensity_bits", "uint8", "Bits of an intensity")
 field("scan.turns", "uint8", "Number of revolutions in the scan: beam i is from revolution i modulo this number")
-field("scan.turn_ns", "uint32", "Time of a revolution in ns if there are several")
+field("scan.turn_ns", "uint32", "Time of a revolution in ns if the scan took several revolutions")
 field("marks.count", "uint8", "Number of marks, at most 64")
 field("marks.overflow", "uint8", "Overflow", base.DEC, nil, 1)
 field("marks.unavailable", "uint8", "Unavailable", base.DEC, nil, 2)
@@ -181,19 +182,19 @@ field("marks.last_beam", "uint16", "Last beam")
 field("zones.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
 field("zones.count", "uint8", "Number of zones, at most 8")
 field("zones.nearest_beam", "uint16", "Beam of the point nearest to the robot's center")
-field("zones.nearest_mm", "uint32", "Distance of that point from the center in mm, rounded down")
+field("zones.nearest_mm", "uint32", "Distance of the nearest point from the center in mm, rounded down")
 field("zones.invalid_beams", "uint16",
-    "Number of beams without a valid reading among those that cross the largest zone")
+    "Number of beams without a valid reading among the beams that cross the largest zone")
 field("zones.provisional", "uint8", "Provisional", base.DEC, nil, 1)
 field("zones.radius_mm", "uint16", "Radius in mm")
-field("zones.beams", "uint16", "Number of beams of this scan that end inside")
-field("zones.violated", "uint8", "1 if enough beams ended inside in enough scans")
+field("zones.beams", "uint16", "Number of beams of this scan that end inside the zone")
+field("zones.violated", "uint8", "1 if enough beams ended inside the zone in enough scans")
 field("foreground.generation", "uint32", "Generation of the compared background")
 field("foreground.unit_um", "uint32", "Micrometers per device unit")
 field("foreground.count", "uint16", "Number of beams of the scan")
 field("foreground.beams", "uint16", "Number of beams in the foreground")
 field("foreground.segments", "uint16", "Number of segments, at most 64")
-field("foreground.dropped", "uint16", "Number of segments that did not fit")
+field("foreground.dropped", "uint16", "Number of segments that did not fit into the sample")
 field("foreground.supported", "uint64",
     "Bit i is set if segment i is supported: it has several beams, or is near the previous scan's foreground")
 field("foreground.first", "uint16", "First beam")
@@ -216,7 +217,7 @@ field("status.unit_mm", "uint8", "Millimeters per device unit: 1, 10 or 100")
 field("status.family", "uint8", "Family of the scanner", base.DEC, FAMILIES)
 field("status.baud", "uint32", "Baud rate of the line")
 field("status.since_ns", "uint64", "Stamp of the start of the state, in ns")
-field("status.rate_mhz", "uint32", "Scans per second in 1/1000")
+field("status.rate_mhz", "uint32", "Scans per second, in units of 1/1000")
 field("status.angle_deg", "uint16", "Field of view in degrees: 100 or 180")
 field("status.resolution_cdeg", "uint16", "Angle between two beams in 1/100 degree")
 field("status.type", "string", "Type that the scanner reports")
@@ -232,7 +233,7 @@ field("status.upside_down", "uint8", "1 if the sensor is mounted upside down, so
 field("lines.count", "uint8", "Number of lines, at most 64")
 field("lines.overflow", "uint8", "Overflow", base.DEC, nil, 1)
 field("lines.readings", "uint16", "Number of beams of the scan that have a range")
-field("lines.on_lines", "uint16", "Number of those beams that end on a line")
+field("lines.on_lines", "uint16", "Number of beams with a range that end on a line")
 field("lines.noise_m", "float", "Standard deviation of the ranges in meters, estimated from this scan")
 field("lines.x1_m", "float", "Point on the first beam: meters ahead of the robot's center")
 field("lines.y1_m", "float", "Point on the first beam: meters to the left of the center")
@@ -267,11 +268,11 @@ field("motion.pose_covariance", "float",
 field("early.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
 field("early.withdrawn", "uint8", "Withdrawn", base.DEC, nil, 1)
 field("early.beam", "uint16", "Beam of the nearest point so far")
-field("early.distance_mm", "uint32", "Distance of that point from the robot's center, in mm")
+field("early.distance_mm", "uint32", "Distance of the nearest point so far from the robot's center, in mm")
 field("early.bytes_seen", "uint16", "Bytes of the telegram that had arrived")
 field("early.beams_seen", "uint16", "Beams of the scan that had arrived")
 field("tracks.count", "uint8", "Number of people, at most 64")
-field("tracks.id", "uint64", "ID of the person, which no one else gets while the tracker runs")
+field("tracks.id", "uint64", "ID of the person")
 field("tracks.x_m", "float", "Midpoint between the legs, along x, in meters on the map")
 field("tracks.y_m", "float", "Midpoint between the legs, along y, in meters on the map")
 field("tracks.vx_m_s", "float", "Velocity along x, in meters per second")
@@ -309,7 +310,7 @@ field("cloud.beam", "uint16", "Index of the beam in its scan")
 field("cloud.class", "uint8", "Class of the point", base.DEC, POINT_CLASSES)
 field("obstacles.sweep", "uint32", "Number of the sweep, as in topic cloud")
 field("obstacles.generation", "uint32", "Generation of the background, as in topic cloud")
-field("obstacles.dropped", "uint32", "Number of obstacles that did not fit")
+field("obstacles.dropped", "uint32", "Number of obstacles that did not fit into the sample")
 field("obstacles.count", "uint8", "Number of obstacles, at most 64")
 field("obstacles.complete", "uint8", "Complete", base.DEC, nil, 4)
 field("obstacles.unreliable", "uint8", "Unreliable", base.DEC, nil, 8)
@@ -339,7 +340,7 @@ scanhub.experts = { expert_lost, expert_order, expert_refused }
 
 -- Checksum ---------------------------------------------------------------------------------------------------------
 
--- Lua 5.2 brings bit32, Lua 5.4 has operators that 5.2 cannot parse.
+-- Lua 5.2 has bit32. Lua 5.4 has operators instead, which are in a string because Lua 5.2 cannot parse them.
 local bits = bit32 or bit or load([[return {
     bxor = function(a, b, c) return a ~ b ~ (c or 0) end, band = function(a, b) return a & b end,
     rshift = function(a, n) return a >> n end, bnot = function(a) return ~a & 0xFFFFFFFF end,
@@ -356,7 +357,7 @@ for byte = 0, 255 do
     CRC[byte] = crc
 end
 
--- CRC-32C of the datagram with its own four bytes as 0.
+-- Returns the CRC-32C of the datagram, computed with 0 in the four bytes of the checksum.
 local function crc_of(tvb)
     local bytes = tvb:bytes()
     local crc = 0xFFFFFFFF
@@ -421,7 +422,8 @@ local function sha256(text)
     return table.concat(out)
 end
 
--- Returns the first blocks of the two hashes of a MAC, for the key in a file; or nil and the reason.
+-- Returns the first blocks of the two hashes of a MAC for the key in the file at `path`. Returns nil and the reason if
+-- the file contains no key.
 local function read_key(path)
     local file, why = io.open(path, "rb")
     if not file then return nil, why end
@@ -461,18 +463,20 @@ end
 local streams, epochs, names, findings
 
 function scanhub.init()
-    -- By hub, epoch, sensor and topic: the highest sequence number, and those received in the window below it.
+    -- By hub, epoch, sensor and topic: the highest sequence number, and the numbers that were received in the window
+    -- below it.
     streams = {}
     -- By hub: the latest epoch.
     epochs = {}
     -- By hub and sensor: the sensor's name.
     names = {}
-    -- By frame number: the result of `check_sequence`. Only the first pass fills it, because later passes are not in order.
+    -- By frame number: the result of `check_sequence`. Only the first pass over the frames fills this table, because
+    -- later passes are not in order.
     findings = {}
 end
 
--- Compares a datagram with earlier ones. Returns the field to show and its value, or nil if the datagram is the
--- expected one.
+-- Compares the sequence number of a datagram with those of earlier datagrams. Returns the field to show and its value,
+-- or nil if the datagram is the expected one.
 local function check_sequence(hub, epoch, sensor, topic, sequence)
     if epochs[hub] and epoch < epochs[hub] then
         return { "retired", epochs[hub] }
@@ -486,7 +490,7 @@ local function check_sequence(hub, epoch, sensor, topic, sequence)
     end
     local ahead = (sequence - stream.highest) % 0x100000000
     if ahead > 0 and ahead < 0x80000000 then
-        -- Removes the numbers that leave the window.
+        -- Remove the numbers that leave the window.
         for behind = 0, math.min(ahead, WINDOW) - 1 do
             stream.seen[(stream.highest - WINDOW + 1 + behind) % 0x100000000] = nil
         end
@@ -539,7 +543,7 @@ end
 
 unpack_payload[1] = function(payload, tree, _, _, family)
     local len, words = payload:len(), ""
-    -- The telegram of an LMS contains its length. Packets of other families fill the payload.
+    -- The telegram of an LMS contains its length. For other families, packets fill the payload completely.
     if family == 0 then
         if len < 4 or payload(0, 1):uint() ~= 2 then return nil end
         len = payload(2, 2):le_uint() + 6
@@ -555,7 +559,7 @@ unpack_payload[1] = function(payload, tree, _, _, family)
     return words .. len .. " bytes"
 end
 
--- Returns whether numbers of `size` bytes from `at` on are neither infinite nor NaN.
+-- Returns whether `count` numbers of `size` bytes, from `at` on, are neither infinite nor NaN.
 local function are_finite(payload, at, size, count)
     for i = 0, count - 1 do
         local number = payload(at + size * i, size):le_float()
@@ -1029,7 +1033,7 @@ unpack_payload[2] = function(payload, tree)
     add_scan(tree, payload)
     if count == 0 then return "0 beams" end
     local at = SCAN_HEAD
-    -- Calls `each` with the number and the bytes of each beam in the next array.
+    -- Adds the next array to the tree. Calls `each` with the index and the bytes of each beam in the array.
     local function array(name, size, each)
         if size == 0 then return end
         local branch = tree:add(payload(at, size * count), name)
@@ -1111,7 +1115,8 @@ local function head(tvb, name)
     return tvb(DATAGRAM[name][1], DATAGRAM[name][2])
 end
 
--- Returns the reason why bytes are not a datagram, in the order of the checks; nil if they are one.
+-- Returns the reason why the bytes are not a datagram; nil if they are a datagram. The first check that fails
+-- determines the reason.
 local function refusal(tvb)
     local len = tvb:len()
     if len < DATAGRAM.size then return "short" end
@@ -1198,7 +1203,7 @@ function scanhub.dissector(tvb, pinfo, root)
     if not words then
         return add_refusal(tree, pinfo, unpack and "payload" or "skipped")
     end
-    -- All parts of a sample have its sequence number, so only the first part counts.
+    -- All parts of a sample have the same sequence number, so only the first part is checked.
     if not pinfo.visited and part == 0 then
         findings[pinfo.number] = check_sequence(hub, epoch, sensor, topic, sequence)
     end

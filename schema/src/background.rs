@@ -1,5 +1,6 @@
 //! The background model of a sensor, and the foreground of a scan. The model has the range at which each beam ends in
-//! an empty scene. The foreground has the beams of one scan that end in front of it, and the segments that they form.
+//! an empty scene. The foreground has the beams of one scan that end in front of the background, and the segments that
+//! these beams form.
 
 use std::fmt;
 
@@ -36,8 +37,8 @@ pub struct BackgroundHead {
 
 sliced! {
     /// The payload of topic `background`: a [`BackgroundHead`], whose fields can be read directly, followed by a range
-    /// of two bytes for every beam. The hub publishes it when a new generation starts, and with every scan if
-    /// configured.
+    /// of two bytes for every beam. The hub publishes the model when a new generation starts, and also with every scan
+    /// if configured.
     Background, BackgroundWord, "scanhub.Background.v2", BackgroundHead
 }
 
@@ -73,7 +74,7 @@ impl Background {
     ///
     /// # Panics
     ///
-    /// Panics if the memory is too short for them.
+    /// Panics if the memory is too short for the head and the ranges.
     pub fn begin(&mut self, head: BackgroundHead) -> &mut [u16] {
         **self = head;
         cast_slice_mut(&mut self.memory_mut()[Background::HEAD..Background::len(head.count.into())])
@@ -97,7 +98,8 @@ impl Background {
         self.flags & Background::FROZEN != 0
     }
 
-    /// Returns the model in `bytes`, or `None` if their length does not match its count.
+    /// Returns the model in `bytes`, or `None` if its head is not valid or the length of `bytes` does not match the
+    /// number of beams in the head.
     pub fn read(bytes: &[u8]) -> Option<Box<Background>> {
         let mut model = Background::zeroed(bytes.len());
         (model.unpack(bytes) && model.bytes().len() == bytes.len()).then_some(model)
@@ -107,7 +109,7 @@ impl Background {
         Background::len(self.ranges().len())
     }
 
-    /// Returns the length of the model in a datagram's payload, or `None` if it is not valid.
+    /// Returns the length in bytes of the model in a datagram's payload, or `None` if the model is not valid.
     fn packed_len(payload: &[u8]) -> Option<usize> {
         let head: BackgroundHead = read_head(payload)?;
         let len = Background::len(head.count.into());
@@ -143,18 +145,18 @@ pub struct ForegroundHead {
     pub beams: u16,
     /// Number of segments, at most [`MAX_SEGMENTS`].
     pub segments: u16,
-    /// Number of segments that did not fit.
+    /// Number of segments that did not fit into the sample.
     pub dropped: u16,
     /// Bit i is set if segment i is supported: it has several beams, or is near the previous scan's foreground.
     pub supported: u64,
 }
 
 sliced! {
-    /// The payload of topic `foreground`, one sample per scan even if it is empty. It starts with a [`ForegroundHead`],
-    /// whose fields can be read directly. The arrays follow:
+    /// The payload of topic `foreground`, one sample per scan even if it is empty. The payload starts with a
+    /// [`ForegroundHead`], whose fields can be read directly. The arrays follow:
     ///
     /// - [`MAX_SEGMENTS`] segments of 16 bytes,
-    /// - a bit for every beam of the scan, in pairs of bytes,
+    /// - a bit for every beam of the scan, padded to an even number of bytes,
     /// - a range of two bytes for every beam of the scan.
     ///
     /// In the arrays of segments and ranges, the used elements come first, and the others are 0.
@@ -187,8 +189,8 @@ pub struct ForegroundArrays<'a> {
     pub segments: &'a mut [Segment],
     /// Beams in the foreground: beam i is bit i % 8 of byte i / 8.
     pub bits: &'a mut [u8],
-    /// Ranges of the foreground beams in device units, in the order of the beams. There is room for all beams of the
-    /// scan.
+    /// Ranges of the foreground beams in device units, in the order of the beams. The array has room for all beams of
+    /// the scan.
     pub ranges: &'a mut [u16],
 }
 
@@ -215,7 +217,7 @@ impl Foreground {
     ///
     /// # Panics
     ///
-    /// Panics if the memory is too short for them.
+    /// Panics if the memory is too short for the head and the arrays.
     pub fn begin(&mut self, head: ForegroundHead) -> ForegroundArrays<'_> {
         **self = head;
         let n = usize::from(head.count);
@@ -256,18 +258,18 @@ impl Foreground {
         &all[..usize::from(self.segments).min(all.len())]
     }
 
-    /// Returns whether segment `i` is supported. A single beam without foreground near it in the previous scan is not,
-    /// and may come from a flickering edge.
+    /// Returns whether segment `i` is supported. A segment of a single beam is not supported if the previous scan had
+    /// no foreground near the beam. Such a segment may come from a flickering edge.
     pub fn has_support(&self, i: usize) -> bool {
         i < self.segments().len() && self.supported >> i & 1 == 1
     }
 
-    /// Returns a bit for every beam of the scan, as [`ForegroundArrays::bits`].
+    /// Returns a bit for every beam of the scan, with the layout of [`ForegroundArrays::bits`].
     fn bits(&self) -> &[u8] {
         self.memory().get(BITS_OFFSET..BITS_OFFSET + self.scan_beams().div_ceil(8)).unwrap_or_default()
     }
 
-    /// Returns the number of beams of the scan, or 0 if there is too little memory for them.
+    /// Returns the number of beams of the scan, or 0 if the memory is too short for the arrays of all beams.
     fn scan_beams(&self) -> usize {
         let n = usize::from(self.count);
         if Foreground::len(n) <= self.memory().len() { n } else { 0 }
@@ -279,8 +281,8 @@ impl Foreground {
 }
 
 impl DatagramPayload for Foreground {
-    /// Writes head, bits, the used ranges, and as many segments as there is room for. The other segments are counted as
-    /// dropped.
+    /// Writes the head, the bits, the used ranges, and as many segments as fit into `room`. The other segments are
+    /// counted as dropped.
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
         let fixed = |head: &ForegroundHead, room: &mut [u8]| {
             write(room, &[bytes_of(head), self.bits(), cast_slice::<u16, u8>(self.ranges())])
@@ -370,10 +372,11 @@ impl fmt::Debug for Foreground {
     }
 }
 
-/// Offset of the bits.
+/// Offset in bytes from the start of a foreground to its bits.
 const BITS_OFFSET: usize = Foreground::HEAD + MAX_SEGMENTS * size_of::<Segment>();
 
-/// Returns the length in bytes of a bit for every beam. It is even, because the ranges that follow take two bytes each.
+/// Returns the length in bytes of the array with a bit for every beam. The length is even, because the ranges that
+/// follow take two bytes each.
 const fn bit_set_len(beams: usize) -> usize {
     2 * beams.div_ceil(16)
 }

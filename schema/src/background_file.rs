@@ -1,16 +1,16 @@
-//! A background model as one JSON object: the output line that shows it, and the file that it is saved to and loaded
-//! from. The file may come from an untrusted source, so all of its values are checked.
+//! A background model as one JSON object. Commands print the object as a line, save it to a file, and load it from a
+//! file. The file may come from an untrusted source, so all of its values are checked.
 
 use serde::{Deserialize, Serialize, Serializer};
 
 use crate::{Background, BackgroundHead, Failure, Kind, MAX_BEAMS, in_degrees};
 
-/// A model that was read from a file, with its sensor.
+/// A model that was read from a file, with the name of its sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BackgroundFile {
     /// Name of the sensor that the model was saved from.
     pub sensor: String,
-    /// The model, with the generation and flags of the saved one.
+    /// The model. Its generation and flags are those at the time when it was saved.
     pub model: Box<Background>,
 }
 
@@ -51,7 +51,7 @@ pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + '
 }
 
 impl BackgroundFile {
-    /// Parses the model in `text`. `source` is its place for messages. Unknown keys are ignored.
+    /// Parses the model in `text`. `source` is the name of the file in messages. Unknown keys are ignored.
     ///
     /// # Errors
     ///
@@ -74,8 +74,8 @@ struct ClassKey {
     class: String,
 }
 
-/// The JSON object before its values are checked. Ranges are wider than in a model, so that the message about a value
-/// that does not fit can name its beam.
+/// The JSON object before its values are checked. Ranges have a wider type than in a model. A range that is too large
+/// for a model is therefore still parsed, and the message about it can name its beam.
 #[derive(Deserialize)]
 struct ParsedFile {
     sensor: String,
@@ -147,8 +147,8 @@ impl ParsedFile {
         Ok(model)
     }
 
-    /// Returns whether the angles are in the frame of version 1, which supported only the LMS: 0 was on the right, and
-    /// 90 ahead.
+    /// Returns whether the angles are in the frame of version 1, which supported only the LMS: 0 degrees was on the
+    /// right, and 90 degrees was ahead.
     fn has_version_1_angles(&self) -> bool {
         let layouts =
             [(181, 0.0, 1.0), (361, 0.0, 0.5), (101, 40.0, 1.0), (201, 40.0, 0.5), (401, 40.0, 0.25)];
@@ -162,7 +162,8 @@ fn read<'a, T: Deserialize<'a>>(text: &'a [u8], source: &str) -> Result<T, Failu
         if text.is_empty() {
             return invalid_file(source, "it is empty");
         }
-        // A text that ends inside a number causes the same error as a wrong digit.
+        // A text that ends inside a number causes the same error as a wrong digit, so the last character is checked,
+        // too.
         let is_cut = error.is_eof() || text.starts_with(b"{") && !text.ends_with(b"}");
         invalid_file(source, &if is_cut { format!("it is cut short: {error}") } else { error.to_string() })
     })
@@ -173,7 +174,7 @@ fn invalid_file(source: &str, reason: &str) -> Failure {
     Failure::new(Kind::Input, format!("{source} is not a background model: {reason}"), hint)
 }
 
-/// Serializes a unit of `unit_um` micrometers in mm, as a whole number if it is one.
+/// Serializes a unit of `unit_um` micrometers in mm, as an integer if the unit is a whole number of mm.
 ///
 /// # Errors
 ///
@@ -196,7 +197,7 @@ fn far_beams<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::E
 }
 
 const CLASS: &str = "background";
-/// Highest range in any family that is not a code.
+/// Highest value that is a range in some family. In all families, all higher values are codes.
 const MAX_RANGE: u16 = 0xFFEF;
 
 #[cfg(test)]
@@ -217,7 +218,8 @@ mod tests {
         Background::of(head, &ranges)
     }
 
-    /// Returns a saved model of version 1, with the angle of the first beam as in version 2.
+    /// Returns a model with beams as version 1 supported them. The angle of its first beam is in the frame of version
+    /// 2.
     fn lms(count: u16) -> Box<Background> {
         match count {
             181 => model(181, -90.0, 1.0),

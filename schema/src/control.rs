@@ -6,7 +6,7 @@ use crate::{Background, Failure, Kind, text};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u16)]
 pub enum Verb {
-    /// Stop the sensor; its link stays.
+    /// Stop the sensor. Its link stays in the hub.
     Pause = 1,
     /// Let the sensor stream again.
     Resume = 2,
@@ -25,9 +25,9 @@ pub enum Verb {
 }
 
 impl Verb {
-    /// Requests about the flow of data, in the order of all output.
+    /// Requests about the flow of data, in the order in which all commands print them.
     pub const FLOW: [Verb; 3] = [Verb::Pause, Verb::Resume, Verb::Resync];
-    /// Requests about the background model, in the order of all output.
+    /// Requests about the background model, in the order in which all commands print them.
     pub const BACKGROUND: [Verb; 5] = [Verb::Show, Verb::Reset, Verb::Freeze, Verb::Thaw, Verb::Load];
 
     /// Returns all verbs.
@@ -49,21 +49,21 @@ impl Verb {
         }
     }
 
-    /// Returns the verb with this name, or `None`.
+    /// Returns the verb with this name, or `None` if no verb has it.
     pub fn parse(name: &str) -> Option<Verb> {
         Verb::all().find(|verb| verb.name() == name)
     }
 }
 
-/// A request. It is encoded as the sensor's name (32 bytes), the verb (two bytes, little-endian), six bytes of 0, and
-/// the model for [`Verb::Load`].
+/// A request of a client. The request is encoded as the sensor's name (32 bytes), the verb (two bytes, little-endian),
+/// six bytes of 0, and the model for [`Verb::Load`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
     /// Name of the sensor.
     pub sensor: String,
-    /// The command; `None` if it comes from a newer client and this program does not know it.
+    /// The command; `None` if this version does not have it, for example because the client is newer.
     pub verb: Option<Verb>,
-    /// The model to load.
+    /// The model to load; `None` for every verb except [`Verb::Load`].
     pub model: Option<Box<Background>>,
 }
 
@@ -88,7 +88,7 @@ impl Request {
         bytes
     }
 
-    /// Decodes the request in `bytes`. Returns `None` if it is not valid.
+    /// Decodes the request in `bytes`. Returns `None` if `bytes` are not a valid request.
     pub fn decode(bytes: &[u8]) -> Option<Request> {
         let (head, model) = bytes.split_at_checked(REQUEST_HEAD_LEN)?;
         let verb = u16::from_le_bytes([head[SENSOR_NAME_LEN], head[SENSOR_NAME_LEN + 1]]);
@@ -103,22 +103,24 @@ impl Request {
 /// A background model in a response.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ResponseModel {
-    /// The present model.
+    /// The current model of the sensor.
     pub model: Box<Background>,
-    /// Time at which the model was saved that the next hub starts with, in ns since 1970; `None` if there is none.
+    /// Time at which the hub saved the model that the next hub starts with, in ns since 1970; `None` if no model is
+    /// saved.
     pub kept_wall_ns: Option<u64>,
 }
 
 impl From<Box<Background>> for ResponseModel {
-    /// Wraps a model that is not saved.
+    /// Wraps `model`, with no time of a saved model.
     fn from(model: Box<Background>) -> ResponseModel {
         ResponseModel { model, kept_wall_ns: None }
     }
 }
 
-/// A response: success, with the requested model if there is one, or a failure. It is encoded as exit code and message
-/// length (two bytes each, little-endian), then the message, then the model. The second line of the message of a
-/// failure is the remedy. With a model, the message is the time at which a model was saved, in decimal digits.
+/// A response: success, with a model if the request was for one, or a failure. The response is encoded as exit code and
+/// message length (two bytes each, little-endian), then the message, then the model. The message of a failure has a
+/// second line, which is the remedy. In a response with a model, the message is [`ResponseModel::kept_wall_ns`] in
+/// decimal digits, or empty.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Response(pub Result<Option<ResponseModel>, Failure>);
 
@@ -143,8 +145,8 @@ impl Response {
         [head.as_flattened(), &message, model].concat()
     }
 
-    /// Decodes the response in `bytes`. Returns `None` if it is not valid. An unknown exit code becomes
-    /// [`Kind::Failed`].
+    /// Decodes the response in `bytes`. Returns `None` if `bytes` are not a valid response. An unknown exit code
+    /// becomes [`Kind::Failed`].
     pub fn decode(bytes: &[u8]) -> Option<Response> {
         let (&[code_low, code_high, low, high], rest) = bytes.split_first_chunk()?;
         let (message, model) = rest.split_at_checked(usize::from(u16::from_le_bytes([low, high])))?;
@@ -169,7 +171,7 @@ const RESPONSE_HEAD_LEN: usize = 4;
 const SENSOR_NAME_LEN: usize = 32;
 const REQUEST_HEAD_LEN: usize = 40;
 
-/// The kinds of failure in responses. Each has a different exit code.
+/// The kinds of failure in responses. Each of these kinds has a different exit code.
 const RESPONSE_KINDS: [Kind; 4] = [Kind::Failed, Kind::NoTopic, Kind::ResourceExhausted, Kind::Configuration];
 
 #[cfg(test)]

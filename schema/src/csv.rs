@@ -7,9 +7,9 @@ use crate::{Header, Marks, Scan, in_degrees};
 /// Columns of a scan that depend on options.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ScanColumns {
-    /// Ranges in meters instead of device units. Column `unit_um` is then 1000000.
+    /// Whether ranges are in meters instead of device units. Column `unit_um` is then 1000000.
     pub meters: bool,
-    /// Columns `intensity_0` .. after the ranges.
+    /// Whether columns `intensity_0`, `intensity_1` .. follow the ranges.
     pub intensities: bool,
 }
 
@@ -26,8 +26,8 @@ impl ScanColumns {
         (0..intensities).try_for_each(|i| write!(line, ",intensity_{i}"))
     }
 
-    /// Writes the columns of `scan`, without a line end. Ranges without a reading, and intensities that the scanner
-    /// does not send, are empty.
+    /// Writes the columns of `scan`, without a line end. The range of a beam without a reading is empty, and so are
+    /// intensities that the scanner does not send.
     ///
     /// # Errors
     ///
@@ -54,10 +54,10 @@ impl ScanColumns {
     }
 }
 
-/// Columns of marks. A scan has one row for each of its marks, or a single row if it has none.
+/// Columns of marks. A scan has one row for each of its marks, or a single row if it has no marks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MarkColumns {
-    /// Ranges in meters instead of millimeters.
+    /// Whether ranges are in meters instead of millimeters.
     pub meters: bool,
 }
 
@@ -72,8 +72,8 @@ impl MarkColumns {
         writeln!(out, "{STAMP_COLUMNS},marks,mark,angle_deg,{range},peak,weight,first_beam,last_beam,edge")
     }
 
-    /// Writes the rows of `marks`. Column `marks` is their count, or empty if marks are unavailable. Without a mark,
-    /// the columns after it are empty.
+    /// Writes the rows of `marks`. Column `marks` is the number of marks, or empty if marks are unavailable. If there
+    /// are no marks, the columns after `marks` are empty.
     ///
     /// # Errors
     ///

@@ -1,6 +1,6 @@
-//! Format of datagrams: a sample in one datagram, or in several if it is longer, and the announcement of a sensor,
-//! which a gateway sends once a second. A reader needs no library for the format. Every field is checked before it is
-//! used.
+//! Format of datagrams. A gateway sends a sample in one datagram, or in several parts if the sample is too long for
+//! one. The gateway also sends an announcement of each sensor once a second. A reader needs no library for the format.
+//! Every field is checked before it is used.
 //!
 //! This module needs neither shared memory nor a heap. Senders and receivers are in `clients/network`.
 
@@ -13,23 +13,24 @@ use crate::{Topic, check_sensor, text};
 
 pub use crate::payload::{DatagramPayload, FixedPayload, UsedElements};
 
-/// Bytes of the header.
+/// Length of the header in bytes.
 pub const HEADER_LEN: usize = size_of::<DatagramHead>();
-/// Bytes of the MAC after the payload, if [`LanFlags::AUTHENTICATED`] is set.
+/// Length in bytes of the MAC, which follows the payload if [`LanFlags::AUTHENTICATED`] is set.
 pub const MAC_LEN: usize = 16;
-/// Longest datagram that is never fragmented where tunnels leave an MTU of 1400.
+/// Length in bytes of the longest datagram that is not fragmented if the MTU is 1400, as in many tunnels.
 pub const MTU_SAFE: usize = 1372;
-/// Lowest limit that a gateway accepts, which every network can carry. Longer samples are sent in parts.
+/// Lowest limit in bytes that a gateway accepts for the length of its datagrams. Every network can carry datagrams of
+/// this length. Samples that need longer datagrams are sent in parts.
 pub const MIN_MTU: usize = 576;
-/// Longest datagram on an Ethernet.
+/// Length in bytes of the longest datagram that fits into one Ethernet frame.
 pub const MTU_ETHERNET: usize = 1472;
-/// Longest payload of a part.
+/// Maximum length in bytes of the payload of a part.
 pub const MAX_PART_LEN: usize = MTU_ETHERNET - HEADER_LEN;
 /// Maximum number of parts of a sample.
 pub const MAX_PARTS: usize = 255;
-/// Port of all groups.
+/// UDP port of all multicast groups.
 pub const PORT: u16 = 22_200;
-/// First three bytes of all groups. [`group`] returns the last one.
+/// First three bytes of the addresses of all multicast groups. [`group`] returns the last byte.
 pub const GROUP_PREFIX: [u8; 3] = [239, 255, 76];
 
 /// Header of a datagram as it is sent. 48 bytes.
@@ -50,7 +51,7 @@ struct DatagramHead {
     hub: u64,
     /// Number of the gateway's run, higher than in every earlier run.
     epoch: u32,
-    /// Number of the sample among those of this sensor and topic, from 0 in each epoch. It wraps.
+    /// Number of the sample among those of this sensor and topic, from 0 in each epoch. The number wraps.
     sequence: u32,
     /// Wall clock of the telegram's first byte, in ns since 1970. For announcements and `status`, the time of sending.
     stamp_ns: u64,
@@ -98,7 +99,7 @@ pub struct Head {
     pub flags: u8,
     /// Random number of the gateway.
     pub hub: u64,
-    /// Run of the gateway: seconds since 1970 at its start, or one more than the previous run.
+    /// Number of the gateway's run: seconds since 1970 at its start, or one more than the number of the previous run.
     pub epoch: u32,
     /// Sequence number of the sample within this sensor and topic. It starts at 0 and wraps.
     pub sequence: u32,
@@ -146,7 +147,7 @@ pub struct Datagram<'a> {
     pub head: Head,
     /// Payload, or a part of it. [`DatagramPayload::unpack`] checks the content of a whole payload.
     pub payload: &'a [u8],
-    /// MAC, if the datagram has one. It is not checked here.
+    /// MAC, if the datagram has one. This module does not check the MAC.
     pub mac: Option<&'a [u8; MAC_LEN]>,
 }
 
@@ -161,7 +162,7 @@ impl Head {
     }
 
     /// Does the same as [`seal`](Head::seal), and appends the MAC that `mac` computes from header and payload while the
-    /// checksum is 0. Also returns `None` if the buffer ends before the MAC does.
+    /// checksum is 0. Returns `None` in the same cases, and if the buffer has no room for the MAC.
     pub fn seal_with<'a>(
         &self,
         buffer: &'a mut [u8],
@@ -212,8 +213,9 @@ fn add_checksum(datagram: &mut [u8]) -> &[u8] {
     datagram
 }
 
-/// Returns the three pieces of `bytes` that the MAC covers: header and payload with a checksum of 0. `bytes` is a
-/// datagram with a MAC that [`read`](Datagram::read) has accepted.
+/// Returns the bytes that the MAC of a datagram covers, in three pieces: the header before the checksum, four zeros in
+/// place of the checksum, and the rest without the MAC. `bytes` is a datagram with a MAC that [`read`](Datagram::read)
+/// has accepted.
 pub fn mac_input(bytes: &[u8]) -> [&[u8]; 3] {
     let end = bytes.len().saturating_sub(MAC_LEN).max(HEADER_LEN);
     [&bytes[..CRC_OFFSET], &[0; HEADER_LEN - CRC_OFFSET], &bytes[HEADER_LEN..end]]
@@ -282,8 +284,9 @@ impl<'a> Datagram<'a> {
     }
 }
 
-/// Returns the last byte of the group that `topic` is sent to. There is one group for each class of traffic, because
-/// switches filter by group and not by port. The group of announcements is [`Announce::GROUP`].
+/// Returns the last byte of the address of the multicast group that `topic` is sent to. There is one group for each
+/// class of traffic, because switches filter by group and not by port. The group of announcements is
+/// [`Announce::GROUP`].
 pub fn group(topic: Topic) -> u8 {
     topic.spec().group
 }
@@ -294,12 +297,12 @@ const VERSION: u8 = 2;
 const CRC_OFFSET: usize = std::mem::offset_of!(DatagramHead, crc);
 const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISCSI);
 
-// Payloads are sent as they are in memory.
+// Payloads are sent as they are in memory, and the format is little-endian.
 const _: () = assert!(cfg!(target_endian = "little"));
 
-/// Reason why a datagram is refused. The reasons are in the order of the checks, and the first check that fails counts.
-/// [`Datagram::read`] returns those up to the checksum, [`Datagram::check_payload`] the last two, and receivers the
-/// others.
+/// Reason why a datagram is refused. The reasons are in the order of the checks, and a datagram is refused for the
+/// first check that fails. [`Datagram::read`] returns the reasons up to [`Crc`](Self::Crc), [`Datagram::check_payload`]
+/// returns the last two, and receivers add the others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum DatagramError {
     /// Fewer bytes than a header.
@@ -318,22 +321,22 @@ pub enum DatagramError {
     Unauthenticated,
     /// The MAC was not computed with the required key.
     Mac,
-    /// A later epoch of the same gateway is known.
+    /// The epoch is earlier than a known epoch of the same gateway.
     Epoch,
     /// A key is required, and the sensor or topic was not announced within 5 s of this machine's clock. The datagram
-    /// may be a recorded one.
+    /// may have been recorded and sent again.
     Untimely,
-    /// The datagram comes from another sender than the others of this gateway and epoch, and is not known to come from
-    /// the same gateway. A second gateway probably has the same number.
+    /// The other datagrams of this gateway and epoch came from another sender, and this sender is not known to be the
+    /// same gateway. A second gateway probably has the same number.
     Twin,
-    /// The sequence number is older than the window, so it is unknown whether the sample is a duplicate.
+    /// The sequence number is older than the window in which duplicates are detected, so the sample may be a duplicate.
     Stale,
-    /// There is no memory for another gateway that delivers, or for another of its topics.
+    /// There is no memory for another gateway that sends samples, or for another topic of this gateway.
     Capacity,
     /// This version does not have the topic.
     Skipped,
-    /// The payload is shorter than its own counts require, contradicts itself or has no revision, or it is a single
-    /// part.
+    /// The payload is shorter than its own counts require, contradicts itself or has no revision, or the datagram has
+    /// only a part of a sample.
     Payload,
 }
 
@@ -361,7 +364,7 @@ named! {
 pub struct Announce {
     /// Random number of the hub's run.
     pub boot: u64,
-    /// All fields but `boot` are as they are sent.
+    /// All other fields, as they are sent. The `boot` in this head is 0.
     head: AnnounceHead,
     topics: [Announced; MAX_TOPICS],
     /// Number of replaced samples of each topic, if [`AnnounceHead::REPLACED`] is set.
@@ -397,29 +400,29 @@ impl AnnounceHead {
 pub struct Announced {
     /// Number of the topic, as in the header.
     pub topic: u8,
-    /// Last byte of the address of its group.
+    /// Last byte of the address of the topic's group.
     pub group: u8,
-    /// Port that it is sent to.
+    /// Port that the topic is sent to.
     pub port: u16,
-    /// Sequence number that its next datagram will have.
+    /// Sequence number that the topic's next datagram will have.
     pub next: u32,
 }
 
-/// Maximum number of topics of an announcement: 37. That many fit into the shortest datagram that a gateway may be
-/// limited to, with a MAC and the numbers of replaced samples. An announcement is never sent in parts.
+/// Maximum number of topics of an announcement: 37. This is how many fit into a datagram of [`MIN_MTU`] bytes, together
+/// with a MAC and the numbers of replaced samples. An announcement is never sent in parts.
 const MAX_TOPICS: usize =
     (MIN_MTU - HEADER_LEN - MAC_LEN - size_of::<AnnounceHead>()) / (size_of::<Announced>() + 4);
 
 const _: () = assert!(Topic::ALL.len() <= MAX_TOPICS);
 
 impl Announce {
-    /// Topic number of announcements.
+    /// Value of [`Head::topic`] in announcements.
     pub const NUMBER: u8 = 0;
-    /// Last byte of the address of their group.
+    /// Last byte of the address of the multicast group for announcements.
     pub const GROUP: u8 = 80;
 
-    /// Creates an announcement of `sensor`, a sensor of type `kind`, without topics. `boot` identifies the run of its
-    /// hub.
+    /// Creates an announcement of `sensor`, a sensor of type `kind`, without topics. `boot` identifies the run of the
+    /// sensor's hub.
     pub fn new(boot: u64, sensor: &str, kind: &str) -> Announce {
         let mut head = AnnounceHead::zeroed();
         text::write(&mut head.sensor_text, sensor);
@@ -427,7 +430,7 @@ impl Announce {
         Announce { boot, head, topics: [Announced::default(); MAX_TOPICS], replaced: [0; MAX_TOPICS] }
     }
 
-    /// Adds a topic, or ignores it if there are 37 already.
+    /// Adds `topic`, or ignores it if the announcement already has 37 topics.
     pub fn add(&mut self, topic: Announced) {
         if let Some(slot) = self.topics.get_mut(usize::from(self.head.count)) {
             *slot = topic;
@@ -436,7 +439,7 @@ impl Announce {
     }
 
     /// Sets how many samples of the topic that was added last were replaced by newer ones before they got a sequence
-    /// number. The number wraps. Call it for all topics or for none.
+    /// number. The number wraps. Call this function for all topics or for none.
     pub fn add_replaced(&mut self, replaced: u64) {
         if let Some(slot) = self.replaced[..usize::from(self.head.count)].last_mut() {
             *slot = replaced as u32;
@@ -445,7 +448,7 @@ impl Announce {
     }
 
     /// Returns how many samples of the topic with this number were replaced by newer ones before they got a sequence
-    /// number. The number wraps. `None` if the gateway does not report it.
+    /// number. The number wraps. Returns `None` if the gateway does not report this number.
     pub fn replaced(&self, topic: u8) -> Option<u32> {
         let at = self.topics().iter().position(|announced| announced.topic == topic)?;
         self.has_replaced().then(|| self.replaced[at])
@@ -489,7 +492,7 @@ impl Announce {
         &self.topics[..usize::from(self.head.count)]
     }
 
-    /// Writes the payload to the start of `room`. Returns its length, or `None` if there is too little room.
+    /// Writes the payload to the start of `room`. Returns the length of the payload, or `None` if `room` is too short.
     pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
         let replaced = if self.has_replaced() { usize::from(self.head.count) } else { 0 };
         let replaced = cast_slice(&self.replaced[..replaced]);
@@ -497,9 +500,9 @@ impl Announce {
         write(room, &[bytes_of(&head), cast_slice(self.topics()), replaced])
     }
 
-    /// Returns the announcement in `payload`, with its first 37 topics. `None` if it is shorter than its own count
-    /// requires, or if the sensor's name is not valid. Numbers of replaced samples are read only if all topics have
-    /// one.
+    /// Returns the announcement in `payload`, with its first 37 topics. Returns `None` if `payload` is shorter than its
+    /// number of topics requires, or if the sensor's name is not valid. Numbers of replaced samples are read only if
+    /// `payload` has one for each topic.
     pub fn unpack(payload: &[u8]) -> Option<Announce> {
         let head: AnnounceHead = read_head(payload)?;
         let count = usize::from(head.count);
@@ -507,7 +510,8 @@ impl Announce {
             payload[size_of::<AnnounceHead>()..].split_at_checked(count * size_of::<Announced>())?;
         let mut announce =
             Announce::new(head.boot, text::read(&head.sensor_text), text::read(&head.type_text));
-        // A byte that is not UTF-8 ends the text. The name is then rejected.
+        // A byte that is not UTF-8 ends the text that `sensor` returns. The name is then rejected, because the text
+        // ends before the first 0.
         let name_len = head.sensor_text.iter().position(|&byte| byte == 0)?;
         check_sensor(announce.sensor()).ok().filter(|()| announce.sensor().len() == name_len)?;
         let is_reported = head.flags & AnnounceHead::REPLACED != 0 && replaced.len() >= 4 * count;
@@ -643,7 +647,7 @@ mod tests {
         let len = announce.pack(&mut room).expect("it fits");
         assert_eq!((announce.topics().len(), announce.replaced(36)), (37, Some(99)));
         assert_eq!(Announce::unpack(&room[..len]), Some(announce));
-        // A later gateway may announce more.
+        // A gateway of a later version may announce more topics.
         let mut longer = vec![0; 68 + 12 * 255];
         longer[..68].copy_from_slice(&room[..68]);
         longer[64] = 255;

@@ -1,7 +1,7 @@
 //! Families of scanners: their numbers and names, the codes of the SICK LMS 2xx, and the content of topic `telegram`.
 //!
 //! A telegram has the bytes of a scanner in the unit in which its family transmits: one telegram of an LMS from STX to
-//! CRC, or whole packets of another family that arrived together. The hub has checked it before it publishes it.
+//! CRC, or whole packets of another family that arrived together. The hub checks a telegram before publishing it.
 
 use std::f64::consts::TAU;
 use std::ops::{Deref, DerefMut};
@@ -29,7 +29,7 @@ pub enum Family {
 pub struct PacketInfo {
     /// `data`, or `reply` to a request.
     pub kind: &'static str,
-    /// Whether the checksums are correct; `None` if there are none.
+    /// Whether the checksums are correct; `None` if the packets have no checksums.
     pub checked: Option<bool>,
     /// Number of packets.
     pub packets: usize,
@@ -54,9 +54,9 @@ impl Family {
     /// Returns the maximum number of bytes of a telegram, or of packets that are published together.
     pub const fn max_telegram(self) -> usize {
         match self {
-            // Telegram listing: 812 bytes, and two of the checksum.
+            // Telegram listing: 812 bytes, and two more for the checksum.
             Family::Lms => 814,
-            // 10 ms of packets, of an STL27L the most.
+            // The packets of 10 ms. In this family, an STL27L sends the most packets.
             Family::Ld => 17 * LD_PACKET_LEN,
             Family::Rplidar => 800,
         }
@@ -72,7 +72,7 @@ impl Family {
     pub fn packets(self, bytes: &[u8]) -> Option<PacketInfo> {
         match self {
             Family::Lms => None,
-            // The scanner sends no replies, and every published packet had a correct checksum.
+            // An LDROBOT sends no replies, and the hub publishes only packets with a correct checksum.
             Family::Ld => {
                 let packets = bytes.len() / LD_PACKET_LEN;
                 Some(PacketInfo { kind: "data", checked: Some(true), packets })
@@ -88,9 +88,9 @@ impl Family {
 }
 
 impl ScanHead {
-    /// Returns the head of a revolution of a scanner of `family` that rotates clockwise. Its points are assigned to a
-    /// grid of `beams` equal bins, the first one ahead. Ranges are in millimeters, intensities have 8 bits, and angles
-    /// are exact. The caller sets the times.
+    /// Returns the head of a scan of one revolution. The scanner is of `family` and rotates clockwise. The points of
+    /// the revolution are assigned to a grid of `beams` equal bins, and the first bin is straight ahead. Ranges are in
+    /// millimeters, intensities have 8 bits, and angles are exact. The caller sets the times.
     pub fn of_revolution(family: Family, beams: usize) -> ScanHead {
         let step = -TAU / beams.max(1) as f64;
         ScanHead {
@@ -112,14 +112,14 @@ impl ScanHead {
 /// Length of a packet of an LDROBOT (manual of the LD19, "data packet format").
 const LD_PACKET_LEN: usize = 47;
 
-/// Returns the contents of an RPLIDAR's packets or response. Packets of one point have neither a checksum nor a
-/// type. Packets with a head and a correct checksum are of another type (rplidar_sdk, `sl_lidar_cmd.h`).
+/// Returns the contents of an RPLIDAR's packets or response. A packet of one point has neither a checksum nor a type. A
+/// packet of any other type has a head and a checksum, which identify it (rplidar_sdk, `sl_lidar_cmd.h`).
 fn slamtec_packets(bytes: &[u8]) -> PacketInfo {
     const CAPSULE_LENS: [usize; 3] = [84, 132, 170];
     const POINT_LEN: usize = 5;
     const HEAD_LEN: usize = 7;
-    // A packet may start like a response. The head of a response contains the length of the response, unless a stream
-    // follows.
+    // A packet may start with the same bytes as a response, so the length decides, too. The head of a response contains
+    // the length of the rest. If a stream follows, the response is only the head.
     if let Some(&[0xA5, 0x5A, low, middle, high, ..]) = bytes.first_chunk::<HEAD_LEN>() {
         let len = u32::from_le_bytes([low, middle, high, 0]) as usize;
         if bytes.len() == HEAD_LEN || bytes.len() == HEAD_LEN + len {
@@ -140,12 +140,12 @@ fn slamtec_packets(bytes: &[u8]) -> PacketInfo {
 }
 
 impl ScanHead {
-    /// Returns the head of a scan of an LMS. Beam 0 is at `first_angle_mdeg`, and the next one `step_mdeg` further, in
-    /// 1/1000 degree. A step of 1000, 500 or 250 takes 1, 2 or 4 revolutions. Ranges have units of `unit_mm` and
-    /// `range_bits` bits, and their nine highest values are codes.
+    /// Returns the head of a scan of an LMS. Beam 0 is at `first_angle_mdeg`, and each next beam is `step_mdeg`
+    /// further, both in 1/1000 degree. A scan with a step of 1000, 500 or 250 takes 1, 2 or 4 revolutions. Ranges have
+    /// `range_bits` bits and are in units of `unit_mm` mm. Their nine highest values are codes.
     ///
-    /// The stamp is the time at which the LMS starts to send, after the last beam of the last revolution. The upper
-    /// bits are not intensities.
+    /// The stamp is the time at which the LMS starts to send, after the last beam of the last revolution. The head
+    /// states that the upper bits are not intensities.
     pub fn lms(
         count: usize,
         first_angle_mdeg: i32,
@@ -179,8 +179,8 @@ impl ScanHead {
     }
 }
 
-/// Returns the code of `value`, which is not a range, in a scan with `head` (Telegram listing, B0h). Codes 3, 6 and 7
-/// are reserved.
+/// Returns the code of `value`, which is not a range, in a scan with `head` (Telegram listing, B0h). The values 3, 6
+/// and 7 below the highest value are reserved.
 pub(crate) fn lms_code(head: &ScanHead, value: u16) -> Code {
     match head.no_return.checked_sub(value) {
         Some(0) => Code::NoReturn,
@@ -203,7 +203,7 @@ pub(crate) const REFLECTOR_MODE: u8 = 0x01;
 /// Time of one revolution of the mirror (75 Hz).
 const REVOLUTION_NS: u32 = 13_320_000;
 
-/// Bytes that a scanner sent, with names for their fields.
+/// Bytes that a scanner sent, with functions that return the fields of a telegram of an LMS.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Telegram<'a> {
     /// Family of the scanner; `None` if this version does not know it.
@@ -224,9 +224,10 @@ impl<'a> Telegram<'a> {
         max
     };
 
-    /// Returns the telegram at the start of a payload of `family`. The length field of an LMS telegram gives its
-    /// length, and the bytes after it belong to a later revision of the payload. For another family, it is the whole
-    /// payload. Returns `None` if there is no telegram, or if it is longer than [`MAX_LEN`](Self::MAX_LEN).
+    /// Returns the telegram at the start of a payload of `family`. The length field of an LMS telegram gives the
+    /// telegram's length, and the bytes after the telegram belong to a later revision of the payload. For another
+    /// family, the telegram is the whole payload. Returns `None` if there is no telegram, or if it is longer than
+    /// [`MAX_LEN`](Self::MAX_LEN).
     pub fn of(family: u8, payload: &'a [u8]) -> Option<Telegram<'a>> {
         let family = Family::of_number(family);
         let len = match (family, payload) {
@@ -240,7 +241,8 @@ impl<'a> Telegram<'a> {
         Some(Telegram { family, bytes })
     }
 
-    /// Returns whether this is a telegram of an LMS, to which the fields below apply.
+    /// Returns whether this is a telegram of an LMS. Only these telegrams have the fields that the functions below
+    /// return.
     pub fn is_lms(self) -> bool {
         self.family == Some(Family::Lms)
     }
@@ -251,13 +253,13 @@ impl<'a> Telegram<'a> {
     }
 
     /// Returns the address byte: the scanner's address, with 80h added in its replies. Returns 0 if the bytes end
-    /// before it.
+    /// before this field.
     pub fn address(self) -> u8 {
         self.bytes.get(1).copied().unwrap_or_default()
     }
 
     /// Returns the length field, the number of bytes from the command to the status, both included. Returns 0 if the
-    /// bytes end before it.
+    /// bytes end before this field.
     pub fn length(self) -> u16 {
         match self.bytes.get(2..4) {
             Some(bytes) => u16::from_le_bytes([bytes[0], bytes[1]]),
@@ -265,7 +267,7 @@ impl<'a> Telegram<'a> {
         }
     }
 
-    /// Returns the command byte of a request or reply. Returns 0 if the bytes end before it.
+    /// Returns the command byte of a request or reply. Returns 0 if the bytes end before this byte.
     pub fn command(self) -> u8 {
         self.bytes.get(4).copied().unwrap_or_default()
     }

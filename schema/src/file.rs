@@ -1,5 +1,6 @@
 //! The format of a recording: samples as messages of an MCAP file, with a channel for each topic of a sensor. A message
-//! is the header of shared memory, followed by the payload as it is sent over a network (docs/recording.md).
+//! has the sample's header, as in shared memory, and then the payload, as it is sent over a network
+//! (docs/recording.md).
 
 use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};
@@ -19,26 +20,26 @@ pub const ENCODING: &str = "scanhub.v2";
 /// Encoding of recordings of version 1. Header, telegrams, marks, zones and statuses are the same as in version 2; the
 /// other payloads differ.
 pub const ENCODING_V1: &str = "scanhub";
-/// Name of the metadata record at the start of a recording, which describes its origin.
+/// Name of the metadata record at the start of a recording. The record describes the origin of the recording.
 pub const METADATA: &str = "scanhub";
 
-/// Writes a recording into `W`. Every sample before the last [`close_chunk`](Self::close_chunk) can be read even if the
-/// file ends there. Later samples are only in memory.
+/// Writes a recording into `W`. Every sample before the last [`close_chunk`](Self::close_chunk) is in the file, and can
+/// be read even if the file ends after this chunk. Later samples are only in memory.
 pub struct Writer<W: Write> {
     mcap: mcap::Writer<NoSeek<BufWriter<W>>>,
-    /// Channels of each sensor. There are few channels, so a linear search is enough.
+    /// Topics of each sensor, with the IDs of their channels. A sensor has few topics, so a linear search is enough.
     channels: BTreeMap<String, Vec<(Topic, u16)>>,
     message: Vec<u8>,
 }
 
-/// Description of a channel that does not belong to the hub.
+/// Description of a channel for messages of any type, such as messages of ROS 2.
 #[derive(Clone, Copy, Debug)]
 pub struct ForeignChannel<'a> {
     /// Name of the channel.
     pub topic: &'a str,
-    /// Encoding of its messages, such as `cdr`.
+    /// Encoding of the channel's messages, such as `cdr`.
     pub encoding: &'a str,
-    /// Name of their type, its definition, and the language of the definition, such as `ros2msg`.
+    /// Type of the messages: its name, its definition, and the language of the definition, such as `ros2msg`.
     pub schema: (&'a str, &'a str, &'a str),
     /// Metadata of the channel: keys and values.
     pub metadata: &'a [(&'a str, &'a str)],
@@ -69,7 +70,7 @@ impl<W: Write> Writer<W> {
         let options = WriteOptions::new()
             .compression(compression.to_library())
             .compression_level(compression.level())
-            // Chunks are short, and the caller has a thread for writing them.
+            // No threads for compression: chunks are short, and the caller already has a thread for writing.
             .compression_threads(0)
             .profile(profile)
             .library("scanhub")
@@ -149,8 +150,8 @@ impl<W: Write> Writer<W> {
         self.mcap.write_to_known_channel(&header, data).map_err(io_error)
     }
 
-    /// Creates a channel that copies a channel of another file. `schema` has the name, language and definition of its
-    /// messages' type, if there is one.
+    /// Creates a channel that copies a channel of another file. `schema` has the name, language and definition of the
+    /// messages' type, if the channel has a type.
     ///
     /// # Errors
     ///
@@ -217,7 +218,7 @@ impl<W: Write> Writer<W> {
     }
 }
 
-/// Returns header and payload of a message of a recording; `None` if it is shorter than a header.
+/// Returns header and payload of a message of a recording; `None` if the message is shorter than a header.
 pub fn split_message(message: &[u8]) -> Option<(Header, &[u8])> {
     let (header, payload) = message.split_at_checked(size_of::<Header>())?;
     Some((bytemuck::pod_read_unaligned(header), payload))
@@ -238,7 +239,7 @@ fn io_error(error: McapError) -> io::Error {
     }
 }
 
-/// Description of the messages that every recording contains, for readers that have only the file.
+/// Text that describes the format of the messages. Every recording contains it, for readers that have only the file.
 pub const LAYOUT: &str = include_str!("file/layout.txt");
 
 /// Compression of chunks.
@@ -248,7 +249,7 @@ pub enum Compression {
     None,
     /// LZ4.
     Lz4,
-    /// Zstandard, the shortest.
+    /// Zstandard, which makes the shortest files.
     #[default]
     Zstd,
 }
@@ -276,7 +277,7 @@ impl Compression {
         }
     }
 
-    /// Higher levels take many times as long and save a few percent.
+    /// Returns the level of compression. Higher levels take many times as long and save a few percent.
     fn level(self) -> u32 {
         u32::from(self == Compression::Zstd)
     }

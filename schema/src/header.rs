@@ -1,4 +1,5 @@
-//! Header of every sample: sequence numbers that show losses, stamps that relate topics, and the run of the hub.
+//! Header of every sample: sequence numbers whose gaps show missed samples, stamps that relate samples of different
+//! topics, and an ID of the hub's run.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
@@ -47,14 +48,14 @@ pub struct Header {
 
 impl Header {
     /// Returns the time from the telegram's last byte until the sample was sent, in ns, rounded up by at most 256 ns.
-    /// Returns `None` if it is unknown, or 4.3 s or more.
+    /// Returns `None` if the time is unknown, or 4.3 s or more.
     pub fn hub_time_ns(&self) -> Option<u64> {
         let [low, middle, high] = self.hub_time;
         let units = u32::from_le_bytes([low, middle, high, 0]);
         (1..MAX_HUB_TIME).contains(&units).then(|| u64::from(units) * HUB_TIME_UNIT_NS)
     }
 
-    /// Sets the time at which the sample is sent to `now_ns` of CLOCK_MONOTONIC. The telegram's stamps must already be
+    /// Sets `hub_time` of a sample that is sent at `now_ns` of CLOCK_MONOTONIC. The telegram's stamps must already be
     /// set.
     pub fn set_sent_at(&mut self, now_ns: u64) {
         let units = now_ns.saturating_sub(self.stamp_last_ns).div_ceil(HUB_TIME_UNIT_NS);
@@ -68,7 +69,7 @@ impl Header {
         Family::of_number(self.family)
     }
 
-    /// Returns the quality. Unknown values count as suspect.
+    /// Returns the quality; suspect if this version does not know the value.
     ///
     /// # Examples
     ///
@@ -115,11 +116,11 @@ impl Reasons {
     pub const LINE_ERROR: u8 = 1;
     /// The bytes just before the telegram belong to no telegram.
     pub const NEIGHBOUR: u8 = 2;
-    /// The telegram took longer than usual.
+    /// The telegram took longer to arrive than usual.
     pub const SLOW: u8 = 4;
     /// Bits are set that the measuring mode never sets.
     pub const FORBIDDEN_BITS: u8 = 8;
-    /// The header of another telegram started inside.
+    /// The header of another telegram started inside this telegram.
     pub const HEADER_INSIDE: u8 = 16;
 
     /// Returns the names of the bits that are set, as in all output.
@@ -135,7 +136,7 @@ impl Reasons {
     }
 }
 
-/// Flags of a sample, with the same numbers as in datagrams.
+/// Bits of the field `flags` of a header. Datagrams use the same bits.
 pub struct Flags;
 
 impl Flags {

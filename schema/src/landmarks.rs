@@ -56,7 +56,7 @@ impl FixedPayload for Marks {
 }
 
 impl Marks {
-    /// Flag: there were more marks than fit.
+    /// Flag: there were more marks than fit into the sample.
     pub const OVERFLOW: u8 = 1;
     /// Flag: marks are unknown, because the measuring mode has no reflector bits or [`Marks::NO_LEVEL`] is set.
     pub const UNAVAILABLE: u8 = 2;
@@ -69,18 +69,18 @@ impl Marks {
         &self.mark_array[..usize::from(self.count).min(MAX_MARKS)]
     }
 
-    /// Returns whether the sensor sends the data that marks are computed from. Without it, an empty list has no
-    /// meaning.
+    /// Returns whether the sensor sends the data that marks are computed from. If not, an empty list does not mean that
+    /// there are no reflectors.
     pub fn is_available(&self) -> bool {
         self.flags & Marks::UNAVAILABLE == 0
     }
 
-    /// Returns whether only the threshold for reflectors is missing.
+    /// Returns whether marks are unavailable because no threshold for reflectors is configured.
     pub fn lacks_level(&self) -> bool {
         self.flags & Marks::NO_LEVEL != 0
     }
 
-    /// Returns whether there were more marks than fit.
+    /// Returns whether there were more marks than fit into the sample.
     pub fn is_overflow(&self) -> bool {
         self.flags & Marks::OVERFLOW != 0
     }
@@ -104,7 +104,7 @@ pub struct Lines {
     pub reserved: u8,
     /// Number of beams of the scan that have a range.
     pub readings: u16,
-    /// Number of those beams that end on a line.
+    /// Number of beams with a range that end on a line.
     pub on_lines: u16,
     /// Standard deviation of the ranges in meters, estimated from this scan.
     pub noise_m: f32,
@@ -199,7 +199,7 @@ impl Lines {
         &self.corner_array[..usize::from(self.corners).min(MAX_LINES)]
     }
 
-    /// Returns whether there were too many lines.
+    /// Returns whether there were more lines than fit into the sample.
     pub fn is_overflow(&self) -> bool {
         self.flags & Lines::OVERFLOW != 0
     }

@@ -1,5 +1,5 @@
 //! The interface between hub and clients: topics with their payloads and names, and the format of datagrams and
-//! recordings. It makes no system calls: the crate `shm` puts payloads into shared memory.
+//! recordings. This crate makes no system calls: the crate `shm` puts payloads into shared memory.
 
 #![forbid(unsafe_code)]
 
@@ -28,7 +28,7 @@ mod zones;
 mod background_file;
 pub mod limits;
 
-/// The payloads of all topics, with the types of their fields. The client library exports them too.
+/// The payloads of all topics, with the types of their fields. The client library re-exports these types.
 pub mod payloads {
     pub use crate::background::*;
     pub use crate::family::*;

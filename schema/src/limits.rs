@@ -1,19 +1,21 @@
-//! Sizes of all services. They are set explicitly, because the defaults of the shared-memory library (8 subscribers, 20
-//! nodes, 2 samples) are too small, and because the library rejects a subscriber that requests more than the service
-//! was created for.
+//! Sizes of all services. The sizes are set explicitly, because the defaults of the shared-memory library (8
+//! subscribers, 20 nodes, 2 samples) are too small, and because the library rejects a subscriber that requests more
+//! than the service was created for.
 
 use std::ops::RangeInclusive;
 
 use crate::{ArrayFlags, Failure, Family, Kind, Topic};
 
-/// Maximum number of publishers of a topic, which is the hub's link.
+/// Maximum number of publishers of a topic. The publisher is the hub's link, or the program that publishes under the
+/// name of the sensor.
 pub const MAX_PUBLISHERS: usize = 1;
 /// Limits with which the topics of a sensor are created. All other limits are the same for all sensors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TopicLimits {
     /// Maximum number of subscribers of each topic at a time, one of [`TopicLimits::SUBSCRIBERS`]. For each sample, the
-    /// shared-memory library reads all slots three times. The slots are far apart in memory, and each slot has memory
-    /// for the samples that its subscriber may hold. With few subscribers, many slots cost more than the sample itself.
+    /// shared-memory library reads the slots of all possible subscribers three times. The slots are far apart in
+    /// memory, and each slot has memory for the samples that its subscriber may hold. If most slots are unused, reading
+    /// them costs more than the sample itself.
     pub subscribers: usize,
     /// Maximum number of beams of a scan.
     pub beams: usize,
@@ -24,10 +26,11 @@ pub struct TopicLimits {
 }
 
 impl TopicLimits {
-    /// Numbers of subscribers that a topic can be created for. The event that wakes the subscribers has no more slots.
+    /// Permitted values of [`subscribers`](Self::subscribers). The highest one is the number of slots of the wake
+    /// service, which wakes the subscribers of all topics of a sensor.
     pub const SUBSCRIBERS: RangeInclusive<usize> = 1..=MAX_LISTENERS;
 
-    /// Checks that the topics can be created.
+    /// Checks that topics can be created with these limits.
     ///
     /// # Errors
     ///
@@ -43,7 +46,7 @@ impl TopicLimits {
 }
 
 impl Default for TopicLimits {
-    /// Returns the limits of an LMS, with at most 401 beams: 100 degrees in steps of 0.25.
+    /// Returns the limits of an LMS, with at most 401 beams: 100 degrees in steps of 0.25 degrees.
     fn default() -> Self {
         TopicLimits {
             subscribers: 32,
@@ -72,7 +75,7 @@ pub const MAX_CONTROL_CLIENTS: usize = 16;
 /// Maximum number of processes that have the control service open, including dead ones that are not cleaned up yet.
 pub const MAX_CONTROL_NODES: usize = 32;
 
-/// Returns the number of samples that are queued for a subscriber of `topic`.
+/// Returns the maximum number of samples that are queued for a subscriber of `topic`.
 pub const fn queue_len(topic: Topic) -> usize {
     topic.spec().queue_len
 }

@@ -11,8 +11,8 @@ use crate::text::named;
 
 /// The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame.
 ///
-/// The step is the pose of the robot at this scan in the frame that it had at the scan before. The pose is the sum of
-/// all steps since the start: it drifts.
+/// The step is the pose of the robot at this scan, in the robot's frame at the previous scan. The summed pose is the
+/// sum of all steps since the start. It drifts, because the errors of the steps add up.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Motion.v2"))]
 #[repr(C)]
@@ -100,12 +100,12 @@ impl FixedPayload for Motion {
 
 impl Motion {
     /// Flag: the surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance
-    /// is large there.
+    /// is large in this direction.
     pub const DEGENERATE: u8 = 1;
     /// Flag: a step since the start was degenerate, so the summed pose may be off by any distance.
     pub const OPEN: u8 = 2;
 
-    /// Returns the method. An unknown number counts as refused.
+    /// Returns the method; refused if this version does not know its number.
     pub fn method(&self) -> MotionMethod {
         MotionMethod::ALL.get(usize::from(self.method)).copied().unwrap_or(MotionMethod::Refused)
     }
@@ -125,14 +125,15 @@ impl Motion {
         self.has_pose() && self.flags & Motion::OPEN == 0
     }
 
-    /// Returns the covariance of the summed pose; `None` if the pose is not valid, or if the sender's payload has none.
+    /// Returns the covariance of the summed pose; `None` if the pose is not valid, or if the sender's payload has no
+    /// such covariance.
     pub fn sum_covariance(&self) -> Option<&[f32; 9]> {
         let is_first = self.method() == MotionMethod::First;
         let is_reported = is_first || self.pose_covariance != [0.0; 9];
         (self.has_valid_pose() && is_reported).then_some(&self.pose_covariance)
     }
 
-    /// Returns whether the surroundings do not show the motion in some direction.
+    /// Returns whether the surroundings do not show how far the robot moved in some direction.
     pub fn is_degenerate(&self) -> bool {
         self.flags & Motion::DEGENERATE != 0
     }

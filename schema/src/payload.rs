@@ -1,5 +1,6 @@
-//! Payloads in memory and as they are sent over a network: the fields have the same order as in shared memory, and
-//! unused elements of arrays are left out. A received payload is checked against its own counts before it is used.
+//! Conversion of payloads between memory and the form in which they are sent over a network. This form has the fields
+//! in the same order as in shared memory, without the unused elements of arrays. A received payload is checked against
+//! its own counts before it is used.
 //!
 //! Most payloads are structs of fixed size and implement only [`FixedPayload`]. The others have a head of fixed size
 //! and arrays whose length depends on the number of beams. The macro `sliced!` defines them, and they implement
@@ -16,8 +17,9 @@ pub trait DatagramPayload {
     /// Writes the payload to the start of `room`. Returns its length, or `None` if there is too little room.
     fn pack(&self, room: &mut [u8]) -> Option<usize>;
 
-    /// Returns the bytes of memory that `payload` fills. `None` if it is shorter than its own counts
-    /// require or contradicts itself. Bytes after it belong to a later revision.
+    /// Returns the number of bytes of memory that the value in `payload` needs. Returns `None` if `payload` is shorter
+    /// than its own counts require or contradicts itself. More bytes at the end of `payload` belong to a later
+    /// revision.
     fn room(payload: &[u8]) -> Option<usize>;
 
     /// Raises `limits` until a topic that is created with these limits has room for `payload`. [`room`](Self::room)
@@ -27,23 +29,23 @@ pub trait DatagramPayload {
     }
 
     /// Replaces the value by `payload`, for which [`room`](Self::room) returned `room`. Returns `false`, and leaves the
-    /// value undefined, if there is too little memory.
+    /// value undefined, if the value has too little memory.
     #[must_use]
     fn fill(&mut self, payload: &[u8], room: usize) -> bool;
 
-    /// Replaces `target` by a value with memory for `room` bytes if it has less.
+    /// Replaces `target` by a value with memory for `room` bytes if `target` has less memory.
     fn make_room(target: &mut Box<Self>, room: usize) {
         let _ = (target, room);
     }
 
-    /// Replaces the value by `payload`. Returns `false`, and leaves the value undefined, if `payload` has no
-    /// [`room`](Self::room) or there is too little memory.
+    /// Replaces the value by `payload`. Returns `false`, and leaves the value undefined, if [`room`](Self::room)
+    /// returns `None` for `payload` or the value has too little memory.
     #[must_use]
     fn unpack(&mut self, payload: &[u8]) -> bool {
         Self::room(payload).is_some_and(|room| self.fill(payload, room))
     }
 
-    /// Does the same as [`unpack`](Self::unpack), and makes `target` longer if it is too short.
+    /// Does the same as [`unpack`](Self::unpack), and makes `target` longer if `target` is too short.
     #[must_use]
     fn unpack_into(target: &mut Box<Self>, payload: &[u8]) -> bool {
         Self::room(payload).is_some_and(|room| {
@@ -57,10 +59,11 @@ pub trait DatagramPayload {
 pub trait FixedPayload: Pod {
     /// Arrays at the end of the struct. A datagram has only their used elements.
     const ARRAYS: &'static [UsedElements] = &[];
-    /// Length in bytes of the first revision. Fields that it does not have are read as 0.
+    /// Length in bytes of the first revision. In a payload of the first revision, fields that were added later are read
+    /// as 0.
     const FIRST_REVISION_LEN: usize = size_of::<Self>();
 
-    /// Returns whether the values do not contradict each other and all numbers that must be finite are.
+    /// Returns whether the values are consistent, and all numbers that must be finite are finite.
     fn is_valid(&self) -> bool {
         true
     }
@@ -75,7 +78,7 @@ pub struct UsedElements {
     pub element: usize,
     /// Number of elements in the struct.
     pub max: usize,
-    /// Offset of the number of used elements, which is one byte.
+    /// Offset of the field with the number of used elements. The field has one byte.
     pub count_at: usize,
 }
 
@@ -118,7 +121,7 @@ impl<P: FixedPayload> DatagramPayload for P {
 }
 
 /// Copies the fields in `payload` into `memory`. Returns `None` if `payload` is too short, or has more elements than
-/// the struct.
+/// the array in the struct.
 fn unpack_fields<P: FixedPayload>(memory: &mut [u8], payload: &[u8]) -> Option<()> {
     let whole = if payload.len() < memory.len() { P::FIRST_REVISION_LEN } else { memory.len() };
     let head = P::ARRAYS.first().map_or(whole, |array| array.at);
@@ -165,13 +168,13 @@ macro_rules! packed_as_is {
 pub(crate) use packed_as_is;
 
 impl<'a> Datagram<'a> {
-    /// Returns the payload as a telegram, if the topic is `telegram` and the payload is a telegram of the sensor's
-    /// family.
+    /// Returns the payload as a telegram of the sensor's family, or `None` if the payload is not a telegram. The topic
+    /// must be `telegram`; this is not checked here.
     pub fn telegram(&self) -> Option<Telegram<'a>> {
         Telegram::of(self.head.family, self.payload)
     }
 
-    /// Returns the announcement, if the payload is a valid announcement.
+    /// Returns the announcement in the payload, or `None` if the datagram is not a valid announcement.
     pub fn announce(&self) -> Option<Announce> {
         let is_announcement = self.head.topic == Announce::NUMBER && self.is_versioned();
         if is_announcement { Announce::unpack(self.payload) } else { None }
@@ -182,13 +185,13 @@ impl<'a> Datagram<'a> {
         self.head.revision > 0 && self.head.parts == 1
     }
 
-    /// Checks that the topic is known, and that the payload is valid for it. Returns the bytes of memory that the
-    /// payload fills, as [`DatagramPayload::room`] does. They are 0 for an announcement.
+    /// Checks that this version has the topic, and that the payload is valid for this topic. Returns the number of
+    /// bytes of memory that the payload needs, as [`DatagramPayload::room`] does. The number is 0 for an announcement.
     ///
     /// # Errors
     ///
     /// Returns [`DatagramError::Skipped`] if this version does not have the topic, and [`DatagramError::Payload`] if
-    /// the payload is not valid for it.
+    /// the payload is not valid for this topic.
     pub fn check_payload(&self) -> Result<usize, DatagramError> {
         let room = match Topic::of_number(self.head.topic) {
             None if self.head.topic == Announce::NUMBER => self.announce().map(|_| 0),
@@ -202,7 +205,8 @@ impl<'a> Datagram<'a> {
 
 macro_rules! rooms {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        /// Returns the bytes of memory that the payload of `topic` fills, or `None` if it is not valid.
+        /// Returns the number of bytes of memory that the payload of `topic` needs, or `None` if the payload is not
+        /// valid.
         fn room(topic: Topic, payload: &[u8]) -> Option<usize> {
             match topic { $(Topic::$topic => <crate::payload_type!($payload)>::room(payload),)* }
         }
@@ -235,7 +239,7 @@ impl DatagramPayload for [u8] {
     }
 }
 
-/// Returns the head that `payload` starts with, or `None` if it is too short.
+/// Returns the head that `payload` starts with, or `None` if `payload` is too short.
 pub(crate) fn read_head<H: Pod>(payload: &[u8]) -> Option<H> {
     payload.get(..size_of::<H>()).map(pod_read_unaligned)
 }
@@ -245,7 +249,8 @@ pub(crate) fn are_finite<'a, N: Copy + Into<f64> + 'a>(numbers: impl IntoIterato
     numbers.into_iter().all(|&number| number.into().is_finite())
 }
 
-/// Writes `parts` one after the other. Returns their total length.
+/// Writes `parts` one after the other to the start of `room`. Returns their total length, or `None` if `room` is too
+/// short.
 pub(crate) fn write(room: &mut [u8], parts: &[&[u8]]) -> Option<usize> {
     let mut end = 0;
     for part in parts {
@@ -255,7 +260,8 @@ pub(crate) fn write(room: &mut [u8], parts: &[&[u8]]) -> Option<usize> {
     Some(end)
 }
 
-/// Defines the type of a payload and the type of its words, whose name identifies it to the shared-memory library.
+/// Defines the type of a payload and the type of the words that the payload consists of. The shared-memory library
+/// identifies the payload by the name of the words' type.
 macro_rules! sliced {
     ($(#[$about:meta])* $payload:ident, $word:ident, $name:tt, $head:ident) => {
         #[doc = concat!("Eight bytes of a [`", stringify!($payload), "`].")]
@@ -275,7 +281,7 @@ macro_rules! sliced {
             /// Bytes before the arrays.
             pub const HEAD: usize = size_of::<$head>();
 
-            /// Returns a payload with memory for `len` bytes, at least a head, filled with 0.
+            /// Returns a payload filled with 0. It has memory for `len` bytes, and at least for a head.
             pub fn zeroed(len: usize) -> Box<Self> {
                 let words = vec![$word::default(); Self::words(len)].into_boxed_slice();
                 bytemuck::allocation::TransparentWrapperAlloc::wrap_box(words)
@@ -302,21 +308,21 @@ macro_rules! sliced {
                 Self::of_bytes(self.bytes())
             }
 
-            /// Returns a copy of `bytes`, which [`bytes`](Self::bytes) returned.
+            /// Returns a payload with a copy of `bytes`. The caller got `bytes` from [`bytes`](Self::bytes).
             pub fn of_bytes(bytes: &[u8]) -> Box<Self> {
                 let mut copy = Self::zeroed(bytes.len());
                 copy.copy_from(bytes);
                 copy
             }
 
-            /// Replaces `payload` by a payload of `len` bytes, filled with 0, if it has memory for fewer bytes.
+            /// Replaces `payload` by a payload of `len` bytes, filled with 0, if `payload` has memory for fewer bytes.
             pub fn grow(payload: &mut Box<Self>, len: usize) {
                 if payload.capacity() < len {
                     *payload = Self::zeroed(len);
                 }
             }
 
-            /// Returns the number of bytes that there is memory for.
+            /// Returns the number of bytes that the payload has memory for.
             pub fn capacity(&self) -> usize {
                 self.memory().len()
             }
@@ -327,7 +333,7 @@ macro_rules! sliced {
                 memory.get(..self.used()).unwrap_or(memory)
             }
 
-            /// Writes `bytes` to the start of the payload. Returns `false` if there is too little memory.
+            /// Writes `bytes` to the start of the payload. Returns `false` if the payload has too little memory.
             pub fn copy_from(&mut self, bytes: &[u8]) -> bool {
                 let memory = self.memory_mut().get_mut(..bytes.len());
                 memory.map(|memory| memory.copy_from_slice(bytes)).is_some()
@@ -347,7 +353,8 @@ macro_rules! sliced {
 
             fn deref(&self) -> &$head {
                 const NONE: [$word; size_of::<$head>() / size_of::<$word>()] = [$word { word: 0 }; size_of::<$head>() / size_of::<$word>()];
-                // A sample of an unknown publisher may be shorter than a head. The sample then has no beams.
+                // A sample of an unknown publisher may be shorter than a head. The head is then read as zeros, so the
+                // sample has no beams.
                 let head = self.memory().get(..Self::HEAD);
                 bytemuck::from_bytes(head.unwrap_or(bytemuck::cast_slice(&NONE)))
             }

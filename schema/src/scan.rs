@@ -54,7 +54,7 @@ pub struct ScanHead {
     pub valid_to: u16,
     /// Code of a beam without an echo.
     pub no_return: u16,
-    /// Code of an echo from beyond the range limit; [`no_return`](Self::no_return) if the family has none.
+    /// Code of an echo from beyond the range limit; [`no_return`](Self::no_return) if the family has no such code.
     pub beyond: u16,
     /// Number of points that were dropped because another point has the same beam; also points without a return.
     pub collisions: u16,
@@ -64,13 +64,13 @@ pub struct ScanHead {
     pub flags: u8,
     /// Arrays that follow the head: [`ArrayFlags`].
     pub contents: u8,
-    /// Bits of an intensity; 0 if there are none.
+    /// Bits of an intensity; 0 if the scan has no intensities.
     pub intensity_bits: u8,
     /// Number of revolutions in the scan: beam i is from revolution i modulo this number. 0 means 1.
     pub turns: u8,
     /// 0.
     pub reserved: u8,
-    /// Time of a revolution in ns if there are several; otherwise 0.
+    /// Time of a revolution in ns if the scan took several revolutions; otherwise 0.
     pub turn_ns: u32,
     /// 0.
     pub reserved2: [u8; 12],
@@ -146,7 +146,7 @@ impl Scan {
     ///
     /// # Panics
     ///
-    /// Panics if the memory is too short for them.
+    /// Panics if the memory is too short for the head and the arrays.
     pub fn begin(&mut self, head: ScanHead) -> ScanArrays<'_> {
         **self = head;
         let (n, contents) = (usize::from(head.count), head.contents);
@@ -201,14 +201,14 @@ impl Scan {
         }
     }
 
-    /// Returns the exact angles in radians, one for each beam, NaN if nothing was measured. Empty if
-    /// [`angle`](Self::angle) of the grid is exact.
+    /// Returns the exact angles in radians, one for each beam, NaN if nothing was measured. Empty if the scan has no
+    /// exact angles, because the angles of the grid are exact.
     #[inline]
     pub fn exact_angles(&self) -> &[f32] {
         if self.has(ArrayFlags::ANGLES) { self.array(0, 4) } else { &[] }
     }
 
-    /// Returns the number of beams: `count`, or a lower number if there is memory for fewer beams only.
+    /// Returns the number of beams: `count`, or a lower number if the payload has memory for fewer beams only.
     #[inline]
     pub fn beams(&self) -> usize {
         let room = self.memory().len().saturating_sub(Scan::HEAD) / total_bytes_per_beam(self.contents);
@@ -285,7 +285,7 @@ impl Scan {
         Scan::len(self.beams(), self.contents)
     }
 
-    /// Returns the length of the scan in a datagram's payload, or `None` if it is not valid.
+    /// Returns the length in bytes of the scan in a datagram's payload, or `None` if the scan is not valid.
     fn packed_len(payload: &[u8]) -> Option<usize> {
         let head: ScanHead = read_head(payload)?;
         let len = Scan::len(head.count.into(), head.contents);
@@ -320,7 +320,7 @@ impl Intensities<'_> {
         self.len() == 0
     }
 
-    /// Returns the intensity of beam `i`.
+    /// Returns the intensity of beam `i`, or `None` if the scan has no intensity for this beam.
     pub fn get(&self, i: usize) -> Option<u16> {
         match self {
             Intensities::Narrow(values) => values.get(i).map(|&value| value.into()),
@@ -340,13 +340,15 @@ pub fn in_degrees(radians: f64) -> f64 {
     (radians.to_degrees() * 1e6).round() / 1e6 + 0.0
 }
 
-/// Returns `radians` in 1/1000 degree, from -180,000 to below 180,000, as sectors are configured.
+/// Returns `radians` in 1/1000 degree, from -180,000 to below 180,000. The configuration gives sectors in this unit and
+/// range.
 pub fn in_sector_mdeg(radians: f64) -> i32 {
     let mdeg = (1000.0 * in_degrees(radians)).round() as i64 % 360_000;
     ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
-/// Bit for the ranges, which every scan has, alongside [`ArrayFlags`].
+/// Bit for the array of ranges, in addition to the bits of [`ArrayFlags`]. [`ScanHead::contents`] does not have this
+/// bit, because every scan has ranges.
 const RANGES: u8 = 0x80;
 
 /// Returns the number of bytes that a beam has in the arrays of `contents`.
@@ -366,8 +368,8 @@ const fn total_bytes_per_beam(contents: u8) -> usize {
     bytes_per_beam(contents & ArrayFlags::ALL | RANGES)
 }
 
-/// Reason why a beam has no valid reading. Its value is above the ranges. An LMS has its own values, and all other
-/// families have the same values at the upper end.
+/// Reason why a beam has no valid reading. In the array of ranges, a code has a value above the highest range. An LMS
+/// has its own values for the codes. All other families share the values of [`Code::value`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Code {
     /// Nothing was measured.
@@ -380,7 +382,7 @@ pub enum Code {
     TooNear,
     /// The receiver was dazzled.
     TooBright,
-    /// The signal is too weak for the noise.
+    /// The signal is too weak in comparison with the noise.
     Weak,
     /// The measurement overflowed.
     Overflow,
@@ -389,7 +391,7 @@ pub enum Code {
 }
 
 impl Code {
-    /// Returns the name in all output.
+    /// Returns the code's name, which all commands print.
     pub fn name(self) -> &'static str {
         match self {
             Code::NotMeasured => "not_measured",
@@ -474,7 +476,7 @@ mod tests {
     fn count_beyond_the_memory_is_cut() {
         let mut scan = revolution();
         scan.count = u16::MAX;
-        // 32 bytes after the head, in whole words.
+        // The memory consists of whole words, so it has 32 bytes after the head, enough for 3 beams of 9 bytes.
         assert_eq!((scan.ranges().len(), scan.upper().len(), scan.exact_angles().len()), (3, 3, 3));
         assert_eq!(Scan::of_words(&[]).beams(), 0, "a stranger's");
     }

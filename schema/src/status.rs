@@ -12,7 +12,7 @@ use crate::payload::FixedPayload;
 use crate::text::named;
 use crate::{Family, text};
 
-/// Room for counters in a [`Status`]; new ones append.
+/// Maximum number of counters in a [`Status`]. New counters are appended to those that have names.
 pub const MAX_COUNTERS: usize = 28;
 
 /// The payload of topic `status`, 592 bytes: published every second and on every change.
@@ -32,7 +32,7 @@ pub struct Status {
     pub baud: u32,
     /// Stamp of the start of the state, in ns.
     pub since_ns: u64,
-    /// Scans per second in 1/1000; 0 while they are not measured. See [`Status::rate_hz`].
+    /// Scans per second, in units of 1/1000; 0 while the rate is not measured. See [`Status::rate_hz`].
     pub rate_mhz: u32,
     /// Field of view in degrees: 100 or 180; 0 if unknown.
     pub angle_deg: u16,
@@ -60,10 +60,10 @@ impl Default for Status {
 impl FixedPayload for Status {}
 
 impl Status {
-    /// The measuring mode as long as the sensor has not reported it.
+    /// Value of `mode` while the sensor has not reported its measuring mode.
     pub const MODE_UNKNOWN: u8 = 0xFF;
 
-    /// Returns the state, or `None` if it comes from a newer hub and this program does not know it.
+    /// Returns the state, or `None` if this version does not know the state, for example because the hub is newer.
     pub fn state(&self) -> Option<State> {
         State::ALL.get(usize::from(self.state)).copied()
     }
@@ -74,8 +74,9 @@ impl Status {
         (self.mode != Status::MODE_UNKNOWN).then(|| has_reflector_bits(self.mode))
     }
 
-    /// Returns the measuring mode that would give the scanner reflector bits. `None` if it has them, if its mode is
-    /// unknown, or if it is a recording. The mode is in the scanner's EEPROM, which only a person changes.
+    /// Returns the measuring mode in which the scanner would send reflector bits. Returns `None` if the scanner already
+    /// sends them, if its mode is unknown, or if the sensor is a recording. The mode is in the scanner's EEPROM, which
+    /// only a person changes.
     pub fn missing_reflector_mode(&self) -> Option<u8> {
         let is_missing = self.has_reflector_bits() == Some(false) && !self.is_replayed();
         is_missing.then_some(REFLECTOR_MODE)
@@ -93,8 +94,8 @@ impl Status {
         self.pose.reserved[0] = if has_mark_level { MARK_LEVEL } else { 0 };
     }
 
-    /// Returns whether topic `marks` is available: with the reflector bits of an LMS, and with the threshold for
-    /// reflectors of every other scanner. `None` while the family or the measuring mode is unknown.
+    /// Returns whether topic `marks` is available. An LMS must send reflector bits. For every other scanner, a
+    /// threshold for reflectors must be configured. `None` while the family or the measuring mode is unknown.
     pub fn has_marks(&self) -> Option<bool> {
         if self.family()?.has_reflector_levels() {
             self.has_reflector_bits()
@@ -103,31 +104,34 @@ impl Status {
         }
     }
 
-    /// Returns the scans per second. Returns `None` while a stream that just started has not been measured.
+    /// Returns the scans per second. Returns `None` while the rate of a stream that just started has not been measured.
     pub fn rate_hz(&self) -> Option<f64> {
         let is_measured = self.rate_mhz != 0 || self.state() != Some(State::Streaming);
         is_measured.then(|| f64::from(self.rate_mhz) / 1000.0)
     }
 
-    /// Returns the fraction of the line's bytes that were damaged in the last 10 s, 0 to 1: bytes outside telegrams
-    /// while a stream arrived, except those of scans that the scanner broke off for a reply.
+    /// Returns the fraction of the line's bytes that were damaged in the last 10 s, 0 to 1. Damaged bytes are the bytes
+    /// outside telegrams that arrived during a stream. Bytes of scans that the scanner broke off to send a reply are
+    /// not included.
     pub fn damaged_share(&self) -> f64 {
         self.counters[Counter::DamagedPpm] as f64 / 1e6
     }
 
     /// Returns the number of scans of an LMS, or of packets of another scanner, that must have been sent but did not
-    /// arrive. Returns `None` if it is unknown.
+    /// arrive. Returns `None` if this number is unknown.
     pub fn lost_on_line(&self) -> Option<u64> {
         (self.counters[Counter::DueOnLine] > 0).then_some(self.counters[Counter::LostOnLine])
     }
 
-    /// Returns the fraction of the scans or packets due in the last 10 s that were lost, 0 to 1.
+    /// Returns the fraction of the scans or packets due in the last 10 s that were lost, 0 to 1. Returns `None` if this
+    /// fraction is unknown.
     pub fn lost_share(&self) -> Option<f64> {
         self.lost_on_line().map(|_| self.counters[Counter::LostPpm] as f64 / 1e6)
     }
 
-    /// Returns the loss of the line as text, such as `41 % lost on the line`, if it exceeded a thousandth in the last
-    /// 10 s.
+    /// Returns the share of lost scans or packets as text, such as `41 % lost on the line`, if this share exceeded a
+    /// thousandth in the last 10 s. Otherwise, returns the share of damaged bytes in the same way, or `None` if this
+    /// share did not exceed a thousandth either.
     pub fn line_loss(&self) -> Option<String> {
         let lost = self.lost_share().filter(|&share| share > LOSS_REPORT_THRESHOLD);
         let damaged = Some(self.damaged_share()).filter(|&share| share > LOSS_REPORT_THRESHOLD);
@@ -136,9 +140,9 @@ impl Status {
         Some(format!("{percent:.digits$} % {word} on the line"))
     }
 
-    /// Returns the number of discarded bytes and of all bytes since the hub's start, if most bytes were in no telegram,
-    /// telegrams have arrived before, and the hub searches for the scanner again. Before the first telegram, the bytes
-    /// may come from another scanner and mean nothing.
+    /// Returns the number of discarded bytes and of all bytes since the hub's start. Returns them only if most bytes
+    /// were in no telegram, telegrams have arrived before, and the hub searches for the scanner again; otherwise
+    /// `None`. Before the first telegram, these numbers mean nothing, because the bytes may come from another scanner.
     pub fn discarded_and_read(&self) -> Option<(u64, u64)> {
         let (discarded, read) = (self.counters[Counter::BytesDiscarded], self.counters[Counter::BytesRead]);
         let has_replied = self.counters[Counter::Telegrams] > 0;
@@ -151,7 +155,7 @@ impl Status {
         model.starts_with("0x")
     }
 
-    /// Returns `model` for text. A model that scanhub does not know has only a number.
+    /// Returns `model` as shown to a user. A model that scanhub does not know is a number, and is shown as unknown.
     pub fn display_model(model: &str) -> String {
         if Status::is_model_number(model) { format!("{model} (unknown)") } else { model.to_owned() }
     }
@@ -167,26 +171,27 @@ impl Status {
         Family::of_number(self.family)
     }
 
-    /// Returns the scanner's model in lower case. `None` if it is unknown.
+    /// Returns the scanner's model in lower case, or `None` if the model is unknown.
     pub fn model(&self) -> Option<String> {
         self.reported_model().map(str::to_lowercase)
     }
 
-    /// Returns the scanner's model as the scanner writes it: the first word of its type. `None` if it is unknown.
+    /// Returns the scanner's model as the scanner reports it: the first word of its type. Returns `None` if the model
+    /// is unknown.
     pub fn reported_model(&self) -> Option<&str> {
         let word = self.sensor_type().split(|c: char| c == ';' || c.is_whitespace()).next();
         word.filter(|word| !word.is_empty())
     }
 
-    /// Returns the scan mode of a scanner whose modes have names: the second word of its type. Returns `None` if it is
-    /// unknown.
+    /// Returns the scan mode of a scanner whose modes have names: the second word of its type. Returns `None` if the
+    /// scan mode is unknown.
     pub fn mode_name(&self) -> Option<&str> {
         let is_named = self.family().is_some_and(|family| family != Family::Lms);
         let word = self.sensor_type().split_whitespace().nth(1).filter(|_| is_named)?;
         word.starts_with(|c: char| c.is_ascii_lowercase()).then_some(word)
     }
 
-    /// Returns what [`lost_on_line`](Self::lost_on_line) counts: scans or packets.
+    /// Returns the unit of [`lost_on_line`](Self::lost_on_line): `scans` or `packets`.
     pub fn transmission_name(&self) -> &'static str {
         if self.family() == Some(Family::Lms) { "scans" } else { "packets" }
     }
@@ -225,7 +230,7 @@ impl Status {
     }
 }
 
-/// Fraction of losses above which a line is reported as faulty.
+/// Fraction of lost scans or packets, or of damaged bytes, above which [`Status::line_loss`] reports it.
 const LOSS_REPORT_THRESHOLD: f64 = 0.001;
 
 /// Flag in the first reserved byte of the pose: a threshold for reflectors is configured.
@@ -269,7 +274,7 @@ named! {
 pub struct Counters(pub [u64; MAX_COUNTERS]);
 
 impl Counters {
-    /// Returns name and value of every counter that has a name, in their order.
+    /// Returns name and value of every counter that has a name, in the order of [`Counter::ALL`].
     pub fn named_values(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
         Counter::ALL.iter().map(|&counter| (counter.name(), self[counter]))
     }
@@ -292,7 +297,7 @@ impl IndexMut<Counter> for Counters {
 /// Declares the counters. Each line has the variant, its name and its meaning.
 macro_rules! counters {
     ($($variant:ident $name:literal $meaning:literal,)*) => {
-        /// Name of a counter. The number is its index in [`Counters`].
+        /// A counter. Its number is its index in [`Counters`].
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         #[repr(usize)]
         pub enum Counter { $(#[doc = $meaning] $variant,)* }
@@ -354,7 +359,7 @@ pub struct Pose {
     pub yaw_rad: f64,
     /// 1 if the sensor is mounted upside down, so that its first beam is the leftmost.
     pub upside_down: u8,
-    /// 0. In a status, the first one is 1 if a threshold for reflectors (`marks.level`) is configured.
+    /// 0. In a status, the first byte is 1 if a threshold for reflectors (`marks.level`) is configured.
     pub reserved: [u8; 7],
 }
 

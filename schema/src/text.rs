@@ -1,8 +1,8 @@
 //! Text in fixed-size fields of payloads, text for a terminal, and failures as users see them.
 //!
-//! A field has UTF-8, padded with 0, and is cut at a character boundary if the text is too long. Names and errors may
-//! come from another machine, and must not move the cursor of a terminal or change its colors. All output is written
-//! through [`Printable`] or [`escape_json`].
+//! A field has UTF-8, padded with 0. A text that is too long for its field is cut at a character boundary. Names and
+//! errors may come from another machine, and must not move the cursor of a terminal or change its colors. All output is
+//! written through [`Printable`] or [`escape_json`].
 
 use std::fmt::{self, Write};
 
@@ -25,14 +25,15 @@ pub(crate) fn read(field: &[u8]) -> &str {
     }
 }
 
-/// Defines the names of an enum's values, in the order of their numbers: `ALL` and `name`.
+/// Defines `ALL`, which has the values of an enum in the order of their numbers, and `name`, which returns the name of
+/// a value.
 macro_rules! named {
     ($type:ident: $($variant:ident $name:literal,)*) => {
         impl $type {
             /// All values, in the order of their numbers.
             pub const ALL: [$type; [$($name),*].len()] = [$($type::$variant),*];
 
-            /// Returns the name in all output.
+            /// Returns the value's name, which all commands print.
             pub const fn name(self) -> &'static str {
                 match self { $($type::$variant => $name,)* }
             }
@@ -52,8 +53,8 @@ impl fmt::Display for Printable<'_> {
     }
 }
 
-/// Replaces DEL and C1, which JSON allows but a terminal executes, by `\u` and four digits. They have the same meaning
-/// in JSON. Writers of JSON always escape C0.
+/// Replaces DEL and C1, which JSON allows but a terminal executes, by `\u` and four digits, which have the same meaning
+/// in JSON. C0 is not replaced here, because writers of JSON always escape it.
 pub fn escape_json(line: &mut Vec<u8>) {
     let code = |at: usize, line: &[u8]| match line[at] {
         0x7f => Some((1, 0x7f)),
@@ -79,7 +80,7 @@ pub fn json_line(line: String) -> String {
     String::from_utf8(line).unwrap_or_default()
 }
 
-/// Kinds of failure. Each has a name for `--json` and an exit code.
+/// Kinds of failure. Each kind has a name for `--json` and an exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Kind {
@@ -94,7 +95,8 @@ pub enum Kind {
     DomainHeld,
     /// Another process publishes under the name: exit 75.
     NameHeld,
-    /// Syntax of the command line, a topic that there is not, or a form that the verb does not take: exit 2.
+    /// The command line has a wrong syntax, a topic that does not exist, or a format that the verb does not support:
+    /// exit 2.
     Usage,
     /// No hub runs in the domain: exit 3.
     NoHub,
@@ -104,25 +106,25 @@ pub enum Kind {
     Timeout,
     /// The port does not exist: exit 4.
     PortMissing,
-    /// The port may not be opened by this user: exit 4.
+    /// This user may not open the port: exit 4.
     PortPermission,
     /// Another process has the port: exit 4.
     PortBusy,
     /// The path is not a serial line: exit 4.
     PortNotTty,
-    /// The port cannot do the rate: exit 4.
+    /// The port does not support the baud rate: exit 4.
     PortRate,
     /// A check failed (telegrams lost, a limit exceeded): exit 5.
     Check,
-    /// A file to read is missing, unreadable, or not what it has to be: exit 66.
+    /// A file to read is missing, cannot be read, or has the wrong content: exit 66.
     Input,
-    /// A file to write exists, or cannot be made: exit 73.
+    /// A file to write exists already, or cannot be created: exit 73.
     Output,
-    /// Shared memory or descriptors are short, try later: exit 75.
+    /// There is too little shared memory, or there are too few descriptors; a later attempt may succeed: exit 75.
     ResourceExhausted,
-    /// A value in the configuration, in `--set` or in `--link`: exit 78.
+    /// A value in the configuration, in `--set` or in `--link` is not valid: exit 78.
     Configuration,
-    /// Interrupted before a bounded run was through: exit 130.
+    /// The program was interrupted before a run of limited length was complete: exit 130.
     Interrupted,
 }
 
@@ -175,14 +177,14 @@ impl Kind {
 pub struct Failure {
     /// Kind of the failure.
     pub kind: Kind,
-    /// Message with the location of the error and the value.
+    /// Message that states where the error is, and which value caused it.
     pub message: String,
     /// Remedy; may be empty.
     pub hint: String,
 }
 
 impl Failure {
-    /// Returns a failure of `kind` that says `message`, with the remedy `hint`.
+    /// Returns a failure of `kind` with this message, and with `hint` as its remedy.
     pub fn new(kind: Kind, message: impl Into<String>, hint: impl Into<String>) -> Self {
         Failure { kind, message: message.into(), hint: hint.into() }
     }

@@ -149,7 +149,7 @@ impl Cloud {
     ///
     /// # Panics
     ///
-    /// Panics if the memory is too short for them.
+    /// Panics if the memory is too short for the head and the points.
     pub fn begin(&mut self, head: CloudHead) -> &mut [CloudPoint] {
         **self = head;
         cast_slice_mut(&mut self.memory_mut()[Cloud::HEAD..Cloud::len(head.count.into())])
@@ -171,7 +171,7 @@ impl Cloud {
         Cloud::len(self.points().len())
     }
 
-    /// Returns the length of the cloud in a datagram's payload, or `None` if it is not valid.
+    /// Returns the length in bytes of the cloud in a datagram's payload, or `None` if the cloud is not valid.
     fn packed_len(payload: &[u8]) -> Option<usize> {
         let count = usize::from(read_head::<CloudHead>(payload)?.count);
         let points = payload.get(Cloud::HEAD..Cloud::len(count)).filter(|_| count <= MAX_BEAMS)?;
@@ -209,8 +209,7 @@ impl fmt::Debug for Cloud {
 #[derive(Clone, Debug, Default)]
 pub struct SweepPoints {
     points: Vec<CloudPoint>,
-    /// Run of the publisher, and number of the next sample of this sweep. `None` while waiting for the first sample of
-    /// a sweep.
+    /// `boot` and `topic_seq` of the next sample of this sweep. `None` while no sweep is being gathered.
     next: Option<(u64, u64)>,
 }
 
@@ -242,7 +241,8 @@ impl SweepPoints {
 /// Maximum number of obstacles of a sweep.
 pub const MAX_OBSTACLES: usize = 64;
 
-/// The payload of topic `obstacles`, 3088 bytes: the obstacles of one sweep. It is published even if there are none.
+/// The payload of topic `obstacles`, 3088 bytes: the obstacles of one sweep. The sample is published even if there are
+/// no obstacles.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Obstacles.v2"))]
 #[repr(C)]
@@ -251,7 +251,7 @@ pub struct Obstacles {
     pub sweep: u32,
     /// Generation of the background, as in topic `cloud`.
     pub generation: u32,
-    /// Number of obstacles that did not fit.
+    /// Number of obstacles that did not fit into the sample.
     pub dropped: u32,
     /// Number of obstacles, at most [`MAX_OBSTACLES`].
     pub count: u8,
@@ -368,7 +368,8 @@ mod tests {
         assert_eq!(CloudPoint { point_class: 4, ..CloudPoint::default() }.class(), PointClass::Unknown);
     }
 
-    /// Returns the number of points of each complete sweep. A sample has a number, flags and a count of points.
+    /// Returns the number of points of each complete sweep. `samples` has the sequence number, the flags and the number
+    /// of points of each sample.
     fn complete_sweeps(sweep: &mut SweepPoints, samples: &[(u64, u8, usize)]) -> Vec<usize> {
         let mut whole = Vec::new();
         for &(topic_seq, flags, count) in samples {

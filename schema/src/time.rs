@@ -16,9 +16,9 @@ pub const fn line_time(bytes: usize, baud: u32) -> Nanos {
     bytes as u64 * 10 * 1_000_000_000 / baud as u64
 }
 
-/// Minimum time from the first to the last sample of a rate. Samples from the history of a topic, or samples that
-/// waited for a subscriber, arrive within microseconds. A rate that is computed from these samples would be
-/// meaningless.
+/// Minimum time from the first to the last of the samples from which a rate is computed. Samples from the history of a
+/// topic, or samples that waited for a subscriber, arrive within microseconds. A rate that is computed from such a
+/// short time would be meaningless.
 pub const MIN_RATE_SPAN: Duration = Duration::from_millis(200);
 
 /// Returns the samples per second if `intervals` samples followed the first one, and the last sample arrived `span`

@@ -8,9 +8,9 @@ use bytemuck::Pod;
 use crate::limits::TopicLimits;
 use crate::{Failure, Kind};
 
-/// The table of topics. Calls the macro `$each` with rows of the table. By default, it passes the rows of all topics.
-/// With `links:`, it passes the rows of the topics that a hub publishes for each link. With `makers:`, it passes all
-/// rows in groups `MAKER { .. }`, one group for each [`PublisherKind`].
+/// The table of topics. Calls the macro `$each` with rows of the table. Without a prefix, `$each` gets the rows of all
+/// topics. With `links:`, `$each` gets only the rows of the topics that a hub publishes for each link. With `makers:`,
+/// `$each` gets all rows in groups `MAKER { .. }`, one group for each [`PublisherKind`].
 ///
 /// A row is `VARIANT PAYLOAD, name, number, type, group, rate, word, queue, history: description;`. Its columns are the
 /// fields of [`TopicSpec`], in the same order. A payload other than `[u8]` is a type of this crate.
@@ -92,7 +92,8 @@ macro_rules! for_each_topic {
     };
 }
 
-/// Expands to the type of a row's payload in [`for_each_topic!`](crate::for_each_topic), in any crate.
+/// Expands to the type that a row of [`for_each_topic!`](crate::for_each_topic) has in its column `PAYLOAD`. Other
+/// crates can use this macro, too.
 ///
 /// # Examples
 ///
@@ -115,18 +116,19 @@ macro_rules! payload_type {
 pub struct TopicSpec {
     /// Name, as in `front/scan`.
     pub name: &'static str,
-    /// Number in datagrams and in C. A new topic gets the next free one, wherever its row is.
+    /// Number in datagrams and in C. A new topic gets the next free number, wherever its row is in the table.
     pub number: u8,
-    /// Type of the payload, which is the same in all languages.
+    /// Name of the payload's type, which is the same in all languages.
     pub payload: &'static str,
-    /// Last byte of the topic's multicast group.
+    /// Last byte of the address of the topic's multicast group.
     pub group: u8,
     /// Publish rate.
     pub publish_rate: PublishRate,
     /// Doorbell word that the hub rings after a sample.
     pub doorbell_word: DoorbellWord,
-    /// Samples that are queued for a subscriber. One more drops the oldest. The topics that a recorder must not lose
-    /// have room for 1.7 s: with a queue of 16, a recorder lost 7 scans while its machine was stopped for 0.6 s.
+    /// Maximum number of samples that are queued for a subscriber. If the queue is full, a new sample evicts the oldest
+    /// one. If a recorder must not miss samples of a topic, the topic has a queue for the samples of 1.7 s. With a
+    /// queue of 16 samples, a recorder missed 7 scans while its machine was stopped for 0.6 s.
     pub queue_len: usize,
     /// Number of samples in the history for late joiners.
     pub history_len: usize,
@@ -137,16 +139,16 @@ pub struct TopicSpec {
 /// Publish rate of a topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PublishRate {
-    /// With each scan.
+    /// One sample for each scan.
     Scan,
-    /// Every second, and after each change.
+    /// One sample every second, and one after each change.
     Second,
-    /// For each new value.
+    /// One sample for each new value.
     Change,
 }
 
-/// Words of a sensor's doorbell. There are three, so that a subscriber to `zones` need not wait for the marks of the
-/// same scan.
+/// Words of a sensor's doorbell. There are three words, so that a subscriber to `zones` need not wait for the marks of
+/// the same scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DoorbellWord {
     /// Rung as soon as telegram, scan and zones are sent.
@@ -172,11 +174,11 @@ macro_rules! rows {
         }
 
         impl Topic {
-            /// All topics, in the order of all output.
+            /// All topics, in the order in which all commands print them.
             pub const ALL: [Topic; [$(stringify!($name)),*].len()] = [$(Topic::$topic),*];
         }
 
-        /// One row for each of [`Topic::ALL`].
+        /// The rows of the topics, in the order of [`Topic::ALL`].
         pub(super) const SPECS: [TopicSpec; Topic::ALL.len()] = [$(TopicSpec {
             name: stringify!($name),
             number: $number,
@@ -233,7 +235,7 @@ impl Topic {
         self.spec().name
     }
 
-    /// Returns the topic called `name`.
+    /// Returns the topic called `name`, or `None` if no topic has this name.
     ///
     /// # Examples
     ///
@@ -252,12 +254,12 @@ impl Topic {
         self.spec().number
     }
 
-    /// Returns the topic with this number.
+    /// Returns the topic with this number in datagrams, or `None` if no topic has it.
     pub fn of_number(number: u8) -> Option<Topic> {
         Topic::ALL.into_iter().find(|topic| topic.number() == number)
     }
 
-    /// Returns the type of the payload, which is the same in all languages.
+    /// Returns the name of the payload's type, which is the same in all languages.
     pub fn payload(self) -> &'static str {
         self.spec().payload
     }
@@ -291,7 +293,7 @@ pub const CONTROL_RESPONSE: &str = "scanhub/v2/control/response";
 /// Name of the service that wakes the subscribers of a sensor.
 pub const WAKE: &str = "wake";
 
-/// Reason why subscribers are woken: the ID of the event.
+/// Reason why subscribers are woken. The value is the ID of the event in the wake service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(usize)]
 pub enum WakeEvent {
@@ -300,9 +302,10 @@ pub enum WakeEvent {
     /// The status changed, or another sample was published without a telegram, such as zones that became unknown or a
     /// new background.
     Status = 2,
-    /// The hub is up. The library sends it when the notifier is created.
+    /// The hub is up. The shared-memory library sends this event when the hub creates its notifier.
     HubUp = 3,
-    /// The hub is down. The library sends it when the notifier is dropped or its process is found dead.
+    /// The hub is down. The shared-memory library sends this event when the hub's notifier is dropped, or when its
+    /// process is found dead.
     HubDown = 4,
     /// A partial telegram caused an early warning.
     Early = 5,
@@ -315,17 +318,18 @@ impl WakeEvent {
     }
 }
 
-/// Returns the sensor and the topic in the name of a service, or `None` if it is neither the service of a topic nor a
-/// wake service. Reverses [`Topic::service`]. A wake service has no topic.
+/// Returns the sensor and the topic in the name of a service; the topic is `None` for a wake service. Returns `None`
+/// for any other service, such as the control service. Reverses [`Topic::service`].
 pub fn parse_service_name(name: &str) -> Option<(&str, Option<Topic>)> {
     let (sensor, topic) = name.strip_prefix("scanhub/v2/")?.split_once('/')?;
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
 }
 
-/// Stands for all sensors of a hub where a sensor's name is expected. No sensor can have this name.
+/// Word that stands for all sensors of a hub, and that users can write in place of a sensor's name. No sensor can have
+/// this name.
 pub const ROBOT: &str = "robot";
 
-/// Checks a sensor's name: 1 to 24 of `[a-z0-9_-]`, and not [`ROBOT`].
+/// Checks a sensor's name. It must have 1 to 24 characters of `[a-z0-9_-]`, and must not be [`ROBOT`].
 ///
 /// # Errors
 ///
@@ -359,7 +363,8 @@ pub fn check_any_sensor(name: &str) -> Result<(), Failure> {
     }
 }
 
-/// Returns whether this is the name of a remote sensor, whose topics a listener publishes here.
+/// Returns whether `sensor` is the name of a remote sensor. A listener publishes the topics of a remote sensor on this
+/// machine.
 pub fn is_remote(sensor: &str) -> bool {
     sensor.contains('.')
 }
@@ -371,7 +376,7 @@ fn service(sensor: &str, topic: &str) -> String {
 /// Kind of a publisher. All topics under one name have the same publisher.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PublisherKind {
-    /// A hub, for a link; or a listener, for a link of another machine.
+    /// A hub, which publishes the topics of its links; or a listener, which publishes the topics of remote sensors.
     Link,
     /// A program that tracks people.
     Tracker,
@@ -382,7 +387,7 @@ pub enum PublisherKind {
 }
 
 impl PublisherKind {
-    /// Returns the description of a name that has these topics.
+    /// Returns a description, such as `a sensor`, of a name that has the topics of this publisher. Messages contain it.
     pub const fn name(self) -> &'static str {
         match self {
             PublisherKind::Link => "a sensor",
@@ -412,7 +417,7 @@ macro_rules! makers {
 crate::for_each_topic!(makers: makers);
 
 impl Topic {
-    /// Returns the kind of its publisher.
+    /// Returns the kind of the topic's publisher.
     pub fn publisher_kind(self) -> PublisherKind {
         let has = |maker: &PublisherKind| maker.topics().contains(&self);
         PublisherKind::ALL.into_iter().find(has).unwrap_or(PublisherKind::Link)

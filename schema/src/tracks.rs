@@ -36,7 +36,7 @@ pub struct Tracks {
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Track.v2"))]
 #[repr(C)]
 pub struct Track {
-    /// ID of the person, which no one else gets while the tracker runs.
+    /// ID of the person. No other person gets the same ID while the tracker runs.
     pub id: u64,
     /// Midpoint between the legs, along x, in meters on the map.
     pub x_m: f32,
@@ -220,7 +220,7 @@ pub struct Event {
     pub reserved: [u8; 7],
     /// Name of the room after the event; empty outside of all rooms. See [`room_name`](Event::room_name).
     pub room_text: [u8; 24],
-    /// Name of the door; empty for other events.
+    /// Name of the door; empty if the kind is not `door`.
     pub door_text: [u8; 24],
     /// Room that the person came from, or `outside`; empty for other events.
     pub from_text: [u8; 24],
@@ -281,12 +281,13 @@ impl Event {
         EventKind::of_number(self.kind)
     }
 
-    /// Returns the name of the room after the event.
+    /// Returns the name of the person's room after the event, or `None` outside of all rooms.
     pub fn room_name(&self) -> Option<&str> {
         Some(text::read(&self.room_text)).filter(|room| !room.is_empty())
     }
 
-    /// Returns the door, the room that the person came from, and the room that they went to. `None` for other events.
+    /// Returns the door, the room that the person came from, and the room that they went to. Returns `None` if the kind
+    /// is not `door`.
     pub fn door(&self) -> Option<(&str, &str, &str)> {
         let [door, from, to] =
             [&self.door_text, &self.from_text, &self.to_text].map(|field| text::read(field));

@@ -21,9 +21,9 @@ pub struct Zones {
     pub count: u8,
     /// Beam of the point nearest to the robot's center; [`Zones::NO_BEAM`] if no beam has a valid reading.
     pub nearest_beam: u16,
-    /// Distance of that point from the center in mm, rounded down; [`Zones::NO_DISTANCE`] if there is none.
+    /// Distance of the nearest point from the center in mm, rounded down; [`Zones::NO_DISTANCE`] if there is none.
     pub nearest_mm: u32,
-    /// Number of beams without a valid reading among those that cross the largest zone.
+    /// Number of beams without a valid reading among the beams that cross the largest zone.
     pub invalid_beams: u16,
     /// Flags: [`Zones::PROVISIONAL`].
     pub flags: u8,
@@ -40,9 +40,9 @@ pub struct Zones {
 pub struct Zone {
     /// Radius in mm.
     pub radius_mm: u16,
-    /// Number of beams of this scan that end inside.
+    /// Number of beams of this scan that end inside the zone.
     pub beams: u16,
-    /// 1 if enough beams ended inside in enough scans.
+    /// 1 if enough beams ended inside the zone in enough scans.
     pub violated: u8,
     /// 0.
     pub reserved: [u8; 3],
@@ -59,9 +59,9 @@ impl FixedPayload for Zones {
 }
 
 impl Zones {
-    /// Value of [`Zones::nearest_beam`] if there is none.
+    /// Value of [`Zones::nearest_beam`] if there is no nearest point.
     pub const NO_BEAM: u16 = u16::MAX;
-    /// Value of [`Zones::nearest_mm`] if there is none.
+    /// Value of [`Zones::nearest_mm`] if there is no nearest point.
     pub const NO_DISTANCE: u32 = u32::MAX;
     /// Flag: there were fewer scans than a violation requires.
     pub const PROVISIONAL: u8 = 1;
@@ -96,13 +96,14 @@ impl Zones {
         Verdict::of(self.verdict)
     }
 
-    /// Returns the beam of the nearest point, and its distance from the robot's center in mm.
+    /// Returns the beam of the nearest point, and the point's distance from the robot's center in mm. Returns `None` if
+    /// no beam has a valid reading.
     pub fn nearest(&self) -> Option<(u16, u32)> {
         (self.nearest_beam != Zones::NO_BEAM).then_some((self.nearest_beam, self.nearest_mm))
     }
 }
 
-/// Result of all zones.
+/// Result of checking a scan against all zones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Verdict {
@@ -130,8 +131,8 @@ impl Verdict {
         Verdict::ALL.into_iter().find(|verdict| *verdict as u8 == number).unwrap_or(Verdict::Unknown)
     }
 
-    /// Returns the worse of two verdicts: stop, then unknown, then slow, then clear. An object inside outweighs missing
-    /// data.
+    /// Returns the worse of two verdicts: stop, then unknown, then slow, then clear. An object inside a zone outweighs
+    /// missing data.
     pub fn worse(self, other: Verdict) -> Verdict {
         let rank = |verdict| match verdict {
             Verdict::Clear => 0,
@@ -143,9 +144,9 @@ impl Verdict {
     }
 }
 
-/// The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first zones with
-/// the same or a higher number belong to its scan and confirm it. A sample with [`Early::WITHDRAWN`]
-/// withdraws it.
+/// The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first sample of
+/// topic `zones` with the same or a higher `seq` belongs to the same scan and confirms the warning. A sample with
+/// [`Early::WITHDRAWN`] withdraws the warning.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Early.v2"))]
 #[repr(C)]
@@ -156,7 +157,7 @@ pub struct Early {
     pub flags: u8,
     /// Beam of the nearest point so far.
     pub beam: u16,
-    /// Distance of that point from the robot's center, in mm.
+    /// Distance of the nearest point so far from the robot's center, in mm.
     pub distance_mm: u32,
     /// Bytes of the telegram that had arrived; 0 for a revolution.
     pub bytes_seen: u16,
@@ -171,7 +172,7 @@ impl FixedPayload for Early {
 }
 
 impl Early {
-    /// Flag: the warning with this number is withdrawn.
+    /// Flag: the warning with this `seq` is withdrawn.
     pub const WITHDRAWN: u8 = 1;
 
     /// Returns the verdict; unknown if this version does not know its number.

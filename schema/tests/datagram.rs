@@ -13,7 +13,7 @@ use scanhub_schema::Family;
 use scanhub_schema::datagram::{Datagram, DatagramError, HEADER_LEN, Head, LanFlags, MIN_MTU, MTU_SAFE};
 use vectors::{Vector, bytes as vector, vectors};
 
-/// Returns `datagram` with a change and a right checksum.
+/// Returns `datagram` after `change`, with a correct checksum.
 fn changed(datagram: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
     let mut bytes = datagram.to_vec();
     change(&mut bytes);
@@ -50,7 +50,8 @@ fn datagrams_of_a_later_revision_match_golden_bytes() {
     assert_eq!(datagram, vector("longer_payload"));
 }
 
-/// The MAC is the first 16 bytes of HMAC-SHA256 with the list's key, over the datagram before the MAC with a CRC of 0.
+/// The MAC is the first 16 bytes of HMAC-SHA256 over the datagram before the MAC, with a CRC of 0. The key is in the
+/// list of golden datagrams.
 #[test]
 fn mac_follows_the_payload() {
     const KEY_BYTES: [u8; 16] =
@@ -67,7 +68,7 @@ fn mac_follows_the_payload() {
     }
 }
 
-/// A single part is not a valid payload. The crate `clients/network` tests that the parts together are one.
+/// A single part is not a valid payload. The crate `clients/network` tests that the parts together are a valid payload.
 #[test]
 fn scan_parts_match_golden_bytes() {
     let scan = vector("scan");
@@ -149,7 +150,8 @@ fn every_refusal_reason_has_a_golden_datagram() {
     }
 }
 
-/// Checks the facts on the page: header fields without gaps, sizes, an example, and the reasons in their order.
+/// Checks the facts in `docs/datagram.md`: header fields without gaps, sizes, an example, and the reasons in their
+/// order.
 #[test]
 fn page_matches_golden_datagrams() {
     let top = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();

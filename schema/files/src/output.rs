@@ -1,11 +1,11 @@
 //! Files that a user names as output. Other users of the machine may write to the same directory, so every verb creates
-//! its files here.
+//! its files with this module.
 //!
-//! A file that is written at once is complete or absent: [`OutputFile`] has a random name until it is complete. A file
-//! that grows has its final name from the start, see [`Target::create`], so that the file survives if the process is
-//! killed.
+//! A file that is written as a whole is complete or absent: [`OutputFile`] has a random name until it is complete. A
+//! file that grows has its final name from the start, see [`Target::create`], so that the file survives if the process
+//! is killed.
 //!
-//! - The last component of a path is never a link, and never a device, a pipe or a socket.
+//! - The last component of a path must not be a link, a device, a pipe or a socket.
 //! - A link among the other components is followed, unless it belongs to another user and lies in a sticky directory,
 //!   such as /tmp.
 //! - An existing file is replaced only if `force` is set.
@@ -25,7 +25,7 @@ use tempfile::NamedTempFile;
 use crate::path_walk::{LinkPolicy, PathWalk, WalkError, components_of, describe_user, effective_uid};
 use scanhub_schema::{Failure, Kind};
 
-/// Writes `content` to the file at `path`. With `force`, it replaces an existing file.
+/// Writes `content` to the file at `path`. With `force`, an existing file is replaced.
 ///
 /// # Errors
 ///
@@ -41,8 +41,8 @@ pub fn write(path: &Path, content: &[u8], force: bool) -> Result<(), Failure> {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Output`] if it cannot be created, is not a directory, or is reached by a link that another user has
-/// put into a sticky directory.
+/// Returns [`Kind::Output`] if the directory cannot be created, is not a directory, or is reached by a link that
+/// another user has put into a sticky directory.
 pub fn create_directory(path: &Path) -> Result<(), Failure> {
     open_directory(path, path, Some(Mode::RWXU | Mode::RWXG | Mode::RWXO)).map(drop)
 }
@@ -51,14 +51,16 @@ pub fn create_directory(path: &Path) -> Result<(), Failure> {
 /// directory of its target. If it is dropped before `commit`, the file is removed.
 #[derive(Debug)]
 pub struct OutputFile {
-    // Dropping it removes the file, which needs the open directory.
+    // Dropping this field removes the file, which needs the open directory in `target`. Fields are dropped in this
+    // order.
     file: NamedTempFile,
     target: Target,
     force: bool,
 }
 
 impl OutputFile {
-    /// Creates the file for `path`. With `force`, it may replace a regular file.
+    /// Creates the temporary file for the output `path`. With `force`, [`commit`](Self::commit) may replace a regular
+    /// file.
     ///
     /// # Errors
     ///
@@ -80,16 +82,17 @@ impl OutputFile {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Output`] if the file cannot be written, or if another file has taken the name since.
+    /// Returns [`Kind::Output`] if the file cannot be written, or if another file got the name in the meantime.
     pub fn commit(self) -> Result<(), Failure> {
         let OutputFile { target, file, force } = self;
         let old = target.check(force)?;
         let persist = || {
             let permissions = match old {
-                // Only root may give a file away. This clears some permissions, so they are set afterwards.
+                // Only root may change the owner of a file. The change clears some permissions, so they are set
+                // afterwards.
                 Some(old) => match fchown(file.as_file(), Some(old.st_uid), Some(old.st_gid)) {
                     Ok(()) => old.st_mode & 0o777,
-                    // These permissions were meant for another owner or group.
+                    // The permissions of group and others were meant for the old owner and group, so they are not kept.
                     Err(_) => old.st_mode & 0o600,
                 },
                 None => PUBLIC_MODE & !umask(),
@@ -117,7 +120,7 @@ impl Write for OutputFile {
     }
 }
 
-/// Name of an output file in its open directory.
+/// An output file: its open directory, and its name there.
 #[derive(Debug)]
 pub struct Target {
     directory: OwnedFd,
@@ -148,7 +151,8 @@ impl Target {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Output`] if the file exists and `force` is not set, and always if it is not a regular file.
+    /// Returns [`Kind::Output`] if the file exists and `force` is not set. Returns it even with `force` if the file is
+    /// not a regular file.
     pub fn check(&self, force: bool) -> Result<Option<Stat>, Failure> {
         let stat = match statat(&self.directory, &self.name, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) => stat,
@@ -173,7 +177,7 @@ impl Target {
                     FileType::Socket => "a socket",
                     _ => "a device",
                 };
-                // The shell can open a pipe or a device without these checks.
+                // With `- > PATH`, the shell opens the pipe or the device, without these checks.
                 (
                     what.to_owned(),
                     format!("name a file; or stdout, if this verb has it: - > {}", self.path.display()),
@@ -189,8 +193,9 @@ impl Target {
     ///
     /// # Errors
     ///
-    /// Returns the system's error: [`ErrorKind::AlreadyExists`] if the file exists and `reuse` is not set, and always
-    /// for a link.
+    /// Returns the system's error, such as [`ErrorKind::AlreadyExists`] if the file exists and `reuse` is not set. A
+    /// link is always an error. Returns [`ErrorKind::InvalidInput`] if the existing file is not a regular file, or has
+    /// several names.
     pub fn create(&self, reuse: bool) -> io::Result<File> {
         self.open_file(reuse, PUBLIC_MODE)
     }
@@ -217,8 +222,8 @@ impl Target {
         Ok(file)
     }
 
-    /// Creates an empty file with the permissions `mode`, without those that the umask removes. With `force`, it
-    /// replaces an existing regular file.
+    /// Creates an empty file with the permissions `mode`, without those that the umask removes. With `force`, an
+    /// existing regular file is replaced.
     ///
     /// # Errors
     ///
@@ -240,8 +245,8 @@ impl Target {
     }
 }
 
-/// Opens `directory`, which is on the way to the output `path`. With `make`, missing directories are created with these
-/// permissions.
+/// Opens `directory`, which is `path` or its parent. `path` is the output that messages name. With `make`, missing
+/// directories are created with these permissions.
 fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<OwnedFd, Failure> {
     let reached = PathWalk::begin(path, LinkPolicy::AllButSticky, effective_uid()).and_then(|mut walk| {
         let exists = walk.enter(components_of(directory), make)?;
@@ -249,7 +254,7 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
     });
     let error = match reached {
         Ok(walk) => return Ok(walk.into_parts().0),
-        // Usually the failed path is this directory, and the message needs no second path.
+        // Usually the directory itself cannot be opened. The message then names only the output.
         Err(WalkError::System(failed_at, error)) if failed_at == directory => error.into(),
         Err(WalkError::System(failed_at, error)) => {
             io::Error::other(format!("{}: {}", failed_at.display(), io::Error::from(error)))
@@ -275,7 +280,7 @@ fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<O
         }
     };
     let failure = unwritable(path, &error);
-    // The reason is not a missing directory.
+    // With `make`, a missing directory cannot be the reason.
     let hint =
         if make.is_some() { "name a directory that can be written to" } else { &failure.hint }.to_owned();
     Err(Failure { hint, ..failure })
@@ -300,7 +305,7 @@ fn already_exists(path: &Path) -> Failure {
 }
 
 /// Returns the permissions that new files of this process do not get. If the kernel does not report them (before Linux
-/// 4.7), these are the permissions of group and others.
+/// 4.7), returns the permissions of group and others.
 fn umask() -> u32 {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let umask = status.lines().find_map(|line| line.strip_prefix("Umask:"));
@@ -350,7 +355,7 @@ mod tests {
         let file = OutputFile::create(&path, false).unwrap();
         fs::write(&path, "old").unwrap();
         fs::set_permissions(&path, Permissions::from_mode(0o640)).unwrap();
-        // The file was created after the check.
+        // Another file was created at `path` after `create` had checked the path.
         let failure = file.commit().unwrap_err();
         assert_eq!((failure.kind, failure.message.ends_with("/a exists")), (Kind::Output, true), "{failure}");
         assert!(failure.hint.contains("--force"), "{failure}");

@@ -11,7 +11,7 @@ use rustix::io::Errno;
 
 /// An open directory, and the path by which it was reached.
 pub struct PathWalk {
-    /// User who must own the directories. Links of this user are followed.
+    /// User who must own the directories that `enter_own` opens. Links of this user are trusted.
     user: u32,
     policy: LinkPolicy,
     /// Last component that was opened.
@@ -21,13 +21,13 @@ pub struct PathWalk {
     links: usize,
 }
 
-/// Links that are followed on the way. Links of root and of this user are always followed if they are in directories
-/// that no other user can write to.
+/// Policy for links among the components of a path. Links of root and of this user are always followed if they are in
+/// directories that no other user can write to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LinkPolicy {
-    /// No other links.
+    /// No other links are followed.
     Own,
-    /// All other links, except links of other users in a sticky directory such as /tmp.
+    /// All other links are followed, except links of other users in a sticky directory such as /tmp.
     AllButSticky,
 }
 
@@ -38,9 +38,9 @@ pub enum WalkError {
     System(PathBuf, Errno),
     /// Another user may have put this path there. The text is the rest of a sentence that begins with the path.
     Untrusted(PathBuf, String),
-    /// The directory belongs to another user. Path, owner and mode.
+    /// The directory belongs to another user. The values are its path, its owner and its mode.
     Foreign(PathBuf, u32, u32),
-    /// Other users can write to the directory. Path and mode.
+    /// Other users can write to the directory. The values are its path and its mode.
     Writable(PathBuf, u32),
 }
 
@@ -145,7 +145,7 @@ impl PathWalk {
             }
             Err(Errno::NOENT) => Ok(ComponentResult::Absent),
             Err(Errno::NOTDIR | Errno::LOOP) => Ok(ComponentResult::NotDirectory),
-            // The owner of a directory can be read even if the directory cannot.
+            // The error states the owner. The owner of a directory can be read even if the directory cannot be opened.
             Err(Errno::ACCESS) => {
                 let component = statat(&self.directory, name, AtFlags::SYMLINK_NOFOLLOW);
                 let component = component.map(|stat| (self.path.join(name), stat));
@@ -215,7 +215,7 @@ pub fn components_of(path: &Path) -> Vec<OsString> {
         .collect()
 }
 
-/// Returns the ID of `user`, with the name if there is one.
+/// Returns the ID of `user` as text, with the user's name if the user has a name.
 pub fn describe_user(user: u32) -> String {
     let entry = nix::unistd::User::from_uid(user.into()).ok().flatten();
     entry.map_or_else(|| user.to_string(), |known| format!("{user} ({})", known.name))

@@ -1,5 +1,5 @@
 //! Reads of files that a user names: only regular files, and only up to a maximum length. Pipes and devices are
-//! rejected, because a pipe may have no writer and a device no end.
+//! rejected, because a read of a pipe may wait for a writer forever, and a device may have no end.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};
@@ -10,8 +10,9 @@ use rustix::fs::OFlags;
 
 use scanhub_schema::{Failure, Kind};
 
-/// Maximum length of a configuration, a world or a model, in bytes. It is many times the length of real files. The
-/// parsed form needs a hundred times as much memory.
+/// Maximum length in bytes of a file with a configuration, a simulated world or a background model. The limit is many
+/// times the length of real files. It bounds the memory for the parsed form, which needs a hundred times the length of
+/// the file.
 pub const MAX_FILE_BYTES: u64 = 512 << 10;
 
 /// Opens the regular file at `path`, without waiting.

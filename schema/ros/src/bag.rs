@@ -1,5 +1,5 @@
-//! Writer of ROS messages to an MCAP file in the form of rosbag2: profile `ros2`, and each channel with the definition
-//! of its type and the quality of service that its publisher offers.
+//! Writer of ROS messages to an MCAP file in the form of rosbag2. The file has the profile `ros2`. Each channel has the
+//! definition of its type, and the quality of service that its publisher offers.
 
 use std::io::{self, Write};
 
@@ -14,13 +14,14 @@ use crate::{
 /// Profile of a file that has only ROS messages.
 pub const PROFILE: &str = "ros2";
 
-/// Channels and transforms of a file.
+/// Writes messages to a file. The writer stores the channels that the file already has, and the poses that were written
+/// last.
 #[derive(Debug, Default)]
 pub struct BagWriter {
-    /// Channels of scans and of points, by topic.
+    /// Topic and channel ID of scans and of points.
     channels: Vec<(String, u16)>,
     transforms: Option<Transforms>,
-    /// Poses by frame.
+    /// Frame and pose of each known sensor.
     poses: Vec<(String, Pose)>,
     message: Vec<u8>,
 }
@@ -29,14 +30,14 @@ pub struct BagWriter {
 #[derive(Clone, Copy, Debug)]
 struct Transforms {
     channel: u16,
-    /// Number of the next message of poses, and its minimum time. The message with the most poses must be the latest
-    /// one.
+    /// Sequence number of the next message of poses. The minimum time of this message is `min_ns`, so that the message
+    /// with the most poses is the latest one.
     number: u32,
     min_ns: u64,
 }
 
 impl BagWriter {
-    /// Writes a scan of `sensor` as a LaserScan. The log time is the wall clock of its telegram.
+    /// Writes a scan of `sensor` as a LaserScan. The log time is the wall-clock time of the scan's telegram.
     ///
     /// # Errors
     ///
@@ -52,7 +53,7 @@ impl BagWriter {
         self.write_message(writer, scan_topic(sensor), &LASER_SCAN, header, write)
     }
 
-    /// Writes a scan of `sensor` as a PointCloud2, with the log time of its LaserScan.
+    /// Writes a scan of `sensor` as a PointCloud2, with the same log time as the LaserScan of this scan.
     ///
     /// # Errors
     ///
@@ -90,7 +91,7 @@ impl BagWriter {
     }
 
     /// Writes the poses of all known sensors if `pose` of `sensor` is new. Log time and stamp are `wall_ns` (since
-    /// 1970), or just after the previous message.
+    /// 1970), or 1 ns after the previous message if that is later.
     pub fn write_pose<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
@@ -135,7 +136,8 @@ fn add_channel<W: Write>(
     })
 }
 
-/// Quality of service: keep the last `depth`, reliable, volatile (2) or transient local (1).
+/// Expands to the text of a quality of service: reliable, keep the last `depth` messages. `durability` is 2 for
+/// volatile and 1 for transient local.
 macro_rules! offered {
     ($depth:literal, $durability:literal) => {
         concat!(
@@ -151,7 +153,7 @@ macro_rules! offered {
     };
 }
 
-/// A player offers the following quality of service, which is compatible with every subscriber.
+/// Quality of service of scans and points. A player of the file offers it, and it is compatible with every subscriber.
 const SCAN_QOS: &str = offered!(5, 2);
-/// Subscribers to transforms request the following quality of service.
+/// Quality of service of transforms, which subscribers to transforms request.
 const LATCHED_QOS: &str = offered!(1, 1);

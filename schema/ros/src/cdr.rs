@@ -118,7 +118,8 @@ impl Value {
     }
 }
 
-/// Decodes `message` of type `message_type`. Returns `None` if it has fewer or more bytes than the type.
+/// Decodes `message` of type `message_type`. Returns `None` if `message` has fewer or more bytes than its type
+/// requires.
 pub fn read(message_type: &Type, message: &[u8]) -> Option<Value> {
     let body = message.strip_prefix(&[0, 1, 0, 0])?;
     let layout = MessageDef::of(message_type);
@@ -167,7 +168,8 @@ impl Reader<'_> {
         String::from_utf8(text.strip_suffix(&[0])?.to_vec()).ok()
     }
 
-    /// Reads the number of values that follow. Each has at least one byte.
+    /// Reads the number of values that follow. Each value has at least one byte, so the number must not exceed the
+    /// number of remaining bytes.
     fn count(&mut self) -> Option<usize> {
         let count = u32::from_le_bytes(self.take()?) as usize;
         (count <= self.body.len() - self.at).then_some(count)
@@ -189,7 +191,7 @@ mod tests {
 
     #[test]
     fn values_are_aligned_to_their_size() {
-        // Bytes before the message do not count.
+        // Positions are relative to the start of the message, so these bytes before the message change nothing.
         let mut message = vec![9; 3];
         let mut cdr = Cdr::begin(&mut message);
         cdr.text("ab");

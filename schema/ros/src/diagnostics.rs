@@ -25,7 +25,8 @@ pub fn diagnosis(
     write(message, now_ns, level, [sensor, &summary, hardware], &values);
 }
 
-/// Appends the diagnostics of the hub at `now_ns` (since 1970) to `message`. They report whether the hub runs.
+/// Appends the diagnostics of the hub at `now_ns` (since 1970) to `message`. These diagnostics report whether the hub
+/// runs.
 pub fn hub_diagnosis(message: &mut Vec<u8>, now_ns: u64, is_running: bool) {
     let (level, summary) = if is_running { (OK, "running") } else { (STALE, NO_HUB) };
     write(message, now_ns, level, ["hub", summary, ""], &[]);
@@ -85,7 +86,7 @@ fn values(status: &Status, age_ns: Option<u64>) -> Vec<(&'static str, String)> {
 /// Message if no hub publishes the status.
 const NO_HUB: &str = "no hub";
 
-/// `DiagnosticStatus.OK` and so on.
+/// Levels of a `DiagnosticStatus`.
 const OK: u8 = 0;
 const WARN: u8 = 1;
 const ERROR: u8 = 2;

@@ -1,5 +1,6 @@
-//! Samples of the hub as messages of ROS 2: their bytes, the names of their topics and frames, and the definitions that
-//! a reader without ROS needs. All code that writes scans for ROS uses this crate. It does no I/O.
+//! Samples of the hub as messages of ROS 2: the encoding of messages, the names of topics and frames, and the
+//! definitions of types that a reader without ROS needs. All code that writes scans for ROS uses this crate. This crate
+//! does no I/O.
 #![forbid(unsafe_code)]
 
 #[cfg(feature = "mcap")]

@@ -7,8 +7,8 @@ use crate::BASE_FRAME;
 use crate::cdr::Cdr;
 
 /// Appends `zones` to `message` as a MarkerArray: thin discs around the robot's center, the largest one lowest. A disc
-/// is red if something is inside its zone, and otherwise green. All discs are gray if the verdict is unknown. A viewer
-/// removes the discs one second after the last message.
+/// is red if its zone is violated. Otherwise, it is green, or gray if the verdict is unknown. A viewer removes the
+/// discs one second after the last message.
 pub fn zone_markers(message: &mut Vec<u8>, header: &Header, zones: &Zones) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(zones.zones().len() as u32);
@@ -52,8 +52,8 @@ pub fn mark_markers(message: &mut Vec<u8>, frame: &str, header: &Header, marks: 
 }
 
 /// Appends the people of `tracks` in the map `frame` to `message` as a MarkerArray: a column for each track that is not
-/// tentative, with the ID of the track above. The column is gray if no sensor sees the person now. A viewer removes the
-/// columns one second after the last message.
+/// tentative, with the ID of the track above the column. The column is gray if no sensor sees the person now. A viewer
+/// removes the columns one second after the last message.
 pub fn people_markers(message: &mut Vec<u8>, frame: &str, header: &Header, tracks: &Tracks) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(2 * established_tracks(tracks).count() as u32);
@@ -102,7 +102,7 @@ fn established_tracks(tracks: &Tracks) -> impl Iterator<Item = &Track> {
     tracks.tracks().iter().filter(|track| track.state() != TrackState::Tentative)
 }
 
-/// A `visualization_msgs/msg/Marker`, without the fields that only other shapes have.
+/// A `visualization_msgs/msg/Marker`, without the fields that are only for shapes of other kinds.
 struct Shape<'a> {
     stamp_ns: u64,
     frame: &'a str,
@@ -147,14 +147,16 @@ impl<'a> Shape<'a> {
         cdr.bool(false);
         cdr.u32(points.len() as u32);
         points.for_each(|[x, y]| [x, y, 0.0].into_iter().for_each(|axis| cdr.f64(axis)));
-        // No colors of points, and no texture: its name, its image with header, format and data, its coordinates.
+        // These fields are empty: colors of points, name of the texture, image of the texture with header, format and
+        // data, coordinates of the texture.
         cdr.u32(0);
         cdr.text("");
         cdr.header(0, "");
         cdr.text("");
         cdr.u32(0);
         cdr.u32(0);
-        // The text, and no mesh: its name, its file, whether its materials are used.
+        // The text. The fields of a mesh are empty: its name, its file with name and data, whether its materials are
+        // used.
         cdr.text(self.text);
         cdr.text("");
         cdr.text("");
@@ -182,7 +184,7 @@ const GREEN: [f32; 4] = [0.1, 0.7, 0.2, 0.25];
 const RED: [f32; 4] = [0.9, 0.1, 0.1, 0.4];
 const GRAY: [f32; 4] = [0.5, 0.5, 0.5, 0.25];
 const YELLOW: [f32; 4] = [1.0, 0.8, 0.0, 1.0];
-/// Minimum speed of a person who walks.
+/// Minimum speed at which a person is considered to walk, in meters per second.
 const MIN_WALKING_SPEED_M_S: f64 = 0.2;
 
 #[cfg(test)]
@@ -291,7 +293,7 @@ mod tests {
             (decoded.number("poses.0.position.x"), decoded.number("poses.0.position.y")),
             (Some(2.0), Some(-0.5))
         );
-        // A quarter turn to the left.
+        // The pose is rotated by 90 degrees to the left.
         let half = std::f64::consts::FRAC_1_SQRT_2;
         for axis in ["z", "w"] {
             let value = decoded.number(&format!("poses.0.orientation.{axis}")).unwrap();

@@ -18,7 +18,8 @@ pub fn frame(sensor: &str) -> &str {
     sensor
 }
 
-/// Returns the topic of `sensor`'s scans, with the default [`RosNames`]. A remote sensor has its own namespace.
+/// Returns the topic of `sensor`'s scans, with the default [`RosNames`]. The topics of a remote sensor `HUB.SENSOR` are
+/// in a namespace for its hub.
 pub fn scan_topic(sensor: &str) -> String {
     RosNames::default().topic(sensor, "scan")
 }
@@ -26,17 +27,17 @@ pub fn scan_topic(sensor: &str) -> String {
 /// Names of topics and frames.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RosNames {
-    /// Start of every topic. It is empty, or has names with a slash before each name.
+    /// Start of every topic. This text is empty, or has names with a slash before each name.
     namespace: String,
-    /// Part between the namespace and the name of a sensor, in the same form.
+    /// Part between the namespace and the name of a sensor, in the same form as the namespace.
     prefix: String,
-    /// Frames by sensor, for sensors whose frame is not called like the sensor.
+    /// Sensor and frame, for each sensor whose frame does not have the default name.
     frames: Vec<(String, String)>,
 }
 
 impl RosNames {
-    /// Creates names with `namespace` at the start of every topic, `prefix` after it in topics of sensors, and a frame
-    /// for each sensor in `frames`. The slash before the first name is optional.
+    /// Creates names with `namespace` at the start of every topic, `prefix` after the namespace in topics of sensors,
+    /// and a frame for each sensor in `frames`. The slash before the first name is optional.
     ///
     /// # Errors
     ///
@@ -56,7 +57,8 @@ impl RosNames {
         &self.namespace
     }
 
-    /// Returns the topic `name` of `sensor`. Its names have letters, digits and `_`, and do not start with a digit.
+    /// Returns the topic `name` of `sensor`. The names in the topic have only letters, digits and `_`, and do not start
+    /// with a digit.
     pub fn topic(&self, sensor: &str, name: &str) -> String {
         let mut topic = [self.namespace(), &self.prefix].concat();
         for part in sensor.split('.') {
@@ -74,7 +76,7 @@ impl RosNames {
         [self.namespace(), name].concat()
     }
 
-    /// Returns the sensors that were given a frame.
+    /// Returns the sensors for which [`new`](Self::new) got a frame.
     pub fn sensors_with_frame(&self) -> impl Iterator<Item = &str> {
         self.frames.iter().map(|(sensor, _)| &**sensor)
     }
@@ -92,8 +94,8 @@ impl RosNames {
 /// stamp `stamp_ns` (since 1970). Pass the poses of all sensors, because a late joiner gets only the last message of
 /// the topic.
 ///
-/// A sensor that is mounted upside down is rotated by half a turn around its x axis, then by its yaw around the robot's
-/// z. The angles of its scans then run in the other direction.
+/// A sensor that is mounted upside down is rotated by 180 degrees around its x axis, and then by its yaw around the
+/// robot's z axis. The angles of its scans then run in the other direction.
 pub fn static_transforms(message: &mut Vec<u8>, stamp_ns: u64, poses: &[(String, Pose)]) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(poses.len() as u32);
@@ -112,7 +114,7 @@ fn rotation(pose: &Pose) -> [f64; 4] {
     if pose.upside_down == 0 { [0.0, 0.0, sin, cos] } else { [cos, sin, 0.0, 0.0] }
 }
 
-/// Returns `text` with a slash before each of its names; `None` if one of them is not valid in ROS.
+/// Returns `text` with a slash before each of its names; `None` if one of the names is not valid in ROS.
 fn to_path(text: &str) -> Option<String> {
     let text = text.strip_prefix('/').unwrap_or(text);
     if text.is_empty() {
@@ -186,7 +188,7 @@ mod tests {
         assert_eq!(message[4..8], [2, 0, 0, 0]);
         assert_eq!(message[8..12], 1_700_000_000_u32.to_le_bytes());
         assert_eq!(message[12..16], [7, 0, 0, 0]);
-        // Stamp, two texts with their ends, up to a multiple of eight: seven numbers.
+        // A transform has a stamp and two texts with their ends. Seven numbers follow at a multiple of eight bytes.
         let x = 4 + (4 + 8 + 4 + 12 + 4 + 6_usize).next_multiple_of(8);
         assert_eq!(message[x..x + 8], 0.5f64.to_le_bytes());
         assert!(message[x + 56..].windows(5).any(|some| some == b"rear\0"));

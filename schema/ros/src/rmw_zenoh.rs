@@ -1,15 +1,15 @@
 //! Wire format of ROS 2 over Zenoh (`rmw_zenoh`), as text and bytes: keys of messages, tokens of nodes and publishers,
-//! the quality of service, and attachments of messages. Its sources are docs/design.md, `liveliness_utils.cpp` and
-//! `attachment_helpers.cpp` of `rmw_zenoh`.
+//! the quality of service, and attachments of messages. The sources for the format are docs/design.md,
+//! `liveliness_utils.cpp` and `attachment_helpers.cpp` of `rmw_zenoh`.
 //!
 //! The attachment has the format of rmw_zenoh from 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6 (Kilted, Rolling) on. In
-//! earlier versions, names separated the values.
+//! earlier versions, each value had its name before it.
 
 use sha2::{Digest, Sha256};
 
 use crate::Type;
 
-/// A release of ROS 2. The wire format depends on it.
+/// A release of ROS 2. The wire format depends on the release.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Distro {
     /// Humble Hawksbill, which has no hashes of types.
@@ -36,7 +36,7 @@ impl Distro {
         }
     }
 
-    /// Returns the release called `name`.
+    /// Returns the release called `name`, or `None` if no release has this name.
     pub fn parse(name: &str) -> Option<Distro> {
         Distro::ALL.into_iter().find(|distro| distro.name() == name)
     }
@@ -53,11 +53,11 @@ impl Distro {
 /// Quality of service that a publisher offers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Qos {
-    /// Best effort, volatile, keep the last 5: sensor data.
+    /// Best effort, volatile, keep the last 5 messages: for sensor data.
     SensorData,
-    /// Reliable, volatile, keep the last one or more.
+    /// Reliable, volatile, keep this number of last messages, at least one.
     Reliable(u8),
-    /// Reliable, transient local, keep the last one, which late joiners receive.
+    /// Reliable, transient local, keep the last message, which late joiners receive.
     Latched,
 }
 
@@ -72,7 +72,7 @@ impl Qos {
     }
 
     /// Returns the text in a token: reliability (2 best effort), durability (1 transient local), history and depth,
-    /// deadline, lifespan, liveliness. Defaults are left out.
+    /// deadline, lifespan, liveliness. Values that are the default are left out.
     pub fn text(self) -> String {
         match self {
             Qos::SensorData => "2::,5:,:,:,,".to_owned(),
@@ -82,7 +82,7 @@ impl Qos {
     }
 }
 
-/// A node.
+/// A node of ROS 2 that publishes.
 #[derive(Clone, Debug)]
 pub struct Node {
     /// `ROS_DOMAIN_ID`.
@@ -91,7 +91,7 @@ pub struct Node {
     pub session: String,
     /// Namespace: empty, or names that each follow a slash.
     pub namespace: String,
-    /// Letters, digits and `_`.
+    /// Name of the node: letters, digits and `_`.
     pub name: String,
     /// Release of the nodes that this node communicates with.
     pub distro: Distro,
@@ -100,11 +100,11 @@ pub struct Node {
 /// A topic with one publisher.
 #[derive(Clone, Debug)]
 pub struct Publisher<'a> {
-    /// Number in the node, from 1. The node itself has 0.
+    /// Number of the publisher in its node, from 1. The node itself has the number 0.
     pub number: u32,
     /// Full name, such as `/front/scan`.
     pub topic: &'a str,
-    /// Type of its messages.
+    /// Type of the messages.
     pub message_type: &'a Type,
     /// Quality of service.
     pub qos: Qos,
@@ -172,8 +172,8 @@ impl Type {
 /// Size of an attachment in bytes.
 pub const ATTACHMENT_LEN: usize = 33;
 
-/// Returns the attachment of message `number` (from 1) of the publisher with ID `gid`, sent at `sent_ns` since 1970:
-/// two 64-bit numbers, little-endian, the length of the ID, and the ID.
+/// Returns the attachment of message `number` (from 1) of the publisher with ID `gid`, sent at `sent_ns` since 1970.
+/// The attachment contains these two 64-bit numbers, little-endian, then the length of the ID in one byte, and the ID.
 pub fn attachment(number: i64, sent_ns: i64, gid: [u8; 16]) -> [u8; ATTACHMENT_LEN] {
     let mut bytes = [0; ATTACHMENT_LEN];
     bytes[..8].copy_from_slice(&number.to_le_bytes());

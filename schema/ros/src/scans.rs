@@ -13,14 +13,14 @@ use crate::cdr::Cdr;
 /// - Angles are in radians, counterclockwise from the sensor's x axis (ahead), in ascending order. Angles are in the
 ///   sensor's own frame, even if the sensor is mounted upside down.
 /// - Ranges are in meters (REP 103), each rounded to the nearest float. +inf means no echo within the sensor's range,
-///   -inf an object that is too near, and NaN an unknown range (REP 117).
+///   -inf means an object that is too near, and NaN means an unknown range (REP 117).
 /// - The stamp is the time of the message's first beam. A clockwise scanner measures that beam last, and the time
 ///   between beams is then negative.
 pub fn laser_scan(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
     let mut cdr = Cdr::begin(message);
     cdr.header(stamp_ns(header, scan), frame);
     let last = scan.beams().saturating_sub(1);
-    // Index of the beam of the scan that is beam `i` of the message.
+    // Returns the index that beam `i` of the message has in the scan.
     let beam = |i: usize| if is_clockwise(scan) { last - i } else { i };
     let (first_angle, step) = (scan.first_angle + beam(0) as f64 * scan.step, scan.step.abs());
     for value in [
@@ -52,14 +52,15 @@ fn is_clockwise(scan: &Scan) -> bool {
 /// Returns the time from a beam of the message to the next one.
 fn beam_time_ns(scan: &Scan) -> f64 {
     match f64::from(scan.beam_time_ns) {
-        // Beams between two others are measured one revolution later, so the time between beams is not constant.
+        // Neighboring beams are measured in different revolutions, so the time between beams is not constant.
         _ if scan.turns > 1 => 0.0,
         time if is_clockwise(scan) => -time,
         time => time,
     }
 }
 
-/// Returns the period of scans: the period in the header, or the duration of a revolution if the header has no period.
+/// Returns the period of scans in microseconds: the period in the header, or the duration of a revolution if the header
+/// has no period.
 fn scan_time_us(header: &Header, scan: &Scan) -> f64 {
     match header.period_us {
         0 => f64::from(scan.beam_time_ns) * scan.beams() as f64 / 1e3,
@@ -81,9 +82,9 @@ fn meters(range: u16, scan: &Scan) -> f32 {
     (f64::from(range) * f64::from(scan.unit_um) / 1e6) as f32
 }
 
-/// Appends the readings of `scan` in frame `frame` to `message` as a PointCloud2, with a point for each reading in the
-/// order of the beams and the stamp of the LaserScan. A point is x, y, z in meters (z is 0) and the intensity that the
-/// scanner reports (0 if it reports none), as 32-bit floats.
+/// Appends the readings of `scan` in frame `frame` to `message` as a PointCloud2 with the stamp of the LaserScan. The
+/// cloud has a point for each reading, in the order of the beams. A point is x, y, z in meters (z is 0) and the
+/// intensity that the scanner reports (0 if it reports none), as 32-bit floats.
 pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
     let points = || (0..scan.beams()).filter_map(|i| Some((i, scan.distance_m(i)?)));
     let width = points().count();
@@ -100,8 +101,9 @@ pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Sc
 }
 
 /// Appends the `foreground` of `scan` in frame `frame` to `message` as a PointCloud2 with the stamp of the LaserScan.
-/// It has a point x, y, z (meters, 32-bit floats; z is 0) for each foreground beam that has a range, in the order of
-/// the beams. The directions of the beams come from `scan`, which must belong to the same telegram.
+/// The cloud has a point x, y, z (meters, 32-bit floats; z is 0) for each foreground beam that has a range, in the
+/// order of the beams. The directions of the beams come from `scan`, which must come from the same telegram as
+/// `foreground`.
 pub fn foreground_cloud(
     message: &mut Vec<u8>,
     frame: &str,
@@ -122,7 +124,7 @@ pub fn foreground_cloud(
             [meters * cos, meters * sin, 0.0].map(|axis| axis as f32).map(f32::to_le_bytes).as_flattened(),
         );
     }
-    // All points have coordinates.
+    // The field `is_dense`: all points have coordinates.
     cdr.bool(true);
 }
 
@@ -180,7 +182,7 @@ const SWEEP_FIELDS: [(&str, u32, u8); 5] = [
     ("beam", offset_of!(CloudPoint, beam) as u32, UINT16),
     ("class", offset_of!(CloudPoint, point_class) as u32, UINT8),
 ];
-/// `PointField.FLOAT32` and others.
+/// Types of fields, as in `PointField`.
 const FLOAT32: u8 = 7;
 const UINT16: u8 = 4;
 const UINT8: u8 = 2;

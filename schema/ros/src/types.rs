@@ -37,14 +37,14 @@ impl Type {
     }
 }
 
-/// Definition of a type. It has the fields of the type, then each contained type once.
+/// Expands to the definition of a type: the fields of the type, then each contained type once.
 macro_rules! text {
     ($($field:literal)+ $(; $($of:ident)+)?) => {
         concat!($($field, "\n",)+ $($(contained!($of),)+)?)
     };
 }
 
-/// A contained type, after the separator.
+/// Expands to the separator and a contained type.
 macro_rules! contained {
     (Header) => { contained!("std_msgs/Header": "builtin_interfaces/Time stamp" "string frame_id") };
     (Time) => { contained!("builtin_interfaces/Time": "int32 sec" "uint32 nanosec") };
@@ -99,7 +99,7 @@ macro_rules! contained {
     };
 }
 
-/// Type of a scan.
+/// Type of a message with a scan.
 pub const LASER_SCAN: Type = Type {
     name: "sensor_msgs/msg/LaserScan",
     text: text!(
@@ -109,7 +109,7 @@ pub const LASER_SCAN: Type = Type {
     ),
 };
 
-/// Type of points.
+/// Type of a message with points.
 pub const POINT_CLOUD: Type = Type {
     name: "sensor_msgs/msg/PointCloud2",
     text: text!(
@@ -118,7 +118,7 @@ pub const POINT_CLOUD: Type = Type {
     ),
 };
 
-/// Type of shapes that a viewer draws.
+/// Type of a message with shapes that a viewer draws.
 pub const MARKER_ARRAY: Type = Type {
     name: "visualization_msgs/msg/MarkerArray",
     text: text!(
@@ -127,16 +127,16 @@ pub const MARKER_ARRAY: Type = Type {
     ),
 };
 
-/// Type of poses.
+/// Type of a message with poses.
 pub const POSE_ARRAY: Type = Type {
     name: "geometry_msgs/msg/PoseArray",
     text: text!("std_msgs/Header header" "geometry_msgs/Pose[] poses"; Header Time Pose Point Quaternion),
 };
 
-/// Type of a text.
+/// Type of a message with a text.
 pub const STRING: Type = Type { name: "std_msgs/msg/String", text: text!("string data") };
 
-/// Type of diagnostics.
+/// Type of a message with diagnostics.
 pub const DIAGNOSTIC_ARRAY: Type = Type {
     name: "diagnostic_msgs/msg/DiagnosticArray",
     text: text!(
@@ -144,7 +144,7 @@ pub const DIAGNOSTIC_ARRAY: Type = Type {
     ),
 };
 
-/// Type of transforms between frames.
+/// Type of a message with transforms between frames.
 pub const TF_MESSAGE: Type = Type {
     name: "tf2_msgs/msg/TFMessage",
     text: text!(
@@ -152,10 +152,10 @@ pub const TF_MESSAGE: Type = Type {
     ),
 };
 
-/// A parsed definition: a type and those that it contains.
+/// A parsed definition: a type and the types that it contains.
 #[derive(Clone, Debug)]
 pub(crate) struct MessageDef<'a> {
-    /// Types by name. The type itself is the first. The names of contained types have no `msg`, as in
+    /// Name and fields of each type. The type itself is the first. The names of contained types have no `msg`, as in
     /// `std_msgs/Header`.
     types: Vec<(&'a str, Vec<Field<'a>>)>,
 }
@@ -166,7 +166,7 @@ pub(crate) struct Field<'a> {
     pub(crate) name: &'a str,
     /// Name of a primitive type or of a contained type.
     pub(crate) type_name: &'a str,
-    /// Whether it is a sequence of any length.
+    /// Whether the field is a sequence of any length.
     pub(crate) is_sequence: bool,
 }
 
@@ -198,7 +198,8 @@ fn field(line: &str) -> Option<Field<'_>> {
     Some(Field { name, type_name: element_type.unwrap_or(type_name), is_sequence: element_type.is_some() })
 }
 
-/// Returns the description of the type and of those that it contains, sorted by name. The spaces are part of the hash.
+/// Returns the text that is hashed: the description of the type, and then the descriptions of the types that it
+/// contains, sorted by name. The hash covers the spaces, too.
 fn description(layout: &MessageDef<'_>) -> String {
     let mut types: Vec<String> =
         layout.types.iter().map(|(name, fields)| type_description(name, fields)).collect();
@@ -258,8 +259,8 @@ const SEQUENCE_OFFSET: u8 = 144;
 mod tests {
     use super::*;
 
-    /// Hashes that PyPI's `rosbags` 0.11.9 computes for Jazzy, and `zenoh-ros2-sdk` 0.1.8 from the same definitions.
-    /// Other published code has the same hashes, taken from ROS itself.
+    /// Hashes that PyPI's `rosbags` 0.11.9 computes for Jazzy. `zenoh-ros2-sdk` 0.1.8 computes the same hashes from the
+    /// same definitions. Other published code has the same hashes, taken from ROS itself.
     const GOLDEN: [(Type, &str); 7] = [
         (LASER_SCAN, "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"),
         (POINT_CLOUD, "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"),

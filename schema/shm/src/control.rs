@@ -1,5 +1,5 @@
 //! The control service: requests of clients and responses of the hub. One event wakes the hub, and another event wakes
-//! clients. The hub's crate handles requests.
+//! clients. The crate `hub/daemon` handles requests.
 
 use std::fmt::Debug;
 
@@ -18,7 +18,7 @@ use crate::resource_limits::{CONTROL_DESCRIPTORS, check_descriptors};
 use crate::service::{OpenFailure, clients_full, create, name, open, port_failure};
 use crate::wake::{Listener, Notifier, WakeService, create_listener, notifier, open_event, take_wakeups};
 
-/// The hub's end. Each request wakes the listener [`requests`](Self::requests).
+/// The hub's end of the control service. Each request wakes the listener [`requests`](Self::requests).
 pub struct ControlServer {
     server: server::Server<LocalService, [u8], (), [u8], ()>,
     requests: Listener,
@@ -30,7 +30,7 @@ pub struct ControlServer {
 /// A request that has no response yet. If it is dropped, the client gets no response.
 pub struct IncomingRequest(ActiveRequest<LocalService, [u8], (), [u8], ()>);
 
-/// A client's end.
+/// A client's end of the control service.
 pub struct ControlClient {
     client: client::Client<LocalService, [u8], (), [u8], ()>,
     requests: Notifier,
@@ -49,8 +49,8 @@ impl ControlServer {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, or if another hub is its server, and
-    /// [`Kind::Incompatible`] if the service has another layout.
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, or if another hub already serves the
+    /// service, and [`Kind::Incompatible`] if the service has another layout.
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
         let service = name(CONTROL)?;
         let control = create(node, &service, || {
@@ -78,12 +78,13 @@ impl ControlServer {
         Ok(ControlServer { server, requests, responses, control, _events: [request_event, response_event] })
     }
 
-    /// Returns the listener that requests wake.
+    /// Returns the listener that each request wakes.
     pub fn requests(&self) -> &Listener {
         &self.requests
     }
 
-    /// Returns the next request whose client still waits, or `None` if there is no request. Takes the pending wake-ups.
+    /// Returns the next request whose client still waits, or `None` if there is no request. Takes the pending wake-ups
+    /// of the listener.
     ///
     /// # Errors
     ///
@@ -96,7 +97,7 @@ impl ControlServer {
             .map_err(|error| port_failure(self.control.name(), &error))
     }
 
-    /// Sends `response` to the client of `request`, if it still waits.
+    /// Sends `response` to the client of `request`, if the client still waits.
     ///
     /// # Errors
     ///
@@ -167,7 +168,7 @@ impl ControlClient {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if it cannot be sent, and [`Kind::NoHub`] if no hub receives it.
+    /// Returns [`Kind::ResourceExhausted`] if the request cannot be sent, and [`Kind::NoHub`] if no hub receives it.
     pub fn send(&self, request: &Request) -> Result<SentRequest, Failure> {
         let unsent = |error: &dyn Debug| {
             Failure::new(
@@ -186,7 +187,7 @@ impl ControlClient {
         Ok(SentRequest(pending))
     }
 
-    /// Returns the listener that responses wake, including those to other clients.
+    /// Returns the listener that each response wakes, including responses to other clients.
     pub fn responses(&self) -> &Listener {
         &self.responses
     }
@@ -197,7 +198,7 @@ impl SentRequest {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] if it cannot be received or decoded.
+    /// Returns [`Kind::Failed`] if the response cannot be received or decoded.
     pub fn try_receive(&self) -> Result<Option<Response>, Failure> {
         let unreadable = |error: &dyn Debug| {
             Failure::new(Kind::Failed, format!("cannot read the hub's response: {error:?}"), "")
@@ -206,7 +207,7 @@ impl SentRequest {
         Response::decode(received.payload()).map(Some).ok_or_else(|| unreadable(&received.payload()))
     }
 
-    /// Returns whether the hub still has the request: it runs and has not dropped it.
+    /// Returns whether the hub still has the request: the hub runs, and has not dropped the request.
     pub fn is_open(&self) -> bool {
         self.0.is_connected()
     }
@@ -227,7 +228,8 @@ fn create_event(node: &Node, service: &str) -> Result<WakeService, Failure> {
     })
 }
 
-/// Bytes that are reserved for a request. Most requests have no model.
+/// Number of bytes that are reserved for a request at first. Most requests have no model; the library allocates more
+/// for those that have one.
 const RESERVED_REQUEST_LEN: usize = 64;
 /// ID of both events.
 const EVENT_ID: usize = 1;

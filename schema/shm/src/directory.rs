@@ -1,11 +1,11 @@
 //! Private directories of this user: the directory of a domain, and the state directory, which survives restarts. Both
 //! contain small files and locks.
 //!
-//! A directory is opened component by component from the root of the file system, and every file in it relative to the
-//! open directory. No other user can put another directory in its place. The last components (base and domain) must
-//! belong to this user, no other user may be able to write to them, and they must not be links. In the components above
-//! them, a link is followed if root or this user made it in a directory that no other user can write to: `/home` or
-//! `/var/run` may be links. The owners of the directories above the base are not checked.
+//! A directory is opened component by component from the root of the file system, and every file in it is opened
+//! relative to the open directory. No other user can therefore substitute another directory. The last components (base
+//! and domain) must belong to this user, no other user may be able to write to them, and they must not be links. In the
+//! components above them, a link is followed if root or this user made it in a directory that no other user can write
+//! to: `/home` or `/var/run` may be links. The owners of the directories above the base are not checked.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -50,9 +50,9 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] with the path, its owner and the remedy if base or domain belongs to another user, can
-    /// be written to by others, or is reached by a link that another user could have made. Returns
-    /// [`Kind::ResourceExhausted`] if descriptors run out.
+    /// Returns [`Kind::OtherUser`] with the path, its owner and the remedy if base or domain belongs to another user.
+    /// Returns [`Kind::Failed`] if base or domain can be written to by others, or is reached by a link that another
+    /// user could have made. Returns [`Kind::ResourceExhausted`] if descriptors run out.
     pub fn open(root: &Path) -> Result<Option<Directory>, Failure> {
         Directory::walk(root, 2, Purpose::Domain, effective_uid(), false)
     }
@@ -66,8 +66,8 @@ impl Directory {
         Directory::create_directory(root, 2, Purpose::Domain)
     }
 
-    /// Returns the directory `path`, in which programs keep files across restarts. This user must own its last
-    /// `owned_components` components. Missing directories are created for this user only.
+    /// Returns the directory `path`, in which programs keep files across restarts. This user must own the last
+    /// `owned_components` components of the path. Missing directories are created for this user only.
     ///
     /// # Errors
     ///
@@ -80,8 +80,8 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`], and does not open the file, if it is a link, is not a regular file, or belongs to
-    /// another user.
+    /// Returns [`Kind::OtherUser`] if the file belongs to another user, and [`Kind::Failed`] if it is a link or not a
+    /// regular file.
     pub fn file(&self, name: &str) -> Result<Option<File>, Failure> {
         match self.open_file(name, OFlags::RDONLY) {
             Err(Errno::NOENT) => Ok(None),
@@ -89,7 +89,7 @@ impl Directory {
         }
     }
 
-    /// Returns the file `name` for reading and writing. It is created with mode 0600 if it does not exist.
+    /// Returns the file `name` for reading and writing. A file that does not exist is created with mode 0600.
     ///
     /// # Errors
     ///
@@ -142,7 +142,7 @@ impl Directory {
         let _ = unlinkat(&self.fd, name, AtFlags::REMOVEDIR);
     }
 
-    /// Returns the names and the metadata of the directory's entries. For a link, it is the metadata of the link
+    /// Returns the names and the metadata of the directory's entries. The metadata of a link is that of the link
     /// itself.
     pub(crate) fn entries(&self) -> Vec<(OsString, Stat)> {
         let Ok(entries) = Dir::read_from(&self.fd) else { return Vec::new() };
@@ -152,7 +152,8 @@ impl Directory {
         entries.map(|(stat, name)| (name, stat)).collect()
     }
 
-    /// Returns the directory `name` in this one. `None` if it does not exist, is a link, or belongs to another user.
+    /// Returns the directory `name` in this directory. Returns `None` if it does not exist, is a link, or belongs to
+    /// another user.
     pub(crate) fn subdirectory(&self, name: &str) -> Option<Directory> {
         let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::RDONLY;
         let fd = openat(&self.fd, name, flags, Mode::empty()).ok()?;
@@ -160,7 +161,7 @@ impl Directory {
         is_own.then(|| Directory { fd, path: self.path.join(name), purpose: self.purpose })
     }
 
-    /// Removes the directory if it is empty and still has its path. Returns whether it is removed.
+    /// Removes the directory if it is empty and is still at its path. Returns whether the directory is removed.
     pub(crate) fn remove_itself(&self) -> bool {
         let at_path = self.path.symlink_metadata().map(|it| (it.dev(), it.ino()));
         let is_at_path =
@@ -222,7 +223,7 @@ impl Directory {
                 return Ok(None);
             }
             for (number, component) in components_to_own.iter().enumerate() {
-                // Only the directory itself is read.
+                // Only the last directory is read. The directories above it are only passed through.
                 let flags = if number + 1 == owned_components { OFlags::RDONLY } else { OFlags::PATH };
                 if !walk.enter_own(component, make, flags)? {
                     return Ok(None);
@@ -259,7 +260,7 @@ impl Purpose {
             WalkError::Writable(path, mode) => {
                 let (path, mode) = (path.display(), mode & 0o7777);
                 let hint = match self {
-                    // A directory for all users, such as /tmp, keeps its mode.
+                    // A sticky directory, such as /tmp, is for all users and must keep its mode.
                     Purpose::Domain if mode & STICKY != 0 => {
                         format!("choose your own directory, for example --root {path}/NAME")
                     }
@@ -300,8 +301,8 @@ impl Purpose {
 
 const STATE_REMEDY: &str = "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user";
 
-/// A lock on a file of a domain's directory. It ends with its process. The file contains the ID of the process that
-/// holds the lock, because the kernel does not report this ID.
+/// A lock on a file of a domain's directory. The lock ends when its process ends. The file contains the ID of the
+/// process that holds the lock, because the kernel does not report this ID.
 #[derive(Debug)]
 pub(crate) struct FileLock {
     file: File,
@@ -313,8 +314,8 @@ impl FileLock {
     ///
     /// # Errors
     ///
-    /// Returns the failure of `on_held` if another process has the lock. Its argument is the ID of that process, or 0
-    /// if the process has not written it yet. Returns [`Kind::Failed`] if the file cannot be locked.
+    /// Returns the failure of `on_held` if another process has the lock. The argument of `on_held` is the ID of that
+    /// process, or 0 if the process has not written it yet. Returns [`Kind::Failed`] if the file cannot be locked.
     pub(crate) fn acquire(
         root: &Path,
         name: &str,
@@ -323,7 +324,8 @@ impl FileLock {
         let file = loop {
             let file = Directory::create(root)?.open_or_create(name)?;
             match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
-                // The previous holder may have removed the domain. The next process would then lock another file.
+                // The previous holder may have removed the file with its domain. The next process would then create and
+                // lock another file, so try again.
                 Ok(_) if file.metadata().is_ok_and(|metadata| metadata.nlink() == 0) => {}
                 Ok(_) => break file,
                 Err(nix::Error::EAGAIN | nix::Error::EACCES) => return Err(on_held(pid_in(&file))),
@@ -345,7 +347,8 @@ impl FileLock {
 }
 
 impl Drop for FileLock {
-    /// Closing is not enough, because a process that is just being started briefly has a copy of the descriptor.
+    /// Releases the lock. Closing the file is not enough: a child process that is just being started has a copy of the
+    /// descriptor for a moment, and the copy would keep the lock.
     fn drop(&mut self) {
         let _ = fcntl(self.file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_UNLCK)));
     }
@@ -357,7 +360,7 @@ pub(crate) struct ServiceCreationLock {
 }
 
 impl ServiceCreationLock {
-    /// Waits for the lock. A process holds it only while it creates one service.
+    /// Waits for the lock. A process holds the lock only while it creates one service.
     pub(crate) fn wait(root: &Path) -> Result<ServiceCreationLock, Failure> {
         let file = Directory::create(root)?.open_or_create(CREATION_LOCK_FILE)?;
         loop {
@@ -396,7 +399,7 @@ pub(crate) fn lock_text(file: &File) -> String {
     String::from_utf8_lossy(&bytes[..length]).into_owned()
 }
 
-/// Returns a lock of the whole file. `l_pid` must be 0 for open file descriptions.
+/// Returns a lock of the whole file. `l_pid` must be 0 in locks of open file descriptions.
 fn whole_file(kind: libc::c_int) -> flock {
     flock {
         l_type: kind as libc::c_short,
@@ -412,22 +415,23 @@ const CREATION_LOCK_FILE: &str = "making.lock";
 /// Directory of the small text files that a domain keeps across restarts: `$STATE_DIRECTORY/DOMAIN`, otherwise
 /// `$XDG_STATE_HOME/scanhub/DOMAIN`, otherwise `~/.local/state/scanhub/DOMAIN`.
 ///
-/// The reader of a file checks its content, which may come from another version or be missing. Losing a file only costs
-/// time.
+/// The reader of a file checks its content, which may come from another version or be missing. If a file is lost, its
+/// content is learned again, which only takes time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StateDirectory {
     path: PathBuf,
 }
 
 impl StateDirectory {
-    /// Returns the directory that contains the directories of all domains, as the environment of this process names it.
-    /// It is the directory that systemd created for the service, otherwise the user's own directory. `None` if the
-    /// environment names no directory.
+    /// Returns the directory that contains the state directories of all domains. The environment of this process names
+    /// it: it is the directory that systemd created for the service, otherwise the user's own directory. Returns `None`
+    /// if the environment names no directory.
     pub fn base() -> Option<PathBuf> {
         base_in(|name| std::env::var_os(name))
     }
 
-    /// Returns the directory of `domain`, which need not exist; `None` as for [`base`](Self::base).
+    /// Returns the directory of `domain`, which need not exist. Returns `None` if the environment names no directory,
+    /// as for [`base`](Self::base).
     pub fn of_domain(domain: &str) -> Option<StateDirectory> {
         Some(StateDirectory::at(StateDirectory::base()?.join(domain)))
     }
@@ -446,8 +450,9 @@ impl StateDirectory {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] with owner and remedy if the directory, or the directory above it, belongs to another
-    /// user, can be written to by others, or is reached by a link that another user could have made.
+    /// Returns [`Kind::OtherUser`] with owner and remedy if the directory, or the directory above it, belongs to
+    /// another user. Returns [`Kind::Failed`] if one of them can be written to by others, or is reached by a link that
+    /// another user could have made.
     pub fn check(&self) -> Result<(), Failure> {
         self.open().map(drop)
     }
@@ -478,8 +483,9 @@ impl StateDirectory {
         self.create()?.replace(name, text.as_bytes()).map_err(not_saved)
     }
 
-    /// Waits for the lock that a process holds between reading and writing the file `name`, and returns it. The lock
-    /// ends when it is dropped. Creates the directory as [`write`](Self::write) does, and a file for the lock.
+    /// Waits for the lock that a process holds between reading and writing the file `name`. Returns the locked file,
+    /// and the lock ends when this file is dropped. Creates the directory as [`write`](Self::write) does, and a file
+    /// for the lock.
     ///
     /// # Errors
     ///
@@ -516,7 +522,8 @@ impl StateDirectory {
     }
 }
 
-/// The directory of the domain, and above it the directory of all domains.
+/// Number of components of the path that this user must own: the directory of the domain, and above it the directory of
+/// all domains.
 const OWNED_COMPONENTS: usize = 2;
 
 /// Adds to the message that no state can be saved.
@@ -635,7 +642,7 @@ mod tests {
         let message = refusal(Directory::open(&here.at("link/x/domain")));
         assert!(message.contains("is a link of user") && message.contains("mode 1777"), "{message}");
         here.mode("", 0o700);
-        // For another user, only links of root are followed.
+        // In a walk for another user, only links of root are followed.
         if effective_uid() != 0 {
             let message = refusal(Directory::walk(
                 &here.at("link/x/domain"),

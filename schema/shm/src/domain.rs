@@ -14,14 +14,15 @@ use scanhub_schema::{Failure, Kind};
 /// The default domain.
 pub const DEFAULT_DOMAIN: &str = "scanhub";
 
-/// Root and prefix together, with the random part of the prefix, must have fewer bytes than this. The path of a
-/// listener's socket has at most 107 bytes (unix(7)), and contains a number of up to 35 digits and 7 other bytes.
+/// Root and prefix together, with the random part of the prefix, must have fewer bytes than this limit. The library
+/// puts root and prefix into the path of a socket, which has at most 107 bytes (unix(7)). This path also contains a
+/// number of up to 35 digits and 7 other bytes.
 const LOCATION_LEN_LIMIT: usize = 66;
 
-/// Bytes that are added to the prefix (`segments.rs`): five random letters, and `_`.
+/// Number of bytes that `segments.rs` appends to the prefix: five random letters, and `_`.
 const RANDOM_LEN: usize = 6;
 
-/// Directory that systemd creates for the service. Clients outside of the service search it too.
+/// Directory that systemd creates for the service. Clients outside of the service search this directory, too.
 const SERVICE_BASE: &str = "/run/scanhub";
 
 /// A domain at its location.
@@ -68,8 +69,8 @@ impl Domain {
         Domain::at(name, &base)
     }
 
-    /// Returns the locations in which a client searches for domain `name`, in this order: only below `base` if it is
-    /// given, otherwise in each directory that a hub may have chosen. Locations whose path is too long for a hub are
+    /// Returns the locations in which a client searches for domain `name`, in this order: only below `base` if `base`
+    /// is given, otherwise in each directory that a hub may have chosen. Locations whose path is too long for a hub are
     /// left out.
     ///
     /// # Errors
@@ -112,7 +113,7 @@ impl Domain {
     }
 }
 
-/// Variables of a process's environment that name locations, and its user.
+/// Variables of a process's environment that name locations, and the user of the process.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Environment {
     /// RUNTIME_DIRECTORY, which systemd sets for the service.
@@ -169,21 +170,22 @@ impl Environment {
 pub struct RunningHub {
     /// Process ID.
     pub pid: u32,
-    /// ID of the user that it runs as.
+    /// ID of the user that the hub runs as.
     pub uid: u32,
-    /// Name of that user; `#` and the ID, as `sudo -u` takes it, if the user has no name.
+    /// Name of this user. For a user without a name, it is `#` and the ID, which `sudo -u` accepts.
     pub user: String,
-    /// Domain of the hub. `None` if only its environment may say, which other users cannot read.
+    /// Domain of the hub. `None` if the domain may be set only in the hub's environment, which other users cannot read.
     pub domain: Option<String>,
-    /// Directory that contains its domain. `None` if only its environment says, which other users cannot read.
+    /// Directory that contains the domain. `None` if this directory depends on the hub's environment, which other users
+    /// cannot read.
     pub base: Option<PathBuf>,
-    /// The program, as it was started.
+    /// Path or name of the program with which the hub was started.
     program: String,
 }
 
 impl RunningHub {
-    /// Returns the hubs on the machine whose files are below `root`, by process ID. Processes that this user may not
-    /// see are missing.
+    /// Returns the hubs that run on this machine, sorted by process ID. `root` is the root of the file system, except
+    /// in tests. Processes that this user may not see are missing.
     pub fn all(root: &Path) -> Vec<RunningHub> {
         let users = fs::read_to_string(root.join("etc/passwd")).unwrap_or_default();
         let processes = fs::read_dir(root.join("proc")).into_iter().flatten().flatten();
@@ -197,7 +199,8 @@ impl RunningHub {
         hubs
     }
 
-    /// Returns the hub that the process at `path` runs.
+    /// Returns the hub that process `pid` runs, or `None` if the process does not run a hub. `path` is the directory of
+    /// the process in /proc, and `users` is the text of /etc/passwd.
     fn of_process(path: &Path, pid: u32, users: &str) -> Option<RunningHub> {
         let text = |name: &str| fs::read_to_string(path.join(name)).ok();
         if text("comm")?.trim_end() != "scanhub" {
@@ -217,7 +220,7 @@ impl RunningHub {
             (!value.is_empty()).then(|| OsStr::from_bytes(value).to_owned())
         };
         let base = match command.root {
-            // A relative directory counts from the working directory of the process, which other users cannot read.
+            // A relative directory is relative to the working directory of the process, which other users cannot read.
             Some(root) => Some(fs::read_link(path.join("cwd")).map_or(root.clone(), |cwd| cwd.join(root))),
             None => environment.is_some().then(|| Environment::of(variable, uid).base_of_hub()),
         };
@@ -228,7 +231,7 @@ impl RunningHub {
         if let Some(domain) = &domain {
             check_name(domain).ok()?;
         }
-        // A relative path counts from the process's working directory.
+        // A relative path is relative to the process's working directory.
         let program = if command.program.contains('/') && !command.program.starts_with('/') {
             let directory = fs::read_link(path.join("cwd"));
             directory.map_or("scanhub".to_owned(), |it| it.join(&command.program).display().to_string())
@@ -255,7 +258,7 @@ impl RunningHub {
     /// domain that the caller searched for. If the hub's domain is unknown, the command lists the domains of the hub's
     /// user.
     pub fn command(&self, verb: &str, domain: &str, caller: &Environment) -> String {
-        // sudo resets the environment of the command.
+        // sudo resets the environment, so the command of another user runs with the defaults of that user.
         let (sudo, environment, domain) = if self.uid == caller.uid {
             (String::new(), caller.clone(), domain)
         } else {
@@ -319,7 +322,8 @@ impl CommandLine {
     }
 }
 
-/// Returns `word` as one word of a shell. Brackets, which zsh expands, blanks and an empty word need quotes.
+/// Returns `word` as one word of a shell. An empty word needs quotes, and so does a word with blanks or with brackets,
+/// which zsh expands.
 pub fn shell_word(word: &str) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:@+,=".contains(c);
     if !word.is_empty() && word.chars().all(is_plain) {
@@ -328,7 +332,7 @@ pub fn shell_word(word: &str) -> String {
     format!("'{}'", word.replace('\'', r"'\''"))
 }
 
-/// Directories that sudo looks for programs in (sudoers(5), `secure_path`).
+/// Directories in which sudo searches for programs (sudoers(5), `secure_path`).
 const USUAL_DIRECTORIES: [&str; 6] =
     ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin"];
 
@@ -402,7 +406,7 @@ mod tests {
                 Err(Kind::Configuration)
             );
         }
-        // "/" + 52 + "/a" and "sh_a_xxxxx_" are 66.
+        // The root `/`, 52 letters and `/a`, and the prefix `sh_a_xxxxx_`, have 66 bytes.
         let base = format!("/{}", "b".repeat(52));
         assert_eq!(
             Domain::at("a", Path::new(&base)).map_err(|failure| failure.kind),
@@ -419,7 +423,7 @@ mod tests {
 
     const PASSWD: &str = "root:x:0:0:root:/root:/bin/sh\nscanhub:x:998:997::/:/usr/sbin/nologin\nalice:x:1000:1000::/home/alice:/bin/sh\n";
 
-    /// A made-up machine: files below a temporary directory.
+    /// A simulated machine: files below a temporary directory.
     struct Machine(TempDir);
 
     impl Machine {
@@ -430,7 +434,7 @@ mod tests {
             Machine(root)
         }
 
-        /// Adds a process; other users cannot read an environment of `None`.
+        /// Adds a process. If `environment` is `None`, the environment of the process cannot be read.
         fn process(&self, pid: u32, uid: u32, command: &[&str], environment: Option<&str>) {
             let path = self.0.path().join(format!("proc/{pid}"));
             fs::create_dir_all(&path).unwrap();
@@ -492,7 +496,7 @@ mod tests {
             hub.command("list", "scanhub", &user(caller))
         };
         let run = ["scanhub", "run"];
-        // Its domain may be in its environment, which other users cannot read.
+        // The hub's domain may be set in its environment, which other users cannot read.
         assert_eq!(command(0, &run, None, 1000), "sudo scanhub list --domains");
         let named = ["/usr/local/bin/scanhub", "run", "--domain", "scanhub"];
         assert_eq!(command(998, &named, None, 1000), "sudo -u scanhub scanhub list");
@@ -509,7 +513,7 @@ mod tests {
         );
         let flags = ["/opt/scanhub", "run", "--root=/srv/a b", "--domain=lab"];
         assert_eq!(command(0, &flags, None, 1000), "sudo /opt/scanhub list --domain lab --root '/srv/a b'");
-        // Its working directory cannot be read.
+        // The working directory of the hub cannot be read, so the command has only the program's name.
         assert_eq!(command(0, &["./scanhub", "run"], None, 1000), "sudo scanhub list --domains");
         assert_eq!(
             command(1000, &["scanhub", "run", "--domain", "lab"], logged_in, 1000),

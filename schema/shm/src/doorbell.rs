@@ -1,16 +1,17 @@
 //! The doorbell of a sensor: three futex words in shared memory, one for each [`DoorbellWord`], on which subscribers
-//! sleep. One system call of the hub wakes all threads that sleep on a word. An event needs one message for each
-//! subscriber.
+//! sleep. One system call of the hub wakes all threads that sleep on a word. An event of the library would need one
+//! message for each subscriber.
 //!
-//! The page is in /dev/shm under the domain's prefix. Subscribers map it read-only. A killed hub leaves the page. The
-//! next hub continues to use this page, so that it can wake subscribers that still sleep on it. A hub that ends
-//! normally closes the page.
+//! The words are in one page of memory, a file in /dev/shm whose name starts with the domain's prefix. Subscribers map
+//! the page read-only. A killed hub leaves the page. The next hub continues to use this page, so that it can wake
+//! subscribers that still sleep on it. A hub that ends normally closes the page.
 //!
 //! A fourth word counts how often a program has attached to one of the sensor's services. The hub reads this word
-//! instead of the lists of subscribers. iceoryx2 has a list of subscribers for each topic, each in a different page.
+//! instead of the lists of subscribers. iceoryx2 has a list of subscribers for each topic, and each list is in a
+//! different page.
 //!
 //! The operations on words, and their memory orders, must be right in all interleavings of hub and subscribers. The
-//! tests run all of them.
+//! tests run all interleavings.
 #![allow(unsafe_code)]
 
 use std::fs::{File, OpenOptions};
@@ -33,7 +34,7 @@ use crate::processes::Node;
 use crate::resource_limits::{SHARED_MEMORY_DIRECTORY, memory_failure};
 use crate::segments::{Segment, name_conflict};
 
-/// The hub's end of a doorbell. Dropping it closes the doorbell and wakes all subscribers once more.
+/// The hub's end of a doorbell. When it is dropped, it closes the doorbell and wakes all subscribers once more.
 #[derive(Debug)]
 pub(crate) struct DoorbellRinger {
     mapping: PageMapping,
@@ -44,8 +45,8 @@ impl DoorbellRinger {
     /// Opens the doorbell of `sensor` that a killed hub has left, because subscribers may still have it mapped. Creates
     /// a new doorbell if there is none.
     ///
-    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, and [`Kind::Failed`] if a file of another user
-    /// has the doorbell's name.
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for the page, and [`Kind::OtherUser`] if a file of
+    /// another user has the doorbell's name.
     pub(crate) fn open_or_create<S: Service>(
         node: &Node<S>,
         sensor: &str,
@@ -84,7 +85,8 @@ impl DoorbellRinger {
             if page.page().closed.load(Ordering::Relaxed) == 0 {
                 return Ok(page);
             }
-            // The hub of this page was killed while it was ending. No subscriber may sleep on this page any more.
+            // The page is closed, so its hub was killed while it was ending. Subscribers leave a closed page, so create
+            // a new one.
             std::fs::remove_file(path)?;
         }
     }
@@ -92,8 +94,8 @@ impl DoorbellRinger {
 
 impl Drop for DoorbellRinger {
     fn drop(&mut self) {
-        // This order ensures that a hub that is killed in between does not leave a page that is not closed but has no
-        // name.
+        // Close the page before removing its name. If the hub was killed after removing the name of an open page,
+        // subscribers would sleep on a page that the next hub cannot find.
         let words = self.mapping.page();
         close(&words.closed, words.word(DoorbellWord::First));
         ring(words.word(DoorbellWord::Last));
@@ -103,8 +105,8 @@ impl Drop for DoorbellRinger {
 }
 
 /// Counts at the doorbell of `sensor` that this process has attached to one of the sensor's services, so that the hub
-/// sends it the next sample. If the doorbell does not exist or cannot be written, the hub finds the subscriber when it
-/// starts, or after a tenth of a second.
+/// sends this process the next sample. If the doorbell does not exist or cannot be written, the hub finds the
+/// subscriber when the hub starts, or after a tenth of a second.
 pub(crate) fn count_attached<S: Service>(node: &Node<S>, sensor: &str) {
     let path = path(node, sensor);
     if let Ok(file) = open_own(OpenOptions::new().read(true).write(true), &path)
@@ -124,8 +126,8 @@ impl Doorbell {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Failed`] if the file belongs
-    /// to another user.
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::OtherUser`] if the file
+    /// belongs to another user.
     pub fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<Doorbell>, Failure> {
         let path = path(node, sensor);
         let mapped = open_own(OpenOptions::new().read(true), &path).and_then(|file| {
@@ -148,7 +150,7 @@ impl Doorbell {
     }
 
     /// Returns the number of times that the hub has rung `word`, modulo 2^32. A subscriber that receives after this
-    /// call gets every sample that was sent before.
+    /// call gets every sample that was sent before these rings.
     pub fn ring_count(&self, word: DoorbellWord) -> u32 {
         read_count(self.0.page().word(word))
     }
@@ -159,7 +161,7 @@ impl Doorbell {
     }
 }
 
-/// The system cannot wait for several words at once (Linux before 5.16, some containers).
+/// Error of a system that cannot wait for several words at once (Linux before 5.16, some containers).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct WaitUnsupported;
 
@@ -198,8 +200,8 @@ pub fn wait_on_doorbells(
     }
 }
 
-/// Words of the page, each on a separate cache line. Only `attached` is next to `first`, because the hub uses both for
-/// each telegram, and `attached` seldom changes.
+/// Words of the page, each on a separate cache line. Only `attached` shares the cache line of `first`, because the hub
+/// uses both words for each telegram, and `attached` seldom changes.
 #[repr(C)]
 struct DoorbellPage {
     first: AtomicU32,
@@ -240,15 +242,15 @@ fn path<S: Service>(node: &Node<S>, sensor: &str) -> PathBuf {
     Path::new(SHARED_MEMORY_DIRECTORY).join(format!("{}{sensor}.bell", node.config().global.prefix))
 }
 
-/// Opens the file at `path` if it belongs to this user alone. Any user can create a file there, or a pipe that would
-/// block.
+/// Opens the file at `path` if it belongs to this user alone. Any user can create a file at this path, or a pipe.
+/// NONBLOCK is set because opening a pipe would block.
 fn open_own(options: &mut OpenOptions, path: &Path) -> Result<File, OpenError> {
     if let Some(segment) = Segment::at(path).filter(Segment::is_foreign) {
         return Err(OpenError::Foreign(segment));
     }
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
     let file = options.mode(0o600).custom_flags(flags.bits() as i32).open(path)?;
-    // Another user may have created it after the first check.
+    // Another user may have created the file after the first check.
     match Segment::of(path, &file.metadata()?) {
         segment if segment.is_foreign() => Err(OpenError::Foreign(segment)),
         _ => Ok(file),
@@ -296,7 +298,7 @@ fn increment(counter: &impl FutexWord) {
     counter.fetch_add(1, Ordering::Release);
 }
 
-/// Returns the `counter` of rings. All samples that were sent before it was incremented can be received after this
+/// Returns the `counter` of rings. All samples that were sent before the last increment can be received after this
 /// call.
 fn read_count<W: FutexWord>(counter: &W) -> u32 {
     // Only a relaxed load may touch memory that is mapped read-only.

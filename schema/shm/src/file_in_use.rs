@@ -10,8 +10,8 @@ use nix::libc::{self, c_int};
 use rustix::fs::OFlags;
 
 /// Returns whether no process has the file at `path` open or mapped. The kernel grants a lease for writing only in this
-/// case (fcntl(2)). The check must use the kernel, because it also covers processes that this process cannot see, for
-/// example in a container that shares the memory.
+/// case (fcntl(2)). The check must use the kernel, because this process cannot see all other processes, for example
+/// those in a container that shares the memory.
 ///
 /// Returns false if the answer is unknown, for example for a file of another user. A process that opens the file during
 /// this call waits until the call returns.
@@ -24,13 +24,13 @@ pub fn is_unused(path: &Path) -> bool {
         unsafe { libc::fcntl(file.as_raw_fd(), command, argument) == 0 }
     };
     // If another process waits for the lease, the kernel sends a signal to the holder. The default signal would end
-    // this process.
+    // this process, but SIGURG is ignored by default.
     control(F_SETSIG, libc::SIGURG)
         && control(libc::F_SETLEASE, libc::F_WRLCK)
         && control(libc::F_SETLEASE, libc::F_UNLCK)
 }
 
-/// asm-generic/fcntl.h.
+/// Command that sets the signal that the holder of a lease receives (asm-generic/fcntl.h).
 const F_SETSIG: c_int = 10;
 
 #[cfg(test)]

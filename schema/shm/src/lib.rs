@@ -1,7 +1,7 @@
-//! The shared memory of a domain: where it is, who publishes in it, and the services of its topics. Only this crate
-//! names the builders of iceoryx2; all other code uses its ports.
+//! The shared memory of a domain: its location, the locks of its publishers, and the services of its topics. Only this
+//! crate uses the builders of iceoryx2. All other code uses only the ports of iceoryx2.
 //!
-//! The modules form layers. Each one uses only modules that are before it in this list:
+//! The modules form layers. Each module uses only modules that are before it in this list:
 //!
 //! - locations and files of a domain: `domain`, `resource_limits`, `directory`, `file_in_use`, `segments`
 //! - processes: `processes`
@@ -26,12 +26,12 @@ pub use doorbell::{Doorbell, WaitUnsupported, wait_on_doorbells};
 pub use file_in_use::is_unused;
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
-/// Shared memory between processes, with ports that stay in their thread; nodes and services may move. The hub uses
-/// it.
+/// Shared memory between processes, with ports that must stay in the thread that created them. Nodes and services may
+/// move between threads. The hub uses this kind of shared memory.
 pub use iceoryx2::prelude::ipc::Service as LocalService;
 /// Shared memory between processes, with ports and samples that may move between threads. These ports differ from the
 /// ports of [`LocalService`] only in a lock within the process, so both kinds of ports can attach to one topic. Clients
-/// use it.
+/// use this kind of shared memory.
 pub use iceoryx2::prelude::ipc_threadsafe::Service as ThreadSafeService;
 pub use iceoryx2::prelude::{CallbackProgression, PortFactory, ZeroCopySend};
 /// Kind of shared memory: [`LocalService`] or [`ThreadSafeService`].

@@ -1,7 +1,7 @@
 //! Processes of a domain: their membership, the locks of processes that publish, and the cleanup after processes that
 //! have died.
 //!
-//! - Each process joins with a [`Node`]. The last process that leaves removes the domain's names.
+//! - Each process joins with a [`Node`]. The last process that leaves removes the names of the domain's shared memory.
 //! - At most one hub, at most one listener for remote sensors, and one process for each name of a sensor, tracker or
 //!   mount hold a lock. A lock ends with its process. Subscribers query the locks but never take one.
 //! - A cleanup removes only files in shared memory that belonged to a known dead process.
@@ -43,7 +43,7 @@ pub enum Role {
     Subscriber,
 }
 
-/// Joins `domain` as a publisher whose ports stay in their thread, as [`join`] does.
+/// Joins `domain` as a publisher, as [`join`] does. The ports of this node must stay in the thread that created them.
 ///
 /// # Errors
 ///
@@ -52,7 +52,7 @@ pub fn hub_node(domain: &Domain) -> Result<Node, Failure> {
     join(domain, Role::Publisher)
 }
 
-/// Joins `domain` as a subscriber whose ports stay in their thread, as [`join`] does.
+/// Joins `domain` as a subscriber, as [`join`] does. The ports of this node must stay in the thread that created them.
 ///
 /// # Errors
 ///
@@ -66,7 +66,7 @@ pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user. For a subscriber,
+/// Returns [`Kind::OtherUser`] with owner, mode and remedy if the directory belongs to another user. For a subscriber,
 /// returns [`Kind::NoHub`] if the domain has no prefix.
 pub fn join<S: Service>(domain: &Domain, role: Role) -> Result<Node<S>, Failure> {
     set_log_level_from_env_or(LogLevel::Error);
@@ -126,7 +126,7 @@ pub struct NodeCounts {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user.
+/// Returns [`Kind::OtherUser`] with owner, mode and remedy if the directory belongs to another user.
 pub fn nodes(domain: &Domain) -> Result<NodeCounts, Failure> {
     nodes_at(domain.root())
 }
@@ -158,7 +158,7 @@ impl HubLock {
     /// # Errors
     ///
     /// Returns [`Kind::DomainHeld`] if another hub has the lock; the message names its process. Returns
-    /// [`Kind::Failed`] if the directory belongs to another user or cannot be created.
+    /// [`Kind::OtherUser`] if the directory belongs to another user, and [`Kind::Failed`] if it cannot be created.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
         PublisherLock::acquire(root, HUB_LOCK_FILE, |pid| domain_held(root, "hub", pid)).map(HubLock)
     }
@@ -173,7 +173,8 @@ impl HubLock {
     }
 }
 
-/// Lock of the listener that publishes remote sensors. It ends like a hub's lock, and both can exist in one domain.
+/// Lock of the listener that publishes remote sensors. The lock ends like a hub's lock. A hub's lock and a listener's
+/// lock can be held in one domain at the same time.
 #[derive(Debug)]
 pub struct ListenLock {
     _lock: PublisherLock,
@@ -193,7 +194,7 @@ impl ListenLock {
 }
 
 /// Lock of the process that publishes under a name: a program with a tracker or a mount, or the hub with a link.
-/// Doorbell and services of the name belong to this process alone. A hub is not necessary.
+/// Doorbell and services of the name belong to this process alone. The process can publish without a hub.
 #[derive(Debug)]
 pub struct NameLock {
     _lock: PublisherLock,
@@ -204,8 +205,8 @@ impl NameLock {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NameHeld`] if another process publishes under `name`; the message names it. Otherwise the
-    /// errors of [`HubLock::acquire`].
+    /// Returns [`Kind::NameHeld`] if another process publishes under `name`; the message names this process. Otherwise,
+    /// returns the errors of [`HubLock::acquire`].
     pub fn acquire(root: &Path, name: &str) -> Result<NameLock, Failure> {
         let lock = PublisherLock::acquire(root, &format!("name.{name}.lock"), |pid| name_taken(name, pid))?;
         Ok(NameLock { _lock: lock })
@@ -223,7 +224,7 @@ pub fn name_taken(name: &str, pid: u32) -> Failure {
     Failure::new(Kind::NameHeld, message, "end it, or choose another name")
 }
 
-/// Lock of a process that publishes, with the cleanup at its end.
+/// Lock of a process that publishes. Dropping it cleans up.
 #[derive(Debug)]
 struct PublisherLock {
     root: PathBuf,
@@ -244,7 +245,8 @@ impl PublisherLock {
 }
 
 impl Drop for PublisherLock {
-    /// Removes the names while the lock is still held, if no other process uses them. The next hub chooses other names.
+    /// Removes the domain's names in shared memory while the lock is still held, if no other process uses these names.
+    /// The next hub chooses other names.
     fn drop(&mut self) {
         // The holder of another lock uses the names, or will soon join with these names.
         let mut others = [HUB_LOCK_FILE, LISTENER_LOCK_FILE].into_iter().filter(|other| *other != self.name);
@@ -254,12 +256,12 @@ impl Drop for PublisherLock {
     }
 }
 
-/// Returns the process of the hub in the domain in `root`; 0 if the hub has not written its ID yet. `None` if no hub
-/// runs there.
+/// Returns the ID of the hub's process in the domain in `root`; 0 if the hub has not written this ID yet. Returns
+/// `None` if no hub runs in the domain.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] if the directory belongs to another user.
+/// Returns [`Kind::OtherUser`] if the directory belongs to another user.
 pub fn hub_pid(root: &Path) -> Result<Option<u32>, Failure> {
     lock_holder(root, HUB_LOCK_FILE)
 }
@@ -274,7 +276,8 @@ pub fn is_starting(root: &Path) -> Result<bool, Failure> {
     Ok(held.is_some_and(|(_, file)| lock_text(&file).lines().nth(1) != Some(READY_LINE) && is_recent(&file)))
 }
 
-/// Returns the process that publishes in `root`: the hub, or otherwise a listener. 0 as for [`hub_pid`].
+/// Returns the ID of the process that publishes in `root`: the hub, or otherwise a listener; 0 if the process has not
+/// written this ID yet. Returns `None` if neither a hub nor a listener runs.
 ///
 /// # Errors
 ///
@@ -287,8 +290,9 @@ pub fn publisher_pid(root: &Path) -> Result<Option<u32>, Failure> {
 }
 
 /// Returns the domain in which a program publishes. This is the first location, in the order in which clients search,
-/// where a hub or a listener is running. If there is none, it is the location that a hub in this `environment` would
-/// use, so that the hub that starts next uses the same domain. If `base` is given, only locations below it count.
+/// where a hub or a listener is running. If neither is running at any location, it is the location that a hub in this
+/// `environment` would use, so that the hub that starts next uses the same domain. If `base` is given, only locations
+/// below `base` are considered.
 ///
 /// # Errors
 ///
@@ -307,7 +311,8 @@ pub fn publisher_domain(
 
 fn lock_holder(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
     let Some((directory, file)) = locked_file(root, name)? else { return Ok(None) };
-    // A process that just starts or ends has the lock, and the file may have the ID of an earlier process.
+    // Without a prefix, the process with the lock is just starting or ending, and the file may have the ID of an
+    // earlier process.
     Ok(Some(if read_prefix(&directory, root)?.is_some() { pid_in(&file) } else { 0 }))
 }
 
@@ -316,7 +321,7 @@ fn lock_holder(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
 pub struct CleanupReport {
     /// Processes that had ended without cleaning up.
     pub dead: usize,
-    /// Processes that still run. Nothing that belongs to them was removed.
+    /// Processes that still run. Nothing that belongs to these processes was removed.
     pub alive: usize,
     /// Whether the domain's directory was removed.
     pub root: bool,
@@ -327,8 +332,9 @@ pub struct CleanupReport {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::DomainHeld`](scanhub_schema::Kind) if a hub or a listener publishes there, because it cleans up by
-/// itself. Returns [`Kind::Failed`](scanhub_schema::Kind) if the directory belongs to another user.
+/// Returns [`Kind::DomainHeld`](scanhub_schema::Kind) if a hub or a listener publishes in `domain`, because a hub or a
+/// listener cleans up by itself. Returns [`Kind::OtherUser`](scanhub_schema::Kind) if the directory belongs to another
+/// user.
 pub fn clean_up(domain: &Domain) -> Result<CleanupReport, Failure> {
     let root = domain.root();
     let Some(directory) = Directory::open(root)? else { return Ok(CleanupReport::default()) };
@@ -345,8 +351,8 @@ pub fn clean_up(domain: &Domain) -> Result<CleanupReport, Failure> {
 }
 
 /// Removes the domain's `directory` at `root` with everything that only running processes need: empty directories,
-/// locks, names, and the saved state of sensors. Returns whether the directory was removed. It stays if it contains
-/// anything else.
+/// locks, names, and the saved state of sensors. Returns whether the directory was removed. The directory stays if it
+/// contains anything else.
 fn remove_domain(directory: &Directory, root: &Path) -> bool {
     remove_prefix(directory, root);
     for (name, stat) in directory.entries() {
@@ -373,8 +379,8 @@ pub(crate) fn remove_names(root: &Path) {
     }
 }
 
-/// Returns the configuration of the shared-memory library; `None` for a domain without a prefix. It never comes from a
-/// file, which the library would search in the working directory.
+/// Returns the configuration of the shared-memory library; `None` for a domain without a prefix. The configuration is
+/// never read from a file, because the library would search for this file in the working directory.
 pub(crate) fn config(root: &Path) -> Result<Option<Config>, Failure> {
     let Some(prefix) = prefix_of(root)? else { return Ok(None) };
     let unusable = || Failure::new(Kind::Configuration, format!("{} cannot be a root", root.display()), "");
@@ -386,11 +392,11 @@ pub(crate) fn config(root: &Path) -> Result<Option<Config>, Failure> {
 }
 
 /// Removes unfinished service descriptions of the domain in `root`, which a hub leaves if it is killed while it creates
-/// a service. The library waits for them forever and cleans up only finished ones, so no later hub could create that
-/// service again.
+/// a service. The library waits for unfinished descriptions forever, and cleans up only finished ones. Without this
+/// function, no later hub could create that service again.
 ///
-/// The caller must hold the [`ServiceCreationLock`]. Then no process creates services, and no process has opened an
-/// unfinished one. Finished descriptions are read-only.
+/// The caller must hold the [`ServiceCreationLock`]. While the caller holds this lock, no process creates services, and
+/// no process has opened an unfinished description. Finished descriptions are read-only.
 fn remove_unfinished_services(root: &Path) {
     let Ok(Some(directory)) = Directory::open(root) else { return };
     let Some(services) = directory.subdirectory(SERVICES_DIRECTORY) else { return };
@@ -402,7 +408,7 @@ fn remove_unfinished_services(root: &Path) {
     }
 }
 
-/// Returns whether the file was written in the last minute. Returns `false` if the clock was set back since.
+/// Returns whether the file was written in the last minute. Returns `false` if the clock was set back since then.
 fn is_recent(file: &File) -> bool {
     let written = file.metadata().and_then(|metadata| metadata.modified());
     written.is_ok_and(|written| written.elapsed().is_ok_and(|age| age < MAX_START_TIME))
@@ -418,8 +424,8 @@ fn domain_held(root: &Path, program: &str, pid: u32) -> Failure {
 
 const HUB_LOCK_FILE: &str = "hub.lock";
 const LISTENER_LOCK_FILE: &str = "listen.lock";
-/// Maximum duration of a hub's start for clients. After this time, a hub counts as ready even if its version never
-/// reports that it is ready.
+/// Maximum duration of a hub's start. After this time, clients consider the hub as ready, even if the hub's version
+/// never reports that it is ready.
 const MAX_START_TIME: Duration = Duration::from_secs(60);
 /// Second line of the file of a hub's lock, which the hub writes once all topics exist.
 const READY_LINE: &str = "ready";
@@ -428,7 +434,7 @@ const READY_LINE: &str = "ready";
 const SERVICES_DIRECTORY: &str = "services";
 
 const SERVICE_SUFFIX: &str = ".service";
-/// Maximum wait for another process that is cleaning up after the same dead process.
+/// Maximum time to wait for another process that is cleaning up after the same dead process.
 const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
 
 #[cfg(test)]

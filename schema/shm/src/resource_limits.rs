@@ -18,18 +18,18 @@ use scanhub_schema::{Failure, Header, Kind, Topic, limits};
 /// Directory of POSIX shared memory on Linux.
 pub const SHARED_MEMORY_DIRECTORY: &str = "/dev/shm";
 
-/// Memory for the segments of a subscriber or control client, with a reserve for others that start at the same time.
-/// Each segment has a few pages.
+/// Bytes of shared memory for the segments of a subscriber or control client, with a reserve for other clients that
+/// start at the same time. Each segment has a few pages.
 const CLIENT_BYTES: u64 = 64 * 1024;
 
-/// Descriptors that another topic or event needs, with a reserve.
+/// Number of descriptors that each further topic or event needs, with a reserve.
 const PORT_DESCRIPTORS: u64 = 8;
 
-/// Descriptors that a client of the control service needs.
+/// Number of descriptors that a client of the control service needs.
 pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
 
-/// Fails if fewer than `needed` bytes of shared memory, in segments of at most `max_segment`, are free or allowed for
-/// this process.
+/// Fails if fewer than `needed` bytes of shared memory are free, or if the limits of this process do not allow these
+/// bytes in segments of up to `max_segment` bytes.
 ///
 /// # Errors
 ///
@@ -58,8 +58,8 @@ fn check_file_size(needed: u64) -> Result<(), Failure> {
     ))
 }
 
-/// Fails if this process may not map `needed` more bytes, plus the memory that creating them needs. Without this check,
-/// the library would leave behind a segment that it cannot map.
+/// Fails if this process may not map `needed` more bytes, plus the memory that is needed to create the segments.
+/// Without this check, the library would leave behind a segment that it cannot map.
 ///
 /// # Errors
 ///
@@ -91,7 +91,7 @@ pub fn check_address_space(needed: u64) -> Result<(), Failure> {
 pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
     let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
     let open = match std::fs::read_dir(OPEN_DESCRIPTORS_DIRECTORY) {
-        // Listing the open descriptors needs a descriptor too.
+        // Listing the open descriptors needs a descriptor too, which is not counted.
         Ok(entries) => entries.count() as u64 - 1,
         Err(error) => assumed_descriptors(&error, limit),
     };
@@ -105,11 +105,12 @@ pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
     ))
 }
 
-/// Raises the limit of descriptors to the hard limit. A publisher needs about four for each subscriber of a topic.
+/// Raises the limit of descriptors to the hard limit. A publisher needs about four descriptors for each subscriber of a
+/// topic.
 ///
 /// # Errors
 ///
-/// Returns the system's error if it refuses.
+/// Returns the system's error if it refuses the new limit.
 pub fn raise_descriptor_limit() -> io::Result<()> {
     let mut limit = getrlimit(Resource::Nofile);
     limit.current = limit.maximum;
@@ -125,13 +126,14 @@ pub fn memory_failure(what: &str) -> Failure {
     )
 }
 
-/// Fails if there is no room for another port of a client. Without this check, the library would create a port that
-/// receives nothing, or end the process.
+/// Fails if memory or descriptors do not suffice for another port of a client. Without this check, the library would
+/// create a port that receives nothing, or end the process.
 pub(crate) fn check_client() -> Result<(), Failure> {
     check_descriptors(PORT_DESCRIPTORS).and_then(|()| check_memory(CLIENT_BYTES, CLIENT_BYTES))
 }
 
-/// Returns a shortage that may be the reason why something failed in the domain at `root`.
+/// Returns a shortage that may be the reason why something failed in the domain at `root`, or `None` if nothing is
+/// short.
 pub(crate) fn find_shortage(root: &Path) -> Option<Failure> {
     let files = || {
         let directory = root.ancestors().find(|path| path.exists()).unwrap_or(root);
@@ -146,8 +148,9 @@ pub(crate) fn find_shortage(root: &Path) -> Option<Failure> {
         .err()
 }
 
-/// Returns the number of open descriptors, at most `limit`, if listing them failed with `error`. Returns 0 if only the
-/// list is unavailable, because not every container has /proc.
+/// Returns the number of open descriptors to assume if listing them failed with `error`. Returns `limit` if no
+/// descriptor was left for the list. Otherwise returns 0, because only the list may be unavailable: not every container
+/// has /proc.
 fn assumed_descriptors(error: &io::Error, limit: u64) -> u64 {
     match Errno::from_io_error(error) {
         Some(Errno::MFILE | Errno::NFILE) => limit,
@@ -170,8 +173,8 @@ fn free(stat: &StatVfs) -> u64 {
     if stat.f_blocks == 0 { u64::MAX } else { stat.f_bavail * stat.f_frsize }
 }
 
-/// Address space that is needed while segments are created: the heap of a thread, tables, and a message about a
-/// failure.
+/// Address space in bytes that is needed while segments are created: the heap of a thread, tables, and a message about
+/// a failure.
 const CREATION_BYTES: u64 = 8 << 20;
 
 /// File with the number of pages of this process. The first number counts all mapped pages.

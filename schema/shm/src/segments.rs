@@ -2,13 +2,13 @@
 //! of their domain:
 //!
 //! - The prefix is `sh_DOMAIN_WORD_`. WORD is random: without it, another user could occupy the names before the hub
-//!   starts. The prefix is stored in the file `prefix` of the domain's directory, which only this user can read. It
-//!   stays as long as any process uses it.
+//!   starts. The prefix is stored in the file `prefix` of the domain's directory, which only this user can read. The
+//!   prefix stays the same as long as any process uses it.
 //! - Segments of other users are found by name, owner and mode, without opening them. The owner is reported, because
 //!   the library only reports "internal error".
-//! - The node counter is the only segment that the shared-memory library opens to all users. Anyone who can write to it
-//!   can keep every later process out. It is therefore created here, for this user only, before the library looks for
-//!   it. The library uses the file that it finds.
+//! - The node counter is the only segment that the shared-memory library opens to all users. A user who can write to
+//!   the counter can prevent every later process from joining. This module therefore creates the counter, for this user
+//!   only, before the library searches for it. The library uses the file that it finds.
 //! - A publisher's segments are allocated, because the first access to a full /dev/shm would end the process.
 
 use std::fs::{self, File, Metadata, OpenOptions};
@@ -78,12 +78,12 @@ impl Segment {
         }
     }
 
-    /// Returns whether it is a regular file of this user.
+    /// Returns whether the segment is a regular file of this user.
     pub(crate) fn is_own(&self) -> bool {
         self.owner == rustix::process::geteuid().as_raw() && self.is_file
     }
 
-    /// Returns whether it is not a regular file of this user, or other users can write to it.
+    /// Returns whether the segment is not a regular file of this user, or other users can write to it.
     pub(crate) fn is_foreign(&self) -> bool {
         !self.is_own() || self.mode & 0o022 != 0
     }
@@ -137,7 +137,7 @@ pub fn allocate(domain: &Domain) -> Result<(), Failure> {
         let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
         let segment = OpenOptions::new().write(true).custom_flags(flags).open(&path);
         let Ok((bytes, segment)) = segment.and_then(|it| Ok((it.metadata()?.len(), it))) else { continue };
-        // After any other error, the allocation may succeed later. An empty segment has nothing to allocate.
+        // Ignore all other errors: the allocation may succeed later, and an empty segment has nothing to allocate.
         if fallocate(&segment, FallocateFlags::empty(), 0, bytes) == Err(Errno::NOSPC) {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             return Err(memory_failure(&format!("no room for {name}: {} kB", bytes / 1024)));
@@ -169,8 +169,8 @@ pub(crate) fn ensure_prefix(root: &Path, _lock: &ServiceCreationLock) -> Result<
     if let Some(prefix) = read_prefix(&directory, root)? {
         return Ok(prefix);
     }
-    // The hash is keyed with random numbers of the system. Another user cannot create files with all names, but
-    // possibly with some.
+    // The hash is keyed with random numbers of the system. Another user cannot occupy all names, but possibly some of
+    // them, so try several words.
     let mut words = (0..).map(|number: u32| random_word(RandomState::new().hash_one(number)));
     let prefixes = words.by_ref().map(|word| format!("{}{word}_", prefix_start(root)));
     let prefix =
@@ -193,7 +193,7 @@ fn random_word(mut random: u64) -> String {
 }
 
 /// Returns the prefix in the open `directory` of `root`. A prefix of another form was not written by this module, and
-/// counts as no prefix.
+/// is ignored.
 ///
 /// # Errors
 ///
@@ -214,18 +214,21 @@ fn prefix_start(root: &Path) -> String {
     format!("sh_{}_", root.file_name().unwrap_or_default().to_string_lossy())
 }
 
-/// Creates the node counter under `prefix`, unless it exists and belongs to this user alone.
+/// Creates the node counter under `prefix`, unless a complete one exists that belongs to this user alone. A counter of
+/// this user that is unfinished, or that other users can write to, is replaced.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] with file, owner and remedy if a file of another user has the counter's name, or if another
-/// user could write to the counter. Returns [`Kind::ResourceExhausted`] if there is no memory for it.
+/// Returns [`Kind::OtherUser`] with file, owner and remedy if a file of another user has the counter's name, and
+/// [`Kind::Failed`] if this name belongs to anything but a regular file. Returns [`Kind::ResourceExhausted`] if there
+/// is no memory for the counter.
 pub(crate) fn ensure_node_counter(prefix: &str) -> Result<(), Failure> {
     let path = node_counter_path(prefix);
     loop {
         match Segment::at(&path) {
             Some(segment) if !segment.is_own() => return Err(name_conflict(&segment)),
-            // The file is the library's own counter, or an unfinished counter that the library would wait for forever.
+            // Either the library created the counter, and other users can write to it, or the counter is unfinished,
+            // and the library would wait for it forever.
             Some(segment) if segment.is_foreign() || segment.bytes != NODE_COUNTER_CONTENT.len() as u64 => {
                 remove_node_counter(prefix)
             }
@@ -240,7 +243,7 @@ fn remove_node_counter(prefix: &str) {
     let _ = fs::remove_file(node_counter_path(prefix));
 }
 
-/// Removes the node counter, and the prefix in `directory`. Only a running process needs them.
+/// Removes the node counter, and the prefix in `directory`. Only a running process needs these files.
 pub(crate) fn remove_prefix(directory: &Directory, root: &Path) {
     if let Ok(Some(prefix)) = read_prefix(directory, root) {
         remove_node_counter(&prefix);
@@ -248,9 +251,10 @@ pub(crate) fn remove_prefix(directory: &Directory, root: &Path) {
     directory.remove(PREFIX_FILE.as_ref());
 }
 
-/// Creates the file with its content in one step, unless another process is faster.
+/// Creates the node counter at `path` with its content in one step. Keeps the existing counter if another process has
+/// created one in the meantime.
 fn create_node_counter(path: &Path) -> Result<(), Failure> {
-    // Threads of one process may create it at the same time.
+    // Threads of one process may create it at the same time, so each temporary name has a number.
     static FILE_COUNT: AtomicU32 = AtomicU32::new(0);
     let number = FILE_COUNT.fetch_add(1, Ordering::Relaxed);
     let temporary = path.with_extension(format!("new-{}-{number}", std::process::id()));
@@ -272,8 +276,8 @@ fn node_counter_path(prefix: &str) -> PathBuf {
     Path::new(SHARED_MEMORY_DIRECTORY).join(format!("{prefix}{NODE_COUNTER_NAME}"))
 }
 
-/// Name with the hash of a type, as iceoryx2 0.10.0 computes it (`DynamicStorageConfiguration::path_for_with_type`).
-/// The test below compares this hash with the hash of iceoryx2.
+/// Name of the node counter without the prefix. It contains the hash of a type, as iceoryx2 0.10.0 computes it
+/// (`DynamicStorageConfiguration::path_for_with_type`). The test below compares this hash with the hash of iceoryx2.
 const NODE_COUNTER_NAME: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
 
 /// Content that the library writes (`posix_shared_memory::Data`): its packed version, then the counter, from 0.

@@ -27,7 +27,7 @@ use crate::processes::{Node, config};
 use crate::resource_limits;
 use crate::segments::access_failure;
 
-/// Class of an error.
+/// Reason why a service cannot be opened or created, classified by the remedy.
 pub(crate) enum OpenFailure {
     /// The service does not exist, or is being created or removed right now.
     Absent,
@@ -46,7 +46,7 @@ impl From<ServiceOpenError> for OpenFailure {
             E::DoesNotExist | E::HangsInCreation | E::IsMarkedForDestruction | E::Interrupt => {
                 OpenFailure::Absent
             }
-            // This error occurs while the hub creates the service or cleans up after a dead process.
+            // This error is temporary: it occurs while the hub creates the service or cleans up after a dead process.
             E::ServiceInCorruptedState => OpenFailure::Absent,
             E::ExceedsMaxNumberOfNodes => OpenFailure::Full,
             E::VersionMismatch => OpenFailure::Incompatible("the hub has another version of iceoryx2"),
@@ -127,7 +127,7 @@ pub(crate) fn create<T, S: Service>(
     }
 }
 
-/// Returns `None` if the service does not exist, and a failure for any other error.
+/// Returns the service that was opened, `None` if the service does not exist, and a failure for any other error.
 pub(crate) fn open<T, E, S: Service>(
     node: &Node<S>,
     service: &ServiceName,
@@ -161,7 +161,7 @@ pub fn links(domain: &Domain) -> Result<Vec<String>, Failure> {
     sensors_with_topic(domain, |topic| topic.publisher_kind() == PublisherKind::Link)
 }
 
-/// Returns the [`sensors`] that have zones. A robot's combined verdict is computed from them.
+/// Returns the [`sensors`] that have zones. A robot's combined verdict is computed from these zones.
 ///
 /// # Errors
 ///
@@ -182,7 +182,7 @@ fn sensors_with_topic(domain: &Domain, is_match: impl Fn(Topic) -> bool) -> Resu
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user.
+/// Returns [`Kind::OtherUser`] with owner, mode and remedy if the directory belongs to another user.
 pub fn published_topics(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
     let mut topics = Vec::new();
     let Some(config) = config(domain.root())? else { return Ok(topics) };
@@ -237,7 +237,8 @@ pub(crate) fn clients_full(service: &ServiceName, limit: usize) -> Failure {
     )
 }
 
-/// Returns the failure for any other port that cannot be created. Usually descriptors or slots are short.
+/// Returns the failure for a port that cannot be created, for all reasons that have no function of their own. Usually
+/// descriptors or slots are short.
 pub(crate) fn port_failure(service: &ServiceName, error: &dyn Debug) -> Failure {
     resource_limits::find_shortage(Path::new(resource_limits::SHARED_MEMORY_DIRECTORY)).unwrap_or_else(|| {
         let hint = "too many subscribers, or `ulimit -n` is too small: about 4 descriptors for each";

@@ -32,12 +32,12 @@ pub type TopicService<P, S = LocalService> =
 pub type Publisher<P, S = LocalService> = port::publisher::Publisher<S, <P as Payload>::Memory, Header>;
 /// Receives the samples of a topic.
 pub type Subscriber<P, S = LocalService> = port::subscriber::Subscriber<S, <P as Payload>::Memory, Header>;
-/// A received sample: the payload by `*`, read-only, in shared memory; the header by `user_header()`.
+/// A received sample in shared memory, read-only. `*` accesses the payload, and `user_header()` the header.
 pub type Sample<P, S = LocalService> = iceoryx2::sample::Sample<S, <P as Payload>::Memory, Header>;
 /// A loaned sample that is not sent yet.
 pub type SampleMut<P, S = LocalService> = iceoryx2::sample_mut::SampleMut<S, <P as Payload>::Memory, Header>;
 
-/// Payload of a topic: `[u8]` (telegram), or a type of `scanhub-schema`. Other crates cannot implement it.
+/// Payload of a topic: `[u8]` (telegram), or a type of `scanhub-schema`. Other crates cannot implement this trait.
 pub trait Payload: sealed::Sealed + Debug + 'static {
     /// Topic of this payload.
     const TOPIC: Topic;
@@ -45,13 +45,13 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     /// Type in shared memory: the payload itself, or the words of a payload of variable length.
     type Memory: IceoryxSend + Debug + ?Sized + 'static;
 
-    /// Returns the topic of `sensor`, for the hub. The topic is created with `limits` if it does not exist. If
-    /// subscribers of a dead hub keep the topic alive, it is reused, with the number of slots that it already has.
+    /// Returns the topic of `sensor`, for the hub. The topic is created with `limits` if it does not exist. A topic
+    /// that subscribers of a dead hub keep alive is reused, with the number of slots that it already has.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if it exists
-    /// with another layout.
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if the topic
+    /// exists with another layout.
     fn create<S: Service>(
         node: &Node<S>,
         sensor: &str,
@@ -62,8 +62,8 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if it has
-    /// another layout.
+    /// Returns [`Kind::ResourceExhausted`] if memory or descriptors are short, and [`Kind::Incompatible`] if the topic
+    /// has another layout.
     fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<TopicService<Self, S>>, Failure>;
 
     /// Returns the publisher of a topic, with memory for the longest samples that `limits` allow.
@@ -124,7 +124,8 @@ mod sealed {
     pub trait Sealed {}
 }
 
-/// In iceoryx2, slices and values have two impl blocks with the same code. This macro generates both.
+/// Implements [`Payload`]. In iceoryx2, the functions for slices and those for values are in separate impl blocks, so
+/// no generic code can call both. This macro generates the calls for either.
 macro_rules! payload {
     ($payload:ty, $topic:expr, $memory:ty, $len:ident, $owned:ty, $make:expr,
         |$builder:ident, $limits:ident| $sized:expr, |$publisher:ident| $loan:expr, $read:path, $write:path, $bytes:path) => {
@@ -236,7 +237,8 @@ macro_rules! payload {
     };
 }
 
-/// A payload of variable length is loaned with its maximum length.
+/// Implements [`Payload`] for rows of the table of topics. For a payload of variable length, the publisher reserves
+/// memory for the maximum length.
 macro_rules! payloads {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         $(payloads!($payload, $topic);)*
@@ -297,7 +299,8 @@ pub fn subscriber_capacity<P: Payload + ?Sized, S: Service>(topic: &TopicService
     topic.static_config().max_subscribers()
 }
 
-/// Returns the payload's revision that the publisher wrote into the `attributes` of a service; 0 if there is none.
+/// Returns the payload's revision that the publisher wrote into the `attributes` of a service; 0 if the attributes have
+/// no revision.
 pub fn payload_revision(attributes: &AttributeSet) -> u32 {
     let revision = attributes.iter().find(|attribute| attribute.key().as_bytes() == REVISION_KEY.as_bytes());
     revision.and_then(|attribute| attribute.value().to_string().parse().ok()).unwrap_or_default()
@@ -398,8 +401,8 @@ impl<P: Payload + ?Sized, S: Service> SampleTransport<P> for SharedMemory<P, S> 
     }
 }
 
-/// Publisher of one topic of one sensor. It numbers samples from 0. The numbers have a gap where samples were lost
-/// before they could be sent.
+/// Publisher of one topic of one sensor. The publisher numbers samples from 0. The numbers have a gap where samples
+/// were lost before they could be sent.
 #[derive(Debug)]
 pub struct TopicPublisher<P: Payload + ?Sized, M = SharedMemory<P>> {
     transport: M,
@@ -409,8 +412,8 @@ pub struct TopicPublisher<P: Payload + ?Sized, M = SharedMemory<P>> {
 }
 
 impl<P: Payload + ?Sized, S: Service> TopicPublisher<P, SharedMemory<P, S>> {
-    /// Creates a publisher into shared memory. Otherwise the same as
-    /// [`with_transport`](TopicPublisher::with_transport).
+    /// Creates the topic in shared memory, and a publisher of this topic as
+    /// [`with_transport`](TopicPublisher::with_transport) does.
     ///
     /// # Errors
     ///
@@ -441,8 +444,8 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
         self.transport.subscribers()
     }
 
-    /// Connects new subscribers, and sends them the history of the topic. A subscriber that cannot be connected is
-    /// retried with the next sample.
+    /// Connects new subscribers, and sends them the history of the topic. If a subscriber cannot be connected, the
+    /// publisher tries again with the next sample.
     ///
     /// # Errors
     ///
@@ -467,11 +470,12 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
         self.transport.loan(len)
     }
 
-    /// Sends `loan` with `header` and the next number of the topic. Returns the number of subscribers that received it.
+    /// Sends `loan` with `header` and the next number of the topic. Returns the number of subscribers that received the
+    /// sample.
     ///
     /// # Errors
     ///
-    /// Returns the library's error. The number is then used, and the sample counts as failed.
+    /// Returns the library's error. The number is then skipped, and the sample is counted as failed.
     pub fn send_loan(&mut self, loan: M::Loan, header: &Header) -> Result<usize, SendError> {
         let header = Header { topic_seq: self.next, ..*header };
         self.next += 1;
@@ -485,12 +489,12 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
     }
 
     /// Sends a sample that `fill` writes in place, starting with a default payload. The payload has `len` bytes, or its
-    /// own length if that is fixed. Otherwise the same as [`send_loan`](TopicPublisher::send_loan).
+    /// own length if that is fixed. Numbers and results are those of [`send_loan`](TopicPublisher::send_loan).
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, or if it is longer than the topic was created
-    /// for. Its number is then used.
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for the sample, or if it is longer than the topic was
+    /// created for. The number of the sample is then skipped.
     pub fn send_len(
         &mut self,
         header: &Header,
@@ -507,23 +511,24 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> TopicPublisher<P, M> {
 }
 
 impl<P: Payload, M: SampleTransport<P>> TopicPublisher<P, M> {
-    /// Sends a sample that `fill` writes in place, starting with a default payload. Otherwise the same as
+    /// Sends a sample that `fill` writes in place, starting with a default payload. Numbers and results are those of
     /// [`send_loan`](TopicPublisher::send_loan).
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it. Its number is then used.
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for the sample. The number of the sample is then
+    /// skipped.
     pub fn send(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
         self.send_len(header, 0, fill)
     }
 }
 
 impl<M: SampleTransport<[u8]>> TopicPublisher<[u8], M> {
-    /// Sends `bytes` as a sample. Otherwise the same as [`send`](TopicPublisher::send).
+    /// Sends `bytes` as a sample. Numbers and results are those of [`send_loan`](TopicPublisher::send_loan).
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`] if there is no memory for it, or if it is longer than
+    /// Returns [`Kind::ResourceExhausted`] if there is no memory for the sample, or if it is longer than
     /// [`Telegram::MAX_LEN`](scanhub_schema::Telegram::MAX_LEN).
     pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
         self.send_len(header, bytes.len(), |sample| sample.copy_from_slice(bytes))

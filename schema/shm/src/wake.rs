@@ -1,9 +1,9 @@
-//! Wake-ups of the subscribers of a sensor: a doorbell for programs that use this code, and an event service for all
-//! other languages. The hub wakes both kinds of subscribers.
+//! Wake-ups of the subscribers of a sensor: a doorbell for programs that use this code, and an event service for
+//! programs in other languages. The hub wakes both kinds of subscribers.
 //!
 //! A thread can sleep on the events of several sensors at once. Sleeping and taking the pending wake-ups are two calls,
-//! so that samples can be received in between. A wake-up that stays pending loses nothing, and taking wake-ups costs
-//! several system calls.
+//! so that samples can be received in between. Wake-ups need not be taken before each receive: no sample is missed
+//! while a wake-up is pending, and taking wake-ups costs several system calls.
 #![allow(unsafe_code)]
 
 use std::os::fd::BorrowedFd;
@@ -32,8 +32,8 @@ pub type Notifier<S = LocalService> = port::notifier::Notifier<S>;
 /// Port on which a subscriber sleeps.
 pub type Listener<S = LocalService> = port::listener::Listener<S>;
 
-/// The hub's end. It wakes subscribers with [`WakeEvent::HubUp`] when it is created, and with [`WakeEvent::HubDown`]
-/// when it is dropped.
+/// The hub's end of both kinds of wake-ups. The sender wakes subscribers with [`WakeEvent::HubUp`] when it is created,
+/// and with [`WakeEvent::HubDown`] when it is dropped.
 pub struct WakeSender<S: Service = LocalService> {
     ringer: DoorbellRinger,
     notifier: Notifier<S>,
@@ -60,7 +60,7 @@ impl<S: Service> WakeSender<S> {
     }
 
     /// Returns a number that changes when a subscriber or listener of the sensor attaches through a library of this
-    /// project. Other programs may not change it.
+    /// project. The number may stay the same if another program attaches.
     pub fn attached(&self) -> u32 {
         self.ringer.attached()
     }
@@ -144,7 +144,7 @@ pub fn open_wake<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<Wake
     open_event(node, &WakeEvent::service(sensor))
 }
 
-/// Returns the event service `service`; `None` if it does not exist.
+/// Returns the event service `service`, or `None` if this service does not exist.
 pub(crate) fn open_event<S: Service>(
     node: &Node<S>,
     service: &str,
@@ -173,7 +173,7 @@ pub fn listener<S: Service>(node: &Node<S>, wake: &WakeService<S>) -> Result<Lis
     Ok(listener)
 }
 
-/// Returns a listener of any event.
+/// Returns a listener of the event service `wake`.
 pub(crate) fn create_listener<S: Service>(wake: &WakeService<S>) -> Result<Listener<S>, Failure> {
     check_client()?;
     wake.listener_builder().create().map_err(|error| match error {
@@ -213,12 +213,12 @@ where
     unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
 }
 
-/// Takes all pending wake-ups of `listeners`, and returns whether there were any. To miss nothing, receive after this
+/// Takes all pending wake-ups of `listeners`, and returns whether there were any. To miss no sample, receive after this
 /// call.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::ResourceExhausted`] if a listener does not work.
+/// Returns [`Kind::ResourceExhausted`] if a listener reports an error.
 pub fn take_wakeups<S: Service>(listeners: &[&Listener<S>]) -> Result<bool, Failure> {
     let mut any = false;
     for listener in listeners {

@@ -283,7 +283,7 @@ fn exited_clients_with_open_requests_free_their_slots() {
         let client = scanhub_shm::ControlClient::open(&node).unwrap().expect("the hub made it");
         let pending = client.send(&Request::new("front", verb)).unwrap();
         if verb == Verb::Pause {
-            // Receives the request and drops it without a response.
+            // The hub receives the request, and the client drops it before the hub responds.
             let request = server.receive().unwrap().expect("was asked");
             drop(pending);
             assert!(!request.is_client_waiting());

@@ -40,7 +40,8 @@ fn one_ring_wakes_all_sleepers_of_a_doorbell() {
             })
         })
         .collect();
-    // Only half of the threads also wait for `front`. They continue to sleep on `rear`.
+    // This ring wakes only the half of the threads that also wait for `front`. They find no ring of `rear`, and sleep
+    // again.
     front.wake(WakeEvent::Telegram).unwrap();
     rear.wake(WakeEvent::Telegram).unwrap();
     assert!(sleepers.into_iter().all(|sleeper| sleeper.join().unwrap() == ring_count + 1));

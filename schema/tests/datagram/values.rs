@@ -9,7 +9,7 @@ use scanhub_schema::{
     Tilt, Topic, Track, TrackSensor, TrackState, Tracks, Verdict, Zone, Zones,
 };
 
-/// Name of the file, header, and function that writes the payload.
+/// Name in the list of golden datagrams, header, and function that writes the payload.
 pub(crate) type GoldenDatagram = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
 
 /// Datagrams that a gateway of this version sends.
@@ -139,7 +139,7 @@ fn announce(buffer: &mut [u8]) -> Option<usize> {
     announce.pack(buffer)
 }
 
-/// The example packet in the manual of the LD06, twice.
+/// Writes the example packet in the manual of the LD06, twice.
 fn packets(buffer: &mut [u8]) -> Option<usize> {
     const PACKET: [u8; 47] = [
         0x54, 0x2C, 0x68, 0x08, 0xAB, 0x7E, 0xE0, 0x00, 0xE4, 0xDC, 0x00, 0xE2, 0xD9, 0x00, 0xE5, 0xD5, 0x00,
@@ -167,8 +167,8 @@ fn scan(count: u16, first_angle_mdeg: i32, step_mdeg: u32, intensity_bits: u8) -
     scan
 }
 
-/// Returns eight beams of a clockwise revolution with all arrays. Every second beam has a code, the first of them
-/// `not_measured`.
+/// Returns eight beams of a clockwise revolution with all arrays. Every second beam has a code. The first of these
+/// codes is `not_measured`.
 fn full_circle_scan() -> Box<Scan> {
     let head = ScanHead {
         first_angle: -0.375,
@@ -300,7 +300,7 @@ fn zones() -> Zones {
     zones
 }
 
-/// Returns 64 segments of three beams, of which 54 fit into a datagram.
+/// Returns a foreground with 64 segments of three beams each. Only 54 of these segments fit into a datagram.
 fn foreground() -> Box<Foreground> {
     let mut foreground = Foreground::of(361);
     let head = ForegroundHead {

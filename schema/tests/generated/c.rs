@@ -9,7 +9,7 @@ use super::{rules, wrap};
 
 const MAX_LINE_WIDTH: usize = 120;
 
-/// Returns the numbers of the topics, the structs, and the constants that their fields can have.
+/// Returns the numbers of the topics, the structs, and the constants for the values of their fields.
 pub(crate) fn structs(description: &Description) -> String {
     let mut text = "/* Topics, and the struct that a payload is or starts with. */\n".to_owned();
     let longest = Topic::ALL.iter().map(|topic| topic.name().len()).max().unwrap_or_default();
@@ -42,7 +42,7 @@ pub(crate) fn type_name(name: &str) -> String {
     format!("scanhub_{}_v2", snake(name))
 }
 
-/// Returns the start of the names of a set's constants.
+/// Returns the text with which the names of a set's constants start.
 fn prefix(set: &str) -> String {
     let name = match set {
         "ArrayFlags" => "scan".to_owned(),
@@ -151,7 +151,7 @@ fn comment(field: &Field) -> String {
     if text == "0." { String::new() } else { text }
 }
 
-/// Returns a line with its comment. If the comment is too long, it is above the line.
+/// Returns a line with its comment. If the comment is too long for the line, the comment is above the line.
 pub(crate) fn with_comment(line: &str, comment: &str) -> String {
     let indent = &line[..line.len() - line.trim_start().len()];
     let on_same_line = format!("{line} /* {comment} */");
@@ -164,7 +164,7 @@ pub(crate) fn with_comment(line: &str, comment: &str) -> String {
     }
 }
 
-/// Returns a comment in lines of its own.
+/// Returns a comment in separate lines.
 pub(crate) fn comment_above(indent: &str, comment: &str) -> String {
     // Keep the end of the comment on the same line as its text.
     let lines =

@@ -149,7 +149,8 @@ fn element_name(element: &Layout) -> String {
     if element.name == "CloudPoint" { "point".to_owned() } else { snake(&element.name) }
 }
 
-/// Returns the head's fields that the struct has. They include the fields of structs in the head.
+/// Returns the fields of the head that the struct in C has, each with its offset and its layout. They include the
+/// fields of structs in the head.
 fn shown_layouts<'a>(
     description: &'a Description,
     layout: &'a Layout,
@@ -332,7 +333,8 @@ fn number_of(field: &Field, base: &str) -> String {
     number(kind, base, field.offset)
 }
 
-/// Returns the function that reads a payload. For a foreground, another function calls it and also checks the bits.
+/// Returns the function that reads a payload. For a foreground, another function calls the returned function and also
+/// checks the bits.
 fn reader(description: &Description, topic: Topic, layout: &Layout, arrays: &[Array]) -> String {
     let name = topic.name();
     let head = rules::fixed_part(layout);

@@ -90,7 +90,7 @@ const NUMBER_TYPES: [(&str, usize); 10] = [
 const VALUES_MARK: char = '\u{1}';
 
 impl Field {
-    /// Returns the comment. `values` replaces the mark for the values that the field can have.
+    /// Returns the comment, with `values` in place of [`VALUES_MARK`].
     pub(crate) fn doc(&self, values: &str) -> String {
         self.doc.replace(VALUES_MARK, values)
     }
@@ -229,9 +229,9 @@ impl Description {
 struct Sources {
     structs: BTreeMap<String, syn::ItemStruct>,
     enums: BTreeMap<String, (String, Vec<NumberNameDoc>)>,
-    /// By `Type::NAME`, or `NAME` outside of a type: number and comment.
+    /// Number and comment of each constant, by `Type::NAME`, or by `NAME` for a constant outside of a type.
     consts: BTreeMap<String, (u64, String)>,
-    /// In the order of the source.
+    /// Names of the constants, in the order of the source.
     const_order: Vec<String>,
 }
 
@@ -281,7 +281,7 @@ impl Sources {
                         }
                     }
                 }
-                // Lines of variant, name and comment.
+                // Each line has a variant, a name and a comment. Only the name and the comment are string literals.
                 Item::Macro(item) if item.mac.path.is_ident("counters") => {
                     let literals = item.mac.tokens.into_iter().filter_map(|token| {
                         syn::parse2::<syn::LitStr>(token.into()).ok().map(|literal| literal.value())
@@ -321,7 +321,7 @@ impl Sources {
                 if let Some((number, _)) = NUMBER_TYPES.iter().find(|(number, _)| *number == name) {
                     return (Kind::Number(number), None);
                 }
-                // A struct around an array is that array.
+                // A struct that wraps an array is described as this array.
                 match &self.structs[&name].fields {
                     syn::Fields::Unnamed(inner) => self.kind(&inner.unnamed[0].ty),
                     _ => (Kind::Layout(name), None),
@@ -331,8 +331,9 @@ impl Sources {
         }
     }
 
-    /// Returns `doc` without links, and the set that it links to. A link to an enum or to flags stands for their
-    /// values, a link to another constant for its number. A sentence with a link to a function is left out.
+    /// Returns `doc` without links, and the set that it links to. A link to an enum or to flags is replaced by
+    /// [`VALUES_MARK`], and a link to another constant by the constant's number. A sentence with a link to a function
+    /// is left out.
     fn resolve(&self, rust: &str, item: &syn::ItemStruct, doc: &str) -> (String, Option<String>) {
         let mut set = None;
         let mut kept = Vec::new();

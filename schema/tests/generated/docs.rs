@@ -42,8 +42,7 @@ pub(crate) fn lists(description: &Description, layout: &Layout) -> String {
     text + "\n"
 }
 
-/// Writes an item for each field that is not always 0, with the values that it can have. Returns the layouts in the
-/// fields.
+/// Writes the rows of all fields. Returns the layouts that these fields contain.
 fn items<'a>(description: &'a Description, layout: &Layout, text: &mut String) -> Vec<&'a Layout> {
     let mut inner = Vec::new();
     for field in layout.fields.iter().filter(|field| field.doc("") != "0.") {

@@ -139,7 +139,8 @@ fn declaration(topic: Topic, layout: &Layout, shown: &ShownField) -> String {
                 None => String::new(),
             };
             let label = first_sentence(&field.doc(""));
-            // Several fields may be parts of one thing, such as a pose.
+            // Without a set, keep the text after a colon: several fields may have the same text before it, such as
+            // `Summed pose`.
             let ends: &[char] = if field.set.is_some() { &[';', ':'] } else { &[';'] };
             (label.split(ends).next().unwrap_or_default().trim().replace('`', ""), more)
         }
@@ -171,7 +172,7 @@ pub(crate) fn functions(description: &Description) -> String {
     text
 }
 
-/// Returns the functions for a payload whose arrays are read by hand.
+/// Returns the functions for the head of a payload whose arrays are read by code that is not generated.
 fn head(description: &Description, topic: Topic, layout: &Layout) -> String {
     let topic_name = topic.name();
     let mut text =
@@ -201,7 +202,7 @@ fn offset(base: &str, at: usize) -> String {
     }
 }
 
-/// Returns the conditions that a head meets, apart from the lengths of its arrays.
+/// Returns the statements that reject a head that is not valid. They do not check the lengths of its arrays.
 fn conditions(layout: &Layout) -> String {
     let size = rules::first_revision(&layout.name).unwrap_or(rules::fixed_part(layout).size);
     let mut text = format!("    if payload:len() < {size} then return nil end\n");
@@ -342,7 +343,8 @@ fn additions(description: &Description, topic: Topic, layout: &Layout, base: &st
 fn function(description: &Description, topic: Topic, layout: &Layout) -> String {
     let mut text = format!("\nunpack_payload[{}] = function(payload, tree)\n", topic.number());
     text += &conditions(layout);
-    // Name, layout, variable with the number of elements, and offset.
+    // For each array: its name, the layout and the size of an element, the variable with the number of elements, and
+    // the offset.
     let mut arrays = Vec::new();
     let mut begin = rules::fixed_part(layout).size.to_string();
     let mut add = |text: &mut String, name: String, element: Option<&'_ Layout>, size: usize, count: &str| {

@@ -1,17 +1,17 @@
-//! Generator of the layouts of all payloads for other languages, from the Rust structs, and the test that the committed
-//! files are up to date. After a change of a struct, `SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated`
-//! writes them.
+//! Generator of the layouts of all payloads for other languages, from the Rust structs. The tests check that the
+//! committed files are up to date. After a change of a struct, `SCANHUB_WRITE=1 cargo test -p scanhub-schema --test
+//! generated` writes these files.
 //!
-//! The generator reads names, types and comments of the fields. These conventions carry the rest:
+//! The generator reads names, types and comments of the fields. These conventions define the rest:
 //!
 //! - `X_text` is UTF-8, padded with 0. `reserved` is 0, and readers do not show it.
 //! - The used elements of `X_array` are counted by the field `Xs` if it exists, and otherwise by `count`.
 //! - A comment that links to an enum, or to a type that only has constants, lists their values. A link to constants
 //!   whose comments start with "Flag" lists the flags; the field is called `flags`.
-//! - A link to another constant becomes its value. A sentence with a link to a function is left out.
+//! - A link to another constant is replaced by the constant's value. A sentence with a link to a function is left out.
 //!
-//! `rules` and `readers` have what the structs do not say: arrays whose length depends on counts, names that differ
-//! between languages, and conditions of a valid payload.
+//! `rules` and `readers` have the information that the structs do not express: arrays whose length depends on counts,
+//! names that differ between languages, and conditions of a valid payload.
 
 mod c;
 mod datagram_c;
@@ -40,7 +40,7 @@ fn topics_by_number() -> [Topic; Topic::ALL.len()] {
     topics
 }
 
-/// Compares the file with `text`, or writes it.
+/// Checks that the file at `path` contains `text`. With `SCANHUB_WRITE`, writes the file.
 fn check(path: &str, text: &str) {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path);
     if fs::read_to_string(&file).expect("a committed file") == text {
@@ -50,8 +50,8 @@ fn check(path: &str, text: &str) {
     fs::write(file, text).expect("a writable file");
 }
 
-/// Compares or writes the blocks of the file. A block is between a line with `generated: NAME`, which is also the end of
-/// [`WRITE_COMMAND`], and the next one with `End of NAME`.
+/// Does the same as [`check`] for the blocks of a file. A block is between a line with `COMMAND: NAME` and the next
+/// line with `End of NAME`.
 fn check_blocks(path: &str, blocks: &[(&str, String)]) {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path);
     let mut text = fs::read_to_string(file).expect("a committed file");

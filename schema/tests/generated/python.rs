@@ -10,7 +10,7 @@ use super::{rules, topics_by_number, wrap};
 
 const MAX_LINE_WIDTH: usize = 120;
 
-/// Order of fields in the dataclasses that have another order than the memory. Other fields follow.
+/// Order of fields in the dataclasses whose order differs from the order in memory. Fields that are not listed follow.
 const PARAMETER_ORDER: [(&str, &[&str]); 6] = [
     (
         "Scan",
@@ -131,7 +131,7 @@ fn members(description: &Description, layout: &Layout) -> Vec<(String, String, S
     members
 }
 
-/// Returns the fields of the head that a class has, in its order.
+/// Returns the fields of the head that a class has, in the order of the class.
 fn ordered<'a>(description: &Description, layout: &'a Layout) -> Vec<ShownField<'a>> {
     let mut shown = readers::shown_fields(layout, &description.sets);
     // The number of elements is the length of a tuple.
@@ -329,7 +329,7 @@ fn function(description: &Description, layout: &Layout) -> String {
     for field in readers::may_be_nan(layout, fields) {
         limit(format!("not math.isinf({})", values.of_field(&field.name)));
     }
-    // Numbers of both sizes are checked together.
+    // Neighboring runs are checked together, even if their numbers have different sizes.
     let mut finite: Vec<(usize, usize)> = Vec::new();
     for run in readers::finite_runs(layout, fields) {
         let (_, at, _) = values.positions[run.field];

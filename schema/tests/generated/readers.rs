@@ -10,15 +10,15 @@ pub(crate) struct ShownField<'a> {
     /// Name in Python and Lua. C may use another name.
     pub(crate) name: String,
     pub(crate) field: &'a Field,
-    /// Index of the first element in the field.
+    /// Index of the element, if only one element of the field is shown; otherwise 0.
     pub(crate) index: usize,
     pub(crate) source: FieldSource,
 }
 
 pub(crate) enum FieldSource {
-    /// Without a change: a number, a text, an array of numbers, or a struct.
+    /// The field without a change: a number, a text, an array of numbers, or a struct.
     Plain,
-    /// 1 if it is true.
+    /// A boolean: 1 means true.
     Bool,
     /// A bit of flags, with the comment of its constant.
     Bit(u64, String),
@@ -28,7 +28,7 @@ pub(crate) enum FieldSource {
     Computed(&'static str),
 }
 
-/// Fields that are 1 if they are true.
+/// Fields that the readers show as booleans: 1 means true.
 const BOOL_FIELDS: [(&str, &str); 3] =
     [("Pose", "upside_down"), ("TrackSensor", "upside_down"), ("Zone", "violated")];
 
@@ -100,7 +100,7 @@ pub(crate) fn shown_fields<'a>(layout: &'a Layout, sets: &BTreeMap<String, Set>)
     shown
 }
 
-/// A condition that a valid payload meets, besides its length, the limits of its counts and that numbers are finite.
+/// A condition that a valid payload meets, in addition to the conditions for its length, its counts and its floats.
 pub(crate) enum BoundsCheck {
     /// Each element of an array has a field below a count of the head.
     Below { array: &'static str, field: &'static str, count: &'static str },
@@ -125,7 +125,7 @@ pub(crate) fn checks(payload: &str) -> &'static [BoundsCheck] {
     }
 }
 
-/// Numbers of a field that must not be infinite or NaN.
+/// Rule that states whether the numbers of a field may be infinite or NaN.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum FiniteRule {
     Required,
@@ -153,7 +153,7 @@ pub(crate) struct FloatRun {
     pub(crate) offset: usize,
     /// Size of a number in bytes.
     pub(crate) size: usize,
-    /// Number of numbers.
+    /// Count of the numbers.
     pub(crate) count: usize,
 }
 
@@ -181,7 +181,7 @@ pub(crate) fn may_be_nan(layout: &Layout, fields: usize) -> impl Iterator<Item =
     layout.fields[..fields].iter().filter(|field| finite(layout, field) == FiniteRule::MayBeNan)
 }
 
-/// Returns the enum whose values a field has; `None` if it has bits, or any number.
+/// Returns the enum whose values a field has; `None` if the field has bits, or can have any number.
 pub(crate) fn enum_of(field: &Field) -> Option<&str> {
     let set = field.set.as_deref();
     set.filter(|_| !["flags", "reasons", "contents"].contains(&field.name.as_str()))
@@ -214,8 +214,8 @@ pub(crate) fn names_of(set: &str) -> String {
     }
 }
 
-/// Payloads whose arrays depend on each other, so that Python and Lua read them by hand. Only their heads are
-/// generated.
+/// Payloads whose arrays depend on each other, so that Python and Lua read them with code that is not generated. Only
+/// their heads are generated.
 pub(crate) const VARIABLE_PAYLOADS: [&str; 2] = ["Scan", "Foreground"];
 
 /// Returns a field and one of its values. If this field has this value, `field` is unknown.

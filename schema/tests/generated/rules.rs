@@ -7,10 +7,10 @@ pub(crate) struct ArrayRule {
     pub(crate) name: &'static str,
     /// A number, or the Rust name of a layout.
     pub(crate) kind: &'static str,
-    /// Number of elements in shared memory, by the fields of the head.
+    /// Number of elements in shared memory, as an expression of the head's fields.
     pub(crate) count: &'static str,
     pub(crate) doc: &'static str,
-    /// Field and bit without which the array does not exist.
+    /// Field and bit. The array exists only if the field has this bit.
     pub(crate) only_if: Option<(&'static str, u64)>,
 }
 
@@ -95,7 +95,7 @@ pub(crate) fn count_of<'a>(layout: &'a Layout, array: &Field) -> &'a str {
     layout.fields.iter().map(|field| field.name.as_str()).find(|field| *field == name).unwrap_or("count")
 }
 
-/// Returns the fields that have numbers of elements in a datagram, with their maximum.
+/// Returns the fields that have numbers of elements in a datagram, each with its maximum.
 pub(crate) fn counts(layout: &Layout) -> Vec<(&str, usize)> {
     let arrays = layout.fields.iter().filter(|field| field.name.ends_with("_array"));
     let mut counts: Vec<_> = arrays.map(|field| (count_of(layout, field), field.len.unwrap_or(1))).collect();

@@ -6,7 +6,7 @@ use super::c::{comment_above, with_comment};
 use super::description::{Description, Field, Kind, Layout, first_sentence, lower_first, snake};
 use super::python::format_code;
 
-/// Returns the name that starts all names of a layout: `DATAGRAM`, `ANNOUNCE` or `ANNOUNCED`.
+/// Returns the start of all names of a layout: `DATAGRAM`, `ANNOUNCE` or `ANNOUNCED`.
 fn prefix(layout: &Layout) -> String {
     snake(&layout.name).to_uppercase()
 }

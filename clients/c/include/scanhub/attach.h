@@ -13,16 +13,18 @@
  *     }
  *     scanhub_close(scans);
  *
- * The hub need not run yet: the library waits for it, and for the next one after it exits or is killed. A program that
- * is too slow misses samples, and each sample has the number that were missed. It never slows the hub.
+ * The hub need not run yet: the library waits for a hub. If the hub exits or is killed, the library waits for the next
+ * one. A program that is too slow misses samples, and each sample has the number of samples that were missed before it.
+ * The program never slows the hub.
  *
  * Threads: a handle or publication belongs to the thread that opened it, and ends with this thread. Other threads open
- * their own; calls with another thread's handle are refused. A sample is released by its handle's thread. Until then,
- * any thread may read its header and payload, and pass it to the functions that only read. scanhub_error has the errors
- * of the calling thread. All functions may be called at the same time in different threads, but not in signal handlers.
+ * their own handles; calls with another thread's handle are refused. The thread of the handle must release the samples
+ * that it took. Until then, any thread may read the header and the payload of a sample, and pass the sample to
+ * functions that only read. scanhub_error returns errors of the calling thread. All functions may be called at the same
+ * time in different threads, but not in signal handlers.
  *
- * All functions may be called with a handle that was closed, or with NULL: they refuse it. A child after fork() opens
- * its own handles, and may exit in any way.
+ * All functions may be called with a handle that was closed, or with NULL: they refuse this handle. A child after
+ * fork() must open its own handles, and may exit in any way.
  *
  * Functions return 0 or more. A negative number is one of SCANHUB_REFUSED_..; scanhub_error() then has the message and
  * the remedy. Signals are never an error.
@@ -46,12 +48,12 @@ extern "C" {
 #define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
 
 /* Methods of scanhub_wait. */
-#define SCANHUB_WAIT_DOORBELL 0 /* on a word in the hub's memory: one call of the hub wakes all. The usual choice */
+#define SCANHUB_WAIT_DOORBELL 0 /* on a word in the hub's memory; one call wakes all subscribers. The usual choice */
 #define SCANHUB_WAIT_EVENT 1    /* on a descriptor, which poll and epoll accept, too: scanhub_fd */
 #define SCANHUB_WAIT_SPIN 2     /* without sleep: uses one CPU core completely for the shortest latency */
 
 /* Reasons why no sample arrives, from scanhub_why_silent. Later versions may have more. */
-#define SCANHUB_SILENCE_WAITING 0        /* the library knows of no problem, or the hub is starting */
+#define SCANHUB_SILENCE_WAITING 0        /* the library finds no problem, or the hub is starting */
 #define SCANHUB_SILENCE_NO_HUB 1         /* no hub runs in the domain */
 #define SCANHUB_SILENCE_OTHER_USER 2     /* only another user runs a hub in the domain */
 #define SCANHUB_SILENCE_UNKNOWN_SENSOR 3 /* the hub has no such sensor; the text has the names that exist */
@@ -89,7 +91,7 @@ struct scanhub_publication;
 #define SCANHUB_QUALITY_CLEAN   0 /* No reason to suspect damage. */
 #define SCANHUB_QUALITY_SUSPECT 1 /* The telegram may be damaged. */
 
-/* Flags of a sample, with the same numbers as in datagrams. */
+/* Bits of the field `flags` of a header. Datagrams use the same bits. */
 #define SCANHUB_FLAG_SIMULATED       2 /* The scanner is simulated, with a pty as its port. */
 #define SCANHUB_FLAG_REPLAYED        4 /* The link plays a recording. */
 #define SCANHUB_FLAG_STAMP_ESTIMATED 8 /* The stamps were computed, not taken when the bytes arrived. */
@@ -103,9 +105,9 @@ struct scanhub_publication;
 /* Reasons to suspect a telegram. */
 #define SCANHUB_REASON_LINE_ERROR     1 /* The driver counted line errors during this telegram or the previous one. */
 #define SCANHUB_REASON_NEIGHBOUR      2 /* The bytes just before the telegram belong to no telegram. */
-#define SCANHUB_REASON_SLOW           4 /* The telegram took longer than usual. */
+#define SCANHUB_REASON_SLOW           4 /* The telegram took longer to arrive than usual. */
 #define SCANHUB_REASON_FORBIDDEN_BITS 8 /* Bits are set that the measuring mode never sets. */
-#define SCANHUB_REASON_HEADER_INSIDE  16 /* The header of another telegram started inside. */
+#define SCANHUB_REASON_HEADER_INSIDE  16 /* The header of another telegram started inside this telegram. */
 
 /* Header of every sample, the same for all topics: the user header of the services in shared memory. 64 bytes. */
 struct scanhub_header_v2 {
@@ -151,16 +153,16 @@ struct scanhub_scan_v2 {
     uint16_t count; /* Number of beams, at most 8192; they are in the order of their measurement. */
     uint16_t valid_to; /* Highest value that is a range; all higher values are codes. */
     uint16_t no_return; /* Code of a beam without an echo. */
-    uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has none. */
+    uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has no such code. */
     /* Number of points that were dropped because another point has the same beam; also points without a return. */
     uint16_t collisions;
     uint8_t family; /* Family of the scanner: SCANHUB_FAMILY_... */
     uint8_t flags; /* Flags: SCANHUB_SCAN_FLAG_... */
     uint8_t contents; /* Arrays that follow the head: SCANHUB_SCAN_... */
-    uint8_t intensity_bits; /* Bits of an intensity; 0 if there are none. */
+    uint8_t intensity_bits; /* Bits of an intensity; 0 if the scan has no intensities. */
     uint8_t turns; /* Number of revolutions in the scan: beam i is from revolution i modulo this number. 0 means 1. */
     uint8_t reserved;
-    uint32_t turn_ns; /* Time of a revolution in ns if there are several; otherwise 0. */
+    uint32_t turn_ns; /* Time of a revolution in ns if the scan took several revolutions; otherwise 0. */
     uint8_t reserved2[12];
 };
 
@@ -177,7 +179,7 @@ struct scanhub_mark_v2 {
 };
 
 /* Flags of struct scanhub_marks_v2. */
-#define SCANHUB_MARKS_OVERFLOW    1 /* There were more marks than fit. */
+#define SCANHUB_MARKS_OVERFLOW    1 /* There were more marks than fit into the sample. */
 /* Marks are unknown, because the measuring mode has no reflector bits or `no_level` is set. */
 #define SCANHUB_MARKS_UNAVAILABLE 2
 /* The sensor measures intensities, and no threshold for reflectors is configured. */
@@ -194,12 +196,12 @@ struct scanhub_marks_v2 {
 /* One zone: a circle around the robot's center. */
 struct scanhub_zone_v2 {
     uint16_t radius_mm; /* Radius in mm. */
-    uint16_t beams; /* Number of beams of this scan that end inside. */
-    uint8_t violated; /* 1 if enough beams ended inside in enough scans. */
+    uint16_t beams; /* Number of beams of this scan that end inside the zone. */
+    uint8_t violated; /* 1 if enough beams ended inside the zone in enough scans. */
     uint8_t reserved[3];
 };
 
-/* Result of all zones. */
+/* Result of checking a scan against all zones. */
 #define SCANHUB_VERDICT_CLEAR   0 /* Nothing is inside any zone. */
 #define SCANHUB_VERDICT_SLOW    1 /* Something is inside a zone, but not inside the smallest one. */
 #define SCANHUB_VERDICT_STOP    2 /* Something is inside the smallest zone. */
@@ -214,8 +216,9 @@ struct scanhub_zones_v2 {
     uint8_t verdict; /* Verdict: SCANHUB_VERDICT_... Treat unknown, and every other number, as stop. */
     uint8_t count; /* Number of zones, at most 8. */
     uint16_t nearest_beam; /* Beam of the point nearest to the robot's center; 65535 if no beam has a valid reading. */
-    uint32_t nearest_mm; /* Distance of that point from the center in mm, rounded down; 4294967295 if there is none. */
-    uint16_t invalid_beams; /* Number of beams without a valid reading among those that cross the largest zone. */
+    /* Distance of the nearest point from the center in mm, rounded down; 4294967295 if there is none. */
+    uint32_t nearest_mm;
+    uint16_t invalid_beams; /* Number of beams without a valid reading among the beams that cross the largest zone. */
     uint8_t flags; /* Flags: SCANHUB_ZONES_... */
     uint8_t reserved;
     struct scanhub_zone_v2 zone_array[8]; /* The zones, the largest first; 0 beyond `count`. */
@@ -239,7 +242,7 @@ struct scanhub_foreground_v2 {
     uint16_t count; /* Number of beams of the scan. */
     uint16_t beams; /* Number of beams in the foreground. */
     uint16_t segments; /* Number of segments, at most 64. */
-    uint16_t dropped; /* Number of segments that did not fit. */
+    uint16_t dropped; /* Number of segments that did not fit into the sample. */
     /* Bit i is set if segment i is supported: it has several beams, or is near the previous scan's foreground. */
     uint64_t supported;
 };
@@ -266,7 +269,7 @@ struct scanhub_pose_v2 {
     double y_m; /* Meters to the left of the robot's center. */
     double yaw_rad; /* Direction in radians, counterclockwise from ahead. */
     uint8_t upside_down; /* 1 if the sensor is mounted upside down, so that its first beam is the leftmost. */
-    /* 0. In a status, the first one is 1 if a threshold for reflectors (`marks.level`) is configured. */
+    /* 0. In a status, the first byte is 1 if a threshold for reflectors (`marks.level`) is configured. */
     uint8_t reserved[7];
 };
 
@@ -320,7 +323,7 @@ struct scanhub_status_v2 {
     uint8_t family; /* Family of the scanner: SCANHUB_FAMILY_..; 255 while the hub searches for it. */
     uint32_t baud; /* Baud rate of the line; 0 if unknown. */
     uint64_t since_ns; /* Stamp of the start of the state, in ns. */
-    uint32_t rate_mhz; /* Scans per second in 1/1000; 0 while they are not measured. */
+    uint32_t rate_mhz; /* Scans per second, in units of 1/1000; 0 while the rate is not measured. */
     uint16_t angle_deg; /* Field of view in degrees: 100 or 180; 0 if unknown. */
     uint16_t resolution_cdeg; /* Angle between two beams in 1/100 degree; 0 if unknown. */
     /* Type that the scanner reports; empty if unknown. UTF-8, padded with 0; a text that fills it has no 0. */
@@ -367,7 +370,7 @@ struct scanhub_lines_v2 {
     uint8_t flags; /* Flags: SCANHUB_LINES_... */
     uint8_t reserved;
     uint16_t readings; /* Number of beams of the scan that have a range. */
-    uint16_t on_lines; /* Number of those beams that end on a line. */
+    uint16_t on_lines; /* Number of beams with a range that end on a line. */
     float noise_m; /* Standard deviation of the ranges in meters, estimated from this scan. */
     struct scanhub_line_v2 line_array[64]; /* The lines in the order of their beams; 0 beyond `count`. */
     struct scanhub_corner_v2 corner_array[64]; /* The corners in the order of their beams; 0 beyond `corners`. */
@@ -383,8 +386,8 @@ struct scanhub_lines_v2 {
 #define SCANHUB_METHOD_BOTH    5 /* Corners and lines in both scans. */
 
 /* Flags of struct scanhub_motion_v2. */
-/* The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is large
- * there. */
+/* The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is large in
+ * this direction. */
 #define SCANHUB_MOTION_DEGENERATE 1
 /* A step since the start was degenerate, so the summed pose may be off by any distance. */
 #define SCANHUB_MOTION_OPEN       2
@@ -411,15 +414,16 @@ struct scanhub_motion_v2 {
 };
 
 /* Flags of struct scanhub_early_v2. */
-#define SCANHUB_EARLY_WITHDRAWN 1 /* The warning with this number is withdrawn. */
+#define SCANHUB_EARLY_WITHDRAWN 1 /* The warning with this `seq` is withdrawn. */
 
-/* The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first zones with
- * the same or a higher number belong to its scan and confirm it. A sample with `withdrawn` withdraws it. */
+/* The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first sample of
+ * topic `zones` with the same or a higher `seq` belongs to the same scan and confirms the warning. A sample with
+ * `withdrawn` withdraws the warning. */
 struct scanhub_early_v2 {
     uint8_t verdict; /* Verdict: SCANHUB_VERDICT_... It is slow or stop, never clear or unknown. */
     uint8_t flags; /* Flags: SCANHUB_EARLY_... */
     uint16_t beam; /* Beam of the nearest point so far. */
-    uint32_t distance_mm; /* Distance of that point from the robot's center, in mm. */
+    uint32_t distance_mm; /* Distance of the nearest point so far from the robot's center, in mm. */
     uint16_t bytes_seen; /* Bytes of the telegram that had arrived; 0 for a revolution. */
     uint16_t beams_seen; /* Beams of the scan that had arrived. */
 };
@@ -432,7 +436,7 @@ struct scanhub_early_v2 {
 
 /* One person. */
 struct scanhub_track_v2 {
-    uint64_t id; /* ID of the person, which no one else gets while the tracker runs. */
+    uint64_t id; /* ID of the person. No other person gets the same ID while the tracker runs. */
     float x_m; /* Midpoint between the legs, along x, in meters on the map. */
     float y_m; /* Midpoint between the legs, along y, in meters on the map. */
     float vx_m_s; /* Velocity along x, in meters per second. */
@@ -480,7 +484,7 @@ struct scanhub_event_v2 {
     /* Name of the room after the event; empty outside of all rooms. UTF-8, padded with 0; a text that fills it has no
      * 0. */
     char room_text[24];
-    /* Name of the door; empty for other events. UTF-8, padded with 0; a text that fills it has no 0. */
+    /* Name of the door; empty if the kind is not `door`. UTF-8, padded with 0; a text that fills it has no 0. */
     char door_text[24];
     /* Room that the person came from, or `outside`; empty for other events. UTF-8, padded with 0; a text that fills it
      * has no 0. */
@@ -544,11 +548,12 @@ struct scanhub_obstacle_v2 {
     uint8_t reserved[3];
 };
 
-/* The payload of topic `obstacles`, 3088 bytes: the obstacles of one sweep. It is published even if there are none. */
+/* The payload of topic `obstacles`, 3088 bytes: the obstacles of one sweep. The sample is published even if there are
+ * no obstacles. */
 struct scanhub_obstacles_v2 {
     uint32_t sweep; /* Number of the sweep, as in topic `cloud`. */
     uint32_t generation; /* Generation of the background, as in topic `cloud`. */
-    uint32_t dropped; /* Number of obstacles that did not fit. */
+    uint32_t dropped; /* Number of obstacles that did not fit into the sample. */
     uint8_t count; /* Number of obstacles, at most 64. */
     uint8_t flags; /* Flags: SCANHUB_SWEEP_... */
     uint8_t reserved[2];
@@ -566,9 +571,9 @@ struct scanhub_robot_sensor {
     uint32_t nearest_mm; /* distance of its nearest point from the robot's center; or SCANHUB_NOTHING_MM */
 };
 
-/* Verdict of a robot: the payload of scanhub_open_robot. All of it is lent with the sample. */
+/* Verdict of a robot: the payload of scanhub_open_robot. The names and the sensors are lent with the sample. */
 struct scanhub_robot {
-    uint8_t verdict;     /* worst verdict of its sensors: stop, unknown, slow, clear; unknown without sensors */
+    uint8_t verdict;     /* worst verdict of its sensors (stop, unknown, slow, clear); unknown without sensors */
     uint32_t nearest_mm; /* smallest distance of all sensors; or SCANHUB_NOTHING_MM */
     const char *worst;   /* first sensor with this verdict; NULL without sensors */
     const char *nearest; /* sensor with the nearest point; NULL if no sensor has a point */
@@ -578,28 +583,28 @@ struct scanhub_robot {
 
 /* A sample that is lent: scanhub_take fills it, scanhub_release empties it. */
 struct scanhub_sample {
-    const struct scanhub_header_v2 *header; /* NULL if no hub sent the sample, see stale, or for a robot's verdict */
+    const struct scanhub_header_v2 *header; /* NULL for a robot's verdict, and if no hub sent the sample (see stale) */
     const void *payload;                    /* payload in shared memory, read-only */
     size_t length;                          /* number of used bytes of the payload */
-    uint64_t missed;                        /* number of samples that were sent before it and not received */
+    uint64_t missed;                        /* number of samples that were sent before this one and not received */
     int restarted;                          /* 1 if the hub has restarted, so that seq and topic_seq start again */
     int stale;                              /* 1 for zones that are unknown because no recent data arrived */
-    struct scanhub_attachment *of;                     /* the library's */
-    uint64_t number;                        /* the library's */
+    struct scanhub_attachment *of;                     /* only for the library */
+    uint64_t number;                        /* only for the library */
 };
 
 /*
- * Subscribes to a topic of `sensor` ("front", "robot1.front") in `domain` (NULL: the one that SCANHUB_DOMAIN names). It
- * does not wait for a hub. Returns 0; *handle is NULL after a refusal.
+ * Subscribes to a topic of `sensor` ("front", "robot1.front") in `domain` (NULL: the domain that SCANHUB_DOMAIN names).
+ * Does not wait for a hub. Returns 0; *handle is NULL after a refusal.
  */
 int scanhub_open(struct scanhub_attachment **handle, const char *domain, const char *sensor, int topic, int wait);
 
 /*
  * Subscribes to the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL means all
- * sensors of the hub. In a domain without a hub, it means the remote sensors that are published there.
- * scanhub_take then lends a struct scanhub_robot, a copy without header. The first one is lent when every sensor has a
- * verdict. Another one is lent when a sensor has a new verdict, or when its verdict becomes unknown because it is
- * stale. See scanhub_open for the rest.
+ * sensors of the hub. In a domain without a hub, NULL means the remote sensors that are published there.
+ * With this handle, scanhub_take lends a struct scanhub_robot, a copy without header. The first one is lent when every
+ * sensor has a verdict. Another one is lent when a sensor has a new verdict, or when the verdict of a sensor becomes
+ * stale and therefore unknown. See scanhub_open for the other arguments and the result.
  */
 int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
@@ -611,10 +616,11 @@ int scanhub_open_robot_early(struct scanhub_attachment **handle, const char *dom
 
 /*
  * Returns a descriptor for poll, select and epoll that is readable while there may be a sample. Do not read, write or
- * close it. It stays the same until scanhub_close, also over restarts of the hub. It is readable until scanhub_take has
- * returned 0: take all samples, then poll. Even then, there may be no sample. It also becomes readable when a hub
- * starts or ends, and when other topics of the sensor have a sample. While a hub runs, it becomes readable once a
- * second, and ten times a second just after the start of the hub. Only with SCANHUB_WAIT_EVENT.
+ * close it. The descriptor stays the same until scanhub_close, also over restarts of the hub. It stays readable until
+ * scanhub_take has returned 0: take all samples, then poll. A readable descriptor does not always mean that there is a
+ * sample. It also becomes readable when a hub starts or ends, and when other topics of the sensor have a sample. While
+ * a hub runs, it becomes readable once a second, and ten times a second just after the start of the hub. Only a handle
+ * with SCANHUB_WAIT_EVENT has a descriptor.
  */
 int scanhub_fd(struct scanhub_attachment *handle);
 
@@ -626,44 +632,45 @@ int scanhub_fd(struct scanhub_attachment *handle);
 int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
 
 /*
- * Lends the next sample and returns 1. Returns 0 if there is none; *sample is then empty. Never waits. Four samples can
- * be lent at a time. The memory that a sample points to is valid until the sample is released.
+ * Lends the next sample and returns 1. Returns 0 if no sample has arrived; *sample is then empty. Never waits. A handle
+ * can lend four samples at a time. The memory that a sample points to is valid until the sample is released.
  *
- * For zones, it lends a copy of the latest sample. When this becomes stale, because scanner, hub or machine stopped,
- * there is one more sample, without header, whose verdict is unknown (`stale`). A program that acts on zones needs no
- * timeout of its own.
+ * For zones, the sample is a copy of the latest sample. When the verdict becomes stale, because scanner, hub or machine
+ * stopped, one more sample follows. It has no header, and its verdict is unknown (`stale`). A program that acts on
+ * zones therefore needs no timeout of its own.
  */
 int scanhub_take(struct scanhub_attachment *handle, struct scanhub_sample *sample);
 
-/* Releases a sample and empties it. Returns 0, even if it was empty. After a refusal, it is unchanged. */
+/* Releases a sample and empties it. Returns 0, even if the sample was empty. After a refusal, the sample is
+ * unchanged. */
 int scanhub_release(struct scanhub_sample *sample);
 
-/* Closes the handle. Its lent samples become invalid. Returns 0, also for NULL. */
+/* Closes the handle. Samples that the handle has lent become invalid. Returns 0, also for NULL. */
 int scanhub_close(struct scanhub_attachment *handle);
 
-/* Returns 1 if a hub ran in the domain at the last call that found no sample, otherwise 0. */
+/* Returns 1 if a hub ran in the domain when a call with this handle last found no sample, otherwise 0. */
 int scanhub_hub_is_running(struct scanhub_attachment *handle);
 
 /*
- * Sets *silent_ns to the nanoseconds since the last sample, or since scanhub_open if there was none. Returns 0. Time
- * during which the machine was suspended counts (CLOCK_BOOTTIME).
+ * Sets *silent_ns to the nanoseconds since the last sample, or since scanhub_open if there was no sample. The number
+ * includes time during which the machine was suspended (CLOCK_BOOTTIME). Returns 0.
  */
 int scanhub_silent_for(struct scanhub_attachment *handle, uint64_t *silent_ns);
 
 /*
- * Returns the reason why no sample arrives, one of SCANHUB_SILENCE_.. . Never waits, and is cheap enough for once a
- * second. Sets *text, unless `text` is NULL, to a line with the reason, followed by a line with the remedy, except for
- * SCANHUB_SILENCE_WAITING. The text is valid until the next call of this function with this handle, or until
- * scanhub_close. A handle of scanhub_open_robot has the reason of its first sensor whose verdict is unknown and that
- * has a reason.
+ * Returns the reason why no sample arrives, one of SCANHUB_SILENCE_.. . Never waits, and is fast enough for a call
+ * every second. Sets *text, unless `text` is NULL, to a line with the reason. Except for SCANHUB_SILENCE_WAITING, a
+ * line with the remedy follows. The text is valid until the next call of this function with this handle, or until
+ * scanhub_close. With a handle of scanhub_open_robot, the reason is that of the first sensor that has an unknown
+ * verdict and a reason.
  */
 int scanhub_why_silent(struct scanhub_attachment *handle, const char **text);
 
 /*
- * Writes the names of the sensors in `domain` (NULL: the one that SCANHUB_DOMAIN names) to `names`, sorted, with blanks
- * between them and a 0 at the end: "front rear". The text is empty if no hub of this user runs. Returns the
- * length of the complete text in bytes, without its 0. If it is `size` or more, only the names that fit were written:
- * use a larger buffer. `names` may be NULL if `size` is 0. Never waits.
+ * Writes the names of the sensors in `domain` (NULL: the domain that SCANHUB_DOMAIN names) to `names`, sorted, with
+ * blanks between them and a 0 at the end: "front rear". The text is empty if no hub of this user runs. Returns the
+ * length of the complete text in bytes, without its 0. If this length is `size` or more, only the names that fit were
+ * written: use a larger buffer. `names` may be NULL if `size` is 0. Never waits.
  */
 int scanhub_sensors(const char *domain, char *names, size_t size);
 
@@ -671,25 +678,27 @@ int scanhub_sensors(const char *domain, char *names, size_t size);
 int scanhub_topics(const char *domain, char *names, size_t size);
 
 /*
- * Publishes the angles of a mount as the topic tilt of `name` ("mount") in `domain` (NULL: the one that SCANHUB_DOMAIN
- * names), for scanhub tilt and all other subscribers: docs/tilt.md. No hub is needed. A name with a dot is refused with
- * SCANHUB_REFUSED_CONFIGURATION. If another process has the name (a program, or the hub with a sensor of this name), it
- * returns SCANHUB_REFUSED_FAILED, and scanhub_error names that process. Returns 0; *publication is NULL after a
- * refusal.
+ * Publishes the angles of a mount as the topic tilt of `name` ("mount") in `domain` (NULL: the domain that
+ * SCANHUB_DOMAIN names), for scanhub tilt and all other subscribers (docs/tilt.md). No hub is needed. Returns 0;
+ * *publication is NULL after a refusal. A name with a dot is refused with SCANHUB_REFUSED_CONFIGURATION. A name that
+ * another process has (a program, or the hub with a sensor of this name) is refused with SCANHUB_REFUSED_FAILED, and
+ * scanhub_error names that process.
  */
 int scanhub_publish_tilt(struct scanhub_publication **publication, const char *domain, const char *name);
 
 /*
- * Publishes the angle of the mount at `stamp_ns` of CLOCK_MONOTONIC (0: now), right-handed around its axis, and its
- * rate in radians per second (NAN: unknown). Wakes the subscribers and never waits. Returns 0.
+ * Publishes the angle of the mount at `stamp_ns` of CLOCK_MONOTONIC (0: now). The angle is in radians, right-handed
+ * around the mount's axis, and its rate is in radians per second (NAN: unknown). Wakes the subscribers and never waits.
+ * Returns 0.
  */
 int scanhub_send_tilt(struct scanhub_publication *publication, uint64_t stamp_ns, double angle_rad, double rate_rad_s);
 
-/* Ends the publication and releases the name. Returns 0, even for NULL. So does the end of the thread or process. */
+/* Ends the publication and releases the name. Returns 0, even for NULL. The end of the thread or of the process ends a
+ * publication, too. */
 int scanhub_unpublish(struct scanhub_publication *publication);
 
-/* Returns the error of this thread's last refused call: the message, and often a second line with the remedy. It is
- * valid until the next refused call of this thread. */
+/* Returns the error of this thread's last refused call: the message, and often a second line with the remedy. The text
+ * is valid until the next refused call of this thread. */
 const char *scanhub_error(void);
 
 /* Returns the version of the library, as in "0.1.0". */
@@ -733,7 +742,8 @@ static inline unsigned scanhub_count(const struct scanhub_sample *scan)
     return head->count < room ? head->count : (unsigned)room;
 }
 
-/* Returns the array that follows the arrays of `before`. */
+/* Returns the array that follows the arrays in `before`, which are bits of `contents`; NULL if the sample is not a
+ * scan. */
 static inline const void *scanhub_scan_array(const struct scanhub_sample *scan, unsigned before)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -743,13 +753,14 @@ static inline const void *scanhub_scan_array(const struct scanhub_sample *scan, 
     return (const unsigned char *)scan->payload + sizeof *head + offset;
 }
 
-/* Returns the scanhub_count ranges in device units, for programs that read many. Values above `valid_to` are codes. */
+/* Returns all ranges in device units, scanhub_count of them. Values above `valid_to` are codes. This is faster than
+ * scanhub_range_m for each beam. */
 static inline const uint16_t *scanhub_ranges(const struct scanhub_sample *scan)
 {
     return (const uint16_t *)scanhub_scan_array(scan, SCANHUB_SCAN_ANGLES);
 }
 
-/* Returns the range of beam i in meters; NAN if it has no reading. */
+/* Returns the range of beam i in meters; NAN if the beam has no reading. */
 static inline double scanhub_range_m(const struct scanhub_sample *scan, unsigned i)
 {
     if (i >= scanhub_count(scan))
@@ -759,7 +770,8 @@ static inline double scanhub_range_m(const struct scanhub_sample *scan, unsigned
     return range <= head->valid_to ? (double)range * head->unit_um / 1e6 : NAN;
 }
 
-/* Returns the angle of beam i in radians, exact if the scanner reports it; NAN if the sample is not a scan. */
+/* Returns the angle of beam i in radians, which is exact if the scanner reports angles; NAN if the sample is not a
+ * scan. */
 static inline double scanhub_angle(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -775,7 +787,7 @@ static inline double scanhub_angle(const struct scanhub_sample *scan, unsigned i
 
 /*
  * Returns the reason why beam i has no reading: "not_measured", "no_return", "beyond" the range limit, "too_near",
- * "too_bright", "weak", "overflow", "error"; NULL if it has one, or does not exist.
+ * "too_bright", "weak", "overflow", "error"; NULL if the beam has a reading, or does not exist.
  */
 static inline const char *scanhub_code(const struct scanhub_sample *scan, unsigned i)
 {
@@ -793,7 +805,7 @@ static inline const char *scanhub_code(const struct scanhub_sample *scan, unsign
     return words[0xFFFFu - range < 7u ? 0xFFFFu - range : 7];
 }
 
-/* Returns the intensity of beam i; -1 if the sensor does not send it, or the beam does not exist. */
+/* Returns the intensity of beam i; -1 if the sensor does not send intensities, or the beam does not exist. */
 static inline int32_t scanhub_intensity(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -806,15 +818,15 @@ static inline int32_t scanhub_intensity(const struct scanhub_sample *scan, unsig
     return -1;
 }
 
-/* Returns the number of points that were dropped because another point has the same beam. Points without a return
- * count, too. */
+/* Returns the number of points that were dropped because another point has the same beam. The number includes points
+ * without a return. */
 static inline unsigned scanhub_collisions(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
     return head == NULL ? 0 : head->collisions;
 }
 
-/* Returns 1 if packets of the revolution are missing. Their beams are not measured. */
+/* Returns 1 if packets of the revolution are missing. The beams of these packets have the code "not_measured". */
 static inline int scanhub_is_incomplete(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -837,7 +849,7 @@ static inline uint64_t scanhub_beam_stamp_ns(const struct scanhub_sample *scan, 
  * Samples of SCANHUB_TOPIC_FOREGROUND and SCANHUB_TOPIC_BACKGROUND.
  */
 
-/* Returns whether the payload has all that the head of a foreground counts. */
+/* Returns whether the payload contains all elements that are counted in the head of a foreground. */
 static inline int scanhub_foreground_is_whole(const struct scanhub_sample *foreground)
 {
     const struct scanhub_foreground_v2 *head = (const struct scanhub_foreground_v2 *)foreground->payload;
@@ -857,7 +869,7 @@ static inline const struct scanhub_segment_v2 *scanhub_segments(const struct sca
 }
 
 /* Returns 1 if segment i is supported: it has several beams, or the foreground of the previous scan was near it.
- * Returns 0 if it may be a flickering edge, or if there is no such segment. */
+ * Returns 0 if the segment may be a flickering edge, or does not exist. */
 static inline int scanhub_has_support(const struct scanhub_sample *foreground, unsigned i)
 {
     const struct scanhub_foreground_v2 *head = (const struct scanhub_foreground_v2 *)foreground->payload;
@@ -887,8 +899,8 @@ static inline const uint16_t *scanhub_foreground_ranges(const struct scanhub_sam
 }
 
 /*
- * Returns the `count` ranges of a background in device units: 0 is unknown, and 65535 is beyond the scanner's range.
- * Returns NULL if the sample is not a background.
+ * Returns the `count` ranges of a background in device units. 0 means that the background of the beam is unknown, and
+ * 65535 that it is beyond the scanner's range. Returns NULL if the sample is not a background.
  */
 static inline const uint16_t *scanhub_background_ranges(const struct scanhub_sample *background)
 {
@@ -908,7 +920,7 @@ static inline const struct scanhub_cloud_point_v2 *scanhub_cloud_points(const st
     return (const struct scanhub_cloud_point_v2 *)(const void *)(head + 1);
 }
 
-/* Compile-time checks that the compiler uses the same layout as the hub. */
+/* Checks at compile time that this compiler uses the same layout as the hub. */
 #if defined(__cplusplus)
 #define SCANHUB_MUST(name, what) static_assert(what, #name)
 #elif defined(__STDC_VERSION__) && __STDC_VERSION__ >= 201112L

@@ -1,6 +1,6 @@
 //! Model checks of the doorbell over all interleavings of hubs and subscribers, and all permitted orders of their
 //! memory accesses. The futex is modeled by a lock and a condition variable. A wake-up is lost if a subscriber sleeps
-//! and no hub will wake it any more. The model then ends the sleep and counts it.
+//! and no hub will wake it any more. The model then ends the sleep and counts a lost wake-up.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
@@ -78,7 +78,7 @@ fn sleep(words: &[(&ModelWord, u32)]) -> bool {
 }
 
 /// The page of one sensor, and the number of the last sample. The memory orders of the words decide when a thread sees
-/// it.
+/// a new number.
 struct Sensor {
     rung: ModelWord,
     closed: ModelWord,
@@ -134,7 +134,7 @@ fn spawn_subscriber(
     thread::spawn(move || act(&sensor))
 }
 
-/// Runs `act` in a thread that counts as a hub until it returns.
+/// Runs `act` in a thread that is counted as a hub until `act` returns.
 fn spawn_hub(sensor: &Arc<Sensor>, act: impl FnOnce(&Sensor) + 'static) -> thread::JoinHandle<()> {
     let sensor = sensor.clone();
     sensor.rung.futex.calls.lock().unwrap().hubs += 1;
@@ -282,7 +282,7 @@ fn model_detects_a_wakeup_lost_without_the_fence() {
             ring(&sensor.rung);
         });
         let got = loop {
-            // Without the fence of `read_count`.
+            // This load lacks the fence of `read_count`.
             let ring_count = sensor.rung.load(Ordering::Relaxed);
             if sensor.sent.load(Ordering::Relaxed) == 1 {
                 break true;
