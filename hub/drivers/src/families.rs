@@ -1,5 +1,5 @@
-//! List of all scanner families, and a [`Session`] for any of them. Code that supports every family needs only this
-//! module.
+//! List of all scanner families, and a [`Session`] with a scanner of any family. Code that supports every family needs
+//! only this module.
 
 use std::fmt;
 
@@ -23,7 +23,7 @@ macro_rules! families {
             $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::$Session),)*
         }
 
-        /// Reason why a session does not stream as it should. The family provides the text.
+        /// Reason why a session does not stream as it should. The scanner's family provides the text.
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub enum Problem {
             $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Problem),)*
@@ -36,14 +36,15 @@ macro_rules! families {
             match family { $(Family::$Family => &$family::FEATURES,)* }
         }
 
-        /// Creates a recognizer for each family. The search listens and sends requests in this order.
+        /// Creates a recognizer for each family, in the order of the declaration below. The search uses the families in
+        /// this order.
         pub(crate) fn probes() -> Vec<Box<dyn Probe>> {
             vec![$(Box::<$family::Probe>::default()),*]
         }
 
         impl Session {
-            /// Creates a session with a scanner of `family`. The port is open at the baud rate of `settings`, or at the
-            /// default rate of the model or family.
+            /// Creates a session with a scanner of `family`. The port is open at the baud rate in `settings`. If
+            /// `settings` contain no baud rate, the port is open at the default rate of the model or family.
             pub fn begin(family: Family, settings: &Settings, now: Nanos) -> Session {
                 match family { $(Family::$Family => Session::$Family($family::$Session::new((*settings).into(), now)),)* }
             }
@@ -68,7 +69,7 @@ macro_rules! families {
             }
         }
 
-        /// Evaluates an expression with the session that a [`Session`] contains, whatever its family is.
+        /// Evaluates an expression with the session that a [`Session`] contains. This session may be of any family.
         macro_rules! each {
             ($of:expr, $session:ident => $value:expr) => {
                 match $of { $(Session::$Family($session) => $value,)* }
@@ -83,9 +84,9 @@ families! {
     Rplidar rplidar RplidarSession,
 }
 
-/// Returns all scan heads that a scanner of `family` with these `settings` may have. All of them have the same number
-/// of beams. For a rotating scanner, it is the number in the settings, the maximum of the settings, or the default of
-/// the family.
+/// Returns all heads that the scans of a scanner of `family` with these `settings` may have. All heads have the same
+/// number of beams. For a rotating scanner, this number is the first of these that exists: the number of beams in the
+/// settings, the maximum number of beams in the settings, and the default of the family.
 pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
     match family {
         Family::Lms => lms::scan_heads(settings),
@@ -114,11 +115,11 @@ pub fn identity_probe(family: Family, rate: Option<u32>, now: Nanos) -> Option<I
     }
 }
 
-/// Features of a link with `family = "auto"`. Its limits are sufficient for every scanner.
+/// Features of a link with `family = "auto"`. The limits in these features are sufficient for every scanner.
 pub const ANY_FAMILY: Features = {
     let mut any = Features {
         models: &[],
-        // Sufficient for every model.
+        // This number of beams is sufficient for every model.
         defaults: Model { name: "auto", baud: FIRST_RATE, beams: 3_240 },
         modes: &[],
         keys: &[],
@@ -227,7 +228,7 @@ impl line::ScannerSession for Session {
     }
 }
 
-/// Baud rate at which a search without a known scanner starts, in bits per second.
+/// Baud rate at which a search starts if no earlier search has found the scanner, in bits per second.
 const FIRST_RATE: u32 = 230_400;
 const _: () = {
     let mut at = 0;

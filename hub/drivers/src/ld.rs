@@ -22,7 +22,7 @@ pub use session::{LdSession, Problem};
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &MODELS,
-    // Sufficient for every model except the STL27L.
+    // This number of beams is sufficient for every model except the STL27L.
     defaults: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
     modes: &[],
     keys: &[],
@@ -53,7 +53,7 @@ named! {
         Stl19p "stl19p",
         /// STL27L.
         Stl27l "stl27l",
-        /// LD14P, whose head rotates more slowly.
+        /// LD14P, whose head rotates more slowly than the heads of the other models.
         Ld14p "ld14p",
     }
 }
@@ -77,7 +77,8 @@ impl Model {
         }
     }
 
-    /// Returns the number of points that the scanner measures per second. It does not depend on the speed of the head.
+    /// Returns the number of points that the scanner measures per second. This number does not depend on the speed of
+    /// the head.
     pub const fn points_per_second(self) -> u32 {
         match self {
             Model::Stl27l => 21_600,
@@ -86,7 +87,7 @@ impl Model {
         }
     }
 
-    /// Returns the number of revolutions per second at which a new scanner rotates.
+    /// Returns the speed at which the head of a factory-new scanner rotates, in revolutions per second.
     pub const fn revolutions_per_second(self) -> u32 {
         match self {
             Model::Ld14p => 6,
@@ -103,8 +104,8 @@ impl Model {
         }
     }
 
-    /// Returns the model that measures `points_per_second`. Several models may measure the same number. The result is
-    /// then the best-known model.
+    /// Returns the model that measures `points_per_second`. If several models measure this number of points, returns
+    /// the best-known of these models.
     pub(crate) fn of_point_rate(points_per_second: f32) -> Model {
         match points_per_second {
             rate if rate > 10_000.0 => Model::Stl27l,
@@ -189,6 +190,7 @@ const SEARCH_STEPS: SearchSteps = SearchSteps {
     max_transmission: PACKET_LEN,
     advice: "it streams by itself once it has 5 V and its head rotates",
 };
-/// Number of consecutive packets that prove an LDROBOT scanner. The header and the checksum of a packet have 24 bits in
-/// total. The angles and the clock of each packet must also continue those of the previous packet.
+/// Number of consecutive packets that prove an LDROBOT scanner. The header and the checksum of a packet have only 24
+/// bits in total, so other bytes may look like a packet by chance. The angles and the clock of each packet must also
+/// continue those of the previous packet.
 const MIN_PROOF_PACKETS: u32 = 4;

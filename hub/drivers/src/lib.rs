@@ -1,9 +1,9 @@
 //! Drivers of all scanner families: the protocol of each family, the session with a scanner, and the scans that a
 //! session returns.
 //!
-//! The drivers do no I/O. The caller passes bytes and the time, and gets bytes, events and deadlines in return. No
-//! driver opens a port, reads a clock or starts a thread. Bytes that are not part of a telegram or packet are counted
-//! and never cause an error.
+//! The drivers do no I/O. The caller passes received bytes and the time to a session, and the session returns bytes to
+//! send, events and deadlines. No driver opens a port, reads a clock or starts a thread. Bytes that are not part of a
+//! telegram or packet are counted and never cause an error.
 #![forbid(unsafe_code)]
 
 mod families;

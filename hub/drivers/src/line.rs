@@ -1,6 +1,6 @@
 //! Code that all scanner families share: the interface between session and driver, arrival times of bytes, and the
-//! reasons why a telegram or packet is suspect. For rotating scanners it also frames packets, assembles their points
-//! into revolutions, and assigns a revolution's points to the beams of a grid.
+//! reasons why a telegram or packet is suspect. For rotating scanners, this code also frames packets, assembles their
+//! points into revolutions, and assigns the points of a revolution to the beams of a grid.
 
 mod arrival_time;
 pub mod family;

@@ -1,5 +1,5 @@
-//! SICK LMS 2xx: the framer, telegrams in both directions, and the session with a scanner. The simulator also uses the
-//! protocol, so requests are decoded and replies are encoded here, too.
+//! SICK LMS 2xx: the framer, telegrams in both directions, and the session with a scanner. The simulator uses this
+//! module too, so the module also decodes requests and encodes replies.
 //!
 //! This file has the settings and the recognizer of the family.
 
@@ -117,7 +117,7 @@ const SEARCH_STEPS: SearchSteps = SearchSteps {
     // Only at this rate can several telegrams of a stream arrive in one listening step.
     listen_steps: &[ListenStep { rate: 500_000, duration: 120 * MILLIS, needs_bytes: true }],
     request_steps: Some(RequestSteps {
-        // The rate at power-on, the rate that a hub leaves behind, and the other rates.
+        // The rate after power-on, the rate at which an earlier hub may have left the scanner, and the other rates.
         rates: &[9_600, 500_000, 38_400, 19_200],
         settle_time: 20 * MILLIS,
         stop: None,
@@ -125,12 +125,13 @@ const SEARCH_STEPS: SearchSteps = SearchSteps {
             &[0x02, 0x00, 0x01, 0x00, command::TYPE, 0x1E, 0x12],
             &[0x02, 0x00, 0x01, 0x00, command::STATUS, 0x15, 0x12],
         ],
-        // At least 55 us and at most 6 ms (Telegram listing 4.3), minus the duration of the write.
+        // The scanner requires gaps of at least 55 us and at most 6 ms (Telegram listing 4.3). These limits leave time
+        // for the write.
         gap: Some((120 * MICROS, 5 * MILLIS)),
         // The acknowledgement arrives within 60 ms (Telegram listing 4.3), and captured replies began within 150 ms.
         reply_timeout: 150 * MILLIS,
         extra_reply_time: 250 * MILLIS,
-        // Sufficient for the rest of every captured reply, and for the rest of a status at 9,600 baud.
+        // This time is sufficient for the rest of every captured reply, and for the rest of a status at 9,600 baud.
         extra_partial_time: 300 * MILLIS,
         repeats: 1,
     }),
@@ -195,7 +196,7 @@ pub(crate) fn set(request: &mut SettingsRequest, key: Key, value: Value<'_>) -> 
     Ok(())
 }
 
-/// Returns the settings of an LMS.
+/// Checks `request`, and returns the settings of a session with an LMS.
 pub(crate) fn check(request: &SettingsRequest) -> Result<settings::Settings, Refusal> {
     if let Some(model) = &request.model {
         let what = format!("model = \"{model}\", but a scanner of family lms reports its model");
@@ -213,7 +214,7 @@ pub(crate) fn check(request: &SettingsRequest) -> Result<settings::Settings, Ref
     let angle_deg = request.angle_deg.unwrap_or(factory.angle_deg);
     let resolution_cdeg = request.resolution_cdeg.unwrap_or(factory.resolution_cdeg);
     if family == Some(Type::Fast) {
-        // A scan with 181 values looks like a scan of 180 degrees with a resolution of 1 degree.
+        // A scan of version S14 has 181 values, so it looks like a scan of 180 degrees with a resolution of 1 degree.
         let what = "the beams of version S14 have other angles: 90 degrees at 0.5, which no telegram reports";
         let remedy = "a hub can stream lms200, lms211, lms221 and lms291";
         return Err(Refusal::new(&[Key::Type], what.to_owned(), remedy));
@@ -231,11 +232,12 @@ pub(crate) fn check(request: &SettingsRequest) -> Result<settings::Settings, Ref
     Ok(settings::Settings { view: Some((angle_deg, resolution_cdeg)), ..request.unchecked_settings() })
 }
 
-/// Modes whose values are ranges (Telegram listing, 77h block D).
+/// List of the modes whose values are ranges, as text for the user (Telegram listing, 77h block D).
 const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";
 
-/// Returns the heads of scans whose angles and resolution are in `settings`. The measuring mode is unknown. The unit is
-/// also unknown, unless `settings` contains it.
+/// Returns the possible heads of scans whose angle and resolution are in `settings`. The measuring mode is still
+/// unknown, so each head has the maximum number of range bits. If `settings` contain no unit, the result has one head
+/// for each unit.
 pub(crate) fn scan_heads(settings: &settings::Settings) -> Vec<ScanHead> {
     let variant = Settings::from(*settings).variant;
     let units = settings.unit_mm.map_or(vec![Unit::Mm.mm(), Unit::Cm.mm()], |mm| vec![mm]);

@@ -1,4 +1,4 @@
-//! Session on a port. Its scanner has the configured family, or a [`Search`] finds it.
+//! Session on a port, with a scanner of the configured family or with a scanner that a [`Search`] finds.
 //!
 //! After the search, a session of the scanner's family takes over. If this session receives nothing for 10 s, the
 //! search starts again, with the same family first. The driver handles a search like a session, and calls
@@ -39,7 +39,8 @@ pub struct PortSession {
     /// Whether a user has paused the search.
     is_paused: bool,
     now: Nanos,
-    /// Last time that was passed to the session. While the session processes captured reads, it is earlier than `now`.
+    /// Last time that was passed to the session. While the session processes captured reads, this time is earlier than
+    /// `now`.
     session_now: Nanos,
     /// Time at which the session last returned an event.
     received_at: Nanos,
@@ -59,9 +60,9 @@ enum Phase {
 }
 
 impl PortSession {
-    /// Creates a session on a port that was opened at `now`. If `family` is set, the port is open at the baud rate of
-    /// `settings`, or at the default rate of the model. If `family` is `None`, the port is open at the [rate of the
-    /// search](Search::opening_rate), which starts with the scanner in `memory`.
+    /// Creates a session on a port that was opened at `now`. If `family` is set, the port is open at the baud rate in
+    /// `settings`, or, without such a rate, at the default rate of the model. If `family` is `None`, the port is open
+    /// at the [rate of the search](Search::opening_rate), and the search first tries to find the scanner in `memory`.
     pub fn begin(
         family: Option<Family>,
         settings: &Settings,
@@ -129,8 +130,8 @@ impl PortSession {
     }
 
     /// Continues after [`poll_action`](line::Protocol::poll_action) has returned a wait. Returns whether the driver
-    /// must drain the session again. It must if the search has found a scanner or has restarted, or if the session has
-    /// processed captured bytes.
+    /// must drain the session again. The driver must do so if the search has found a scanner or has restarted, or if
+    /// the session has processed captured bytes.
     pub fn advance(&mut self) -> bool {
         if !self.is_auto {
             return false;
@@ -498,8 +499,8 @@ fn sum(a: SessionStats, b: SessionStats) -> SessionStats {
     }
 }
 
-/// Time without an event from a found scanner after which the search starts again. Until then, the session handles
-/// silence and power cycles.
+/// Time without an event from a found scanner after which the search starts again. Before this time has passed, the
+/// session itself handles silence and power cycles.
 const LOSS_TIMEOUT: Nanos = 10_000 * MILLIS;
 /// Baud rate that the session reports while the rate of the port is unknown, in bits per second.
 const FALLBACK_RATE: u32 = 9_600;

@@ -1,5 +1,5 @@
-//! Recognition of the scanner family from raw bytes, such as the bytes of a stream file. It counts the bytes that each
-//! family's framer accepts.
+//! Recognition of the scanner family from raw bytes, such as the bytes of a stream file. This module counts the bytes
+//! that each family's framer accepts.
 
 use scanhub_schema::{Family, MILLIS, Nanos};
 
@@ -12,7 +12,7 @@ use crate::{Session, Settings, features};
 pub const EXAMINED_BYTES: usize = 64 * 1024;
 
 /// Returns the family whose telegrams or packets contain most of the first [`EXAMINED_BYTES`] bytes of `bytes`. Returns
-/// `None` if they contain less than half of these bytes.
+/// `None` if these telegrams or packets contain less than half of these bytes.
 pub fn family_of(bytes: &[u8]) -> Option<Family> {
     let examined = bytes.len().min(EXAMINED_BYTES);
     let [(first, max_bytes), ..] = bytes_by_family(bytes);
@@ -29,12 +29,14 @@ pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
 }
 
 /// Returns the name of a scan mode that determines how `bytes` are divided into packets of `family`. Returns `None` if
-/// the bytes alone determine it. The packets of some modes look alike, so decoding may require another mode.
+/// the bytes alone determine this. Packets of several modes may have the same length, so a decoder may need a mode
+/// other than the returned one.
 pub fn framing_mode(family: Family, bytes: &[u8]) -> Option<&'static str> {
     bytes_in_mode(family, &bytes[..bytes.len().min(EXAMINED_BYTES)])?.1
 }
 
-/// Returns the number of bytes in telegrams or packets of `family`. Ignores a number that noise can explain.
+/// Returns the number of bytes in telegrams or packets of `family`. Returns 0 if the number is so small that noise can
+/// explain it.
 fn accepted_bytes(family: Family, bytes: &[u8]) -> usize {
     match bytes_in_mode(family, bytes) {
         None => bytes_in_telegrams(bytes),
@@ -104,7 +106,7 @@ fn bytes_in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
     }
 }
 
-/// Time after which a session releases packets that it holds back.
+/// Time without a byte after which every session releases the packets that it holds back.
 const HOLD_TIMEOUT: Nanos = 100 * MILLIS;
 /// Maximum number of bytes that may be noise whose checksum is right by chance.
 const MAX_CHANCE_BYTES: usize = 100;

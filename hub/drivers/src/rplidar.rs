@@ -27,7 +27,7 @@ pub use session::{Problem, RplidarSession};
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
     models: &MODELS,
-    // Sufficient for every model except the S2 and the S3.
+    // This number of beams is sufficient for every model except the S2 and the S3.
     defaults: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
     modes: &MODES,
     keys: &[Key::ModeName, Key::Idle],
@@ -77,7 +77,8 @@ named! {
 pub(crate) enum Motor {
     /// Only the line DTR controls the motor. The motor runs while DTR is not asserted.
     Dtr,
-    /// A request with a duty cycle controls the motor, if the scanner has an accessory board. Otherwise, DTR does.
+    /// A request with a duty cycle controls the motor, if the scanner has an accessory board. Otherwise, the line DTR
+    /// controls the motor.
     Board,
     /// A request with a speed controls the motor.
     Speed,
@@ -109,7 +110,8 @@ impl Model {
         }
     }
 
-    /// Returns the number that the usual hardware of this model reports. It is the inverse of [`Model::of_id`].
+    /// Returns the number that the usual hardware of this model reports. This method is the inverse of
+    /// [`Model::of_id`].
     pub(crate) fn id(self) -> u8 {
         match self {
             Model::A1 => 0x18,
@@ -145,7 +147,7 @@ impl Model {
         }
     }
 
-    /// Returns the number of revolutions per second.
+    /// Returns the usual number of revolutions per second.
     pub const fn revolutions_per_second(self) -> f32 {
         match self {
             Model::A1 => 7.3,
@@ -153,7 +155,7 @@ impl Model {
         }
     }
 
-    /// Returns the default number of beams. It is the number of points per revolution in the fastest scan mode.
+    /// Returns the default number of beams, which is the number of points per revolution in the fastest scan mode.
     pub const fn beams(self) -> usize {
         self.beams_of(self.points_per_second() as f32)
     }
@@ -164,7 +166,7 @@ impl Model {
     }
 
     /// Returns the number of beams for a scan mode with `points_per_second`. If this number is close to the number of
-    /// beams of the fastest mode, returns the latter.
+    /// beams of the fastest mode, returns the number of the fastest mode.
     pub(crate) fn beams_in_mode(self, points_per_second: f32) -> usize {
         let (beams, fastest) = (self.beams_of(points_per_second), self.beams());
         let is_close = (beams as f64 / fastest as f64 - 1.0).abs() <= MAX_BEAM_DEVIATION;
@@ -178,15 +180,15 @@ const MAX_BEAM_DEVIATION: f64 = 0.03;
 named! {
     /// Scan mode that a model may offer.
     Mode {
-        /// One packet per point, with its quality. The slowest mode.
+        /// One packet for each point, with the quality of the point. This mode is the slowest.
         Standard "standard",
-        /// More points per second, in packets with a checksum.
+        /// More points per second than the standard mode, in packets with a checksum.
         Express "express",
-        /// More points per second, for short ranges.
+        /// More points per second than the standard mode, for short ranges.
         Boost "boost",
-        /// More points per second, for dark targets.
+        /// More points per second than the standard mode, for dark targets.
         Sensitivity "sensitivity",
-        /// Fewer points per second, for sunlight.
+        /// Fewer points per second than modes boost and sensitivity, for sunlight.
         Stability "stability",
         /// The fastest mode of the S series and of the C1.
         DenseBoost "denseboost",

@@ -7,12 +7,13 @@
 //!    they stream.
 //! 3. Send the requests of each family at its rates.
 //!
-//! In every second round, slow scanners have more time. A pause follows each round without a byte except the first, and
-//! pauses get longer.
+//! In every second round, the search waits longer for replies, because some scanners are slow. If no byte has arrived
+//! in a round, the search pauses after the round, except after the first round. The pauses get longer.
 //!
-//! The search sends only requests that no scanner of another family accepts, at any baud rate, and that do not change
-//! anything. Each family declares them in its [`SearchSteps`]. Resets, motor requests, changes of settings and of the line
-//! DTR belong to the sessions. In the first 150 ms after the port was opened, the search sends no byte.
+//! The search sends only requests that no scanner of another family accepts, at any baud rate, and that change nothing
+//! in the scanner. Each family declares its requests in its [`SearchSteps`]. Only a session sends resets, motor
+//! requests and changes of settings, or sets the line DTR. In the first 150 ms after the port was opened, the search
+//! sends no byte.
 //!
 //! The search is a [`Protocol`]. It is done when it has [found](Search::found) the scanner. The bytes of its last step
 //! are then available from [`Search::reads`], so that the family's session can process them.
@@ -41,10 +42,10 @@ pub struct FoundScanner {
 pub enum PortKind {
     /// Serial line whose baud rate the search sets.
     Serial,
-    /// Serial server on the network. The baud rate is set there.
+    /// Serial server on the network. The user sets the baud rate in the server.
     Server,
-    /// Recording, to which the search cannot send. A family whose stream is not a proof is found only by recorded
-    /// replies.
+    /// Recording, to which the search cannot send. If the stream of a family does not prove the family, the search
+    /// finds this family only by recorded replies.
     Recording,
 }
 
@@ -53,9 +54,10 @@ pub enum PortKind {
 pub struct Memory {
     /// Family of the scanner.
     pub family: Family,
-    /// Baud rate of its stream, in bits per second.
+    /// Baud rate at which the scanner streams, in bits per second.
     pub stream_rate: u32,
-    /// Baud rate at which it replied while it did not stream, in bits per second: the one of [`FoundScanner`].
+    /// Baud rate at which the scanner replied while it did not stream, in bits per second. The search reported this
+    /// rate as [`FoundScanner::rate`].
     pub reply_rate: u32,
 }
 
@@ -85,7 +87,8 @@ pub struct Coverage {
     pub rates: Vec<u32>,
     /// Baud rates of the family that the port has rejected, in bits per second.
     pub rejected: Vec<u32>,
-    /// Part of a message for a search without success: properties of the scanner that the user should check.
+    /// Part of the message after a search without success. It names the properties of the scanner that the user should
+    /// check.
     pub advice: &'static str,
 }
 
@@ -138,8 +141,8 @@ struct Step {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum StepCondition {
     Always,
-    /// Bytes have arrived in this round. Also holds at the start of a round, because the port has rejected the rates of
-    /// all earlier steps.
+    /// Bytes have arrived in this round. The condition also holds at the start time of a round: if no time has passed,
+    /// the port has rejected the rates of all earlier steps.
     Bytes,
     /// A request to the scanner in `memory` was sent in this round, no byte has arrived, or the bytes look like a
     /// stream.
@@ -150,7 +153,8 @@ enum StepCondition {
 
 #[derive(Clone, Copy, Debug)]
 enum StepAction {
-    /// Listens for the first duration. If a transmission has begun, listens for up to the second duration longer.
+    /// Listens for the first duration. If a transmission has begun by then, listens longer, by at most the second
+    /// duration.
     Listen(Nanos, Nanos),
     /// Sends the request of the probe with this index.
     Request(usize),
@@ -694,8 +698,8 @@ impl Protocol for Search {
 }
 
 impl Memory {
-    /// Returns the memory if the search can use its baud rates for its family. Replaces an unknown reply rate by the
-    /// stream rate. Returns `None` if the stream rate is unknown.
+    /// Returns the memory for a search with these `probes`. Replaces a reply rate that the family does not use by the
+    /// stream rate. Returns `None` if the family does not use the stream rate.
     fn checked(self, probes: &[Box<dyn Probe>]) -> Option<Memory> {
         let steps =
             probes.iter().map(|probe| probe.search_steps()).find(|steps| steps.family == self.family)?;
@@ -713,7 +717,7 @@ impl OutgoingRequest {
     }
 
     /// Updates the state after the next bytes were written at `now`. If these bytes were too late, the scanner has
-    /// discarded the request, so the request starts over.
+    /// discarded the request, so the search restarts the request.
     fn transmitted(&mut self, now: Nanos, byte_time: Nanos, gap: Option<(Nanos, Nanos)>) {
         let Some((min_gap, max_gap)) = gap else {
             self.sent = self.request.len();
@@ -837,15 +841,15 @@ const SILENT_AFTER_OPEN: Nanos = 150 * MILLIS;
 const SERVER_STEP_TIME: Nanos = 500 * MILLIS;
 /// Pauses after rounds without a byte, by the index of the round. The last pause applies to all later rounds.
 const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
-/// Time from the first byte in a pause to the end of the pause. A boot message takes this time.
+/// Time from the first byte in a pause to the end of the pause. It is long enough for a boot message.
 const BOOT_MESSAGE_TIME: Nanos = 60 * MILLIS;
 /// Interval at which the search checks whether a transmission that has begun is complete.
 const EXTENSION_INTERVAL: Nanos = 20 * MILLIS;
 /// Maximum time by which the search passes a byte to the driver before the driver may send it.
 const TRANSMIT_AHEAD: Nanos = 5 * MILLIS;
-/// Number of times that the search sends a request again because its reply may have been damaged.
+/// Maximum number of times that the search sends a request again because the reply may have been damaged.
 const MAX_RETRIES: u8 = 2;
-/// Number of times that a request starts over because a byte was late.
+/// Maximum number of restarts of a request because a byte was late.
 const MAX_RESTARTS: u8 = 3;
 /// Lowest baud rate, in bits per second. It determines the speed of requests if the rate is unknown.
 const BOOT_RATE: u32 = 9_600;
@@ -853,9 +857,10 @@ const BOOT_RATE: u32 = 9_600;
 const UNKNOWN_RATE: u32 = 0;
 /// Number of captured bytes that the search keeps. The longest telegram has 814 bytes.
 const CAPTURE_LEN: usize = 16 * 1_024;
-/// Length of the buffer of one read, in bytes. A tty returns no more bytes at once.
+/// Length of the buffer of one read, in bytes. One read of a tty never returns more bytes.
 const READ_LEN: usize = 4_096;
-/// Durations in messages, in seconds. They differ by more than a minute, because the hub logs each new message.
+/// Durations that a message can contain, in seconds. Two durations differ by more than a minute, because the hub logs a
+/// message each time that its duration changes.
 const MESSAGE_SECONDS: [u32; 7] = [10, 100, 300, 600, 1_800, 3_600, 36_000];
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! Settings of a scanner: keys of a configuration, and the checked settings of a session. A family lists the keys that
-//! only it has, and checks their values. The crate `config` adds the position of each key in a file.
+//! Settings of a scanner: keys of a configuration, and the checked settings of a session. Each family lists the keys
+//! that no other family has, and checks their values. The crate `config` adds the position of each key in a file.
 
 use std::fmt;
 
@@ -133,11 +133,11 @@ pub struct Settings {
     pub view: Option<(u16, u16)>,
     /// Baud rate for the stream, in bits per second. `None` for the default of the model or family.
     pub baud: Option<u32>,
-    /// Type that the scanner is expected to report. The session only compares it, and never changes the type of the
-    /// scanner.
+    /// Type that the scanner is expected to report. `scanhub doctor` compares it with the reported type. A session does
+    /// not use it.
     pub expected_type: Option<&'static str>,
-    /// Expected unit of ranges, in millimeters. The session only compares it, and never changes the unit of the
-    /// scanner.
+    /// Expected unit of ranges, in millimeters. The hub and `scanhub doctor` compare it with the unit that the scanner
+    /// reports. No session changes the unit of a scanner.
     pub unit_mm: Option<u8>,
     /// Number of the measurement mode, which defines the meaning of values. Used for a recording that does not contain
     /// this number.
@@ -195,7 +195,7 @@ impl SettingsRequest {
         })
     }
 
-    /// Checks the model, if one is set.
+    /// Checks the model, if a model is set.
     ///
     /// # Errors
     ///

@@ -1,6 +1,6 @@
 //! Packet format of LDROBOT scanners, with its encoder, its decoder and its framer. Every packet has 47 bytes and 12
 //! points (source: the manuals of LD06 and LD19, "data packet format"). The framer finds packets in a stream that may
-//! lack bytes, and never discards an intact one.
+//! lack bytes, and never discards an intact packet.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -11,7 +11,7 @@ use crate::line::{self, Buffer, Point, suspect};
 pub const PACKET_LEN: usize = 47;
 /// Number of points in a packet.
 pub const POINTS_PER_PACKET: usize = 12;
-/// First two bytes of every packet. The first one marks the start. The second one contains the kind of packet and the
+/// First two bytes of every packet. The first byte marks the start. The second byte contains the kind of packet and the
 /// number of points.
 pub const HEADER: [u8; 2] = [0x54, 0x2C];
 /// Full circle in hundredths of a degree, the unit of angles in a packet.
@@ -35,7 +35,7 @@ pub struct Packet<'a> {
 pub enum Reject {
     /// The checksum is wrong.
     Checksum,
-    /// An angle is greater than 360 degrees, or the points cover too large an angle.
+    /// An angle is greater than 360 degrees, or the angle from the first to the last point is too large.
     Angle,
 }
 
@@ -79,7 +79,7 @@ impl<'a> Packet<'a> {
         self.word(4)
     }
 
-    /// Returns the angle from the first point to the last one, in hundredths of a degree.
+    /// Returns the angle from the first point to the last point, in hundredths of a degree.
     pub fn span(&self) -> u16 {
         ((u32::from(self.word(END_OFFSET)) + u32::from(FULL_CIRCLE) - u32::from(self.start()))
             % u32::from(FULL_CIRCLE)) as u16
@@ -90,8 +90,8 @@ impl<'a> Packet<'a> {
         self.word(END_OFFSET + 2) % CLOCK_PERIOD_MS
     }
 
-    /// Returns the angle of point `i` in hundredths of a degree, clockwise. It may exceed [`FULL_CIRCLE`]. A packet
-    /// contains only the angles of its first and last point. The points between them are evenly spaced.
+    /// Returns the angle of point `i` in hundredths of a degree, clockwise. The angle may exceed [`FULL_CIRCLE`]. A
+    /// packet contains only the angles of its first and last point. The points between them are evenly spaced.
     pub fn angle(&self, i: usize) -> f32 {
         f32::from(self.start()) + f32::from(self.span()) * i as f32 / (POINTS_PER_PACKET - 1) as f32
     }
@@ -175,8 +175,8 @@ const END_OFFSET: usize = FIRST_POINT_OFFSET + 3 * POINTS_PER_PACKET;
 /// Radians per hundredth of a degree.
 const RADIANS_PER_UNIT: f32 = core::f32::consts::PI / 18_000.0;
 
-/// Consecutive packets without other bytes between them. They stay in the framer's buffer until the caller commits more
-/// bytes.
+/// Consecutive packets without other bytes between them. The packets stay in the framer's buffer until the caller
+/// commits more bytes.
 #[derive(Clone, Copy, Debug)]
 pub struct Span {
     at: usize,
@@ -267,10 +267,11 @@ impl Framer {
     }
 }
 
-/// Capacity of the buffer, in bytes. It holds the bytes that a tty can buffer while the hub does not read, and two
-/// incomplete packets.
+/// Capacity of the buffer, in bytes. The buffer has room for the bytes that a tty can buffer while the hub does not
+/// read, and for two incomplete packets.
 const CAPACITY: usize = 4_096 + 2 * PACKET_LEN;
-/// Time without a byte after which no byte of a packet can still arrive. A packet takes 2.04 ms at 230,400 baud.
+/// Time without a byte after which the rest of a packet can no longer arrive. A whole packet takes only 2.04 ms at
+/// 230,400 baud.
 const HOLD_TIME: Nanos = 4 * MILLIS;
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! Measures the number of points per revolution. A head rotates more slowly while it spins up, so a revolution has more
-//! points. Only revolutions at a constant speed therefore count.
+//! Measures the number of points per revolution. While a head spins up, it rotates more slowly, and a revolution has
+//! more points than at the final speed. The measurement therefore uses only revolutions at a constant speed.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -14,8 +14,8 @@ pub(crate) struct PointCount {
     packets: u32,
     revolution: Option<Revolution>,
     steady: Option<SteadySpeed>,
-    /// Time of the last packet, in the scanner's clock. `angle` is the angle of its first point, in degrees over all
-    /// revolutions.
+    /// Time of the last packet, in the scanner's clock. `angle` is the angle of this packet's first point, in degrees,
+    /// cumulative over all revolutions.
     time: Nanos,
     angle: f64,
 }
@@ -23,7 +23,7 @@ pub(crate) struct PointCount {
 /// Revolution that is being measured.
 #[derive(Clone, Copy, Debug)]
 struct Revolution {
-    /// Angle at the start of the revolution, in degrees over all revolutions.
+    /// Angle at the start of the revolution, in degrees, cumulative over all revolutions.
     angle: f64,
     packets: u32,
     /// Sum of the speeds in the packets that arrived, in degrees per second, and the number of these packets.
@@ -86,8 +86,9 @@ impl PointCount {
         }
     }
 
-    /// Returns the model and its number of beams once the first packets of a revolution match a model. They match if
-    /// the head rotates at the model's usual speed and measures the model's usual number of points.
+    /// Returns the model and its number of beams once the first packets of a revolution match a model. Packets match a
+    /// model if the head rotates constantly at the model's usual speed and the scanner measures the model's usual
+    /// number of points per revolution.
     pub(crate) fn typical_model(&self) -> Option<(Model, usize)> {
         let revolution = self.revolution.filter(|revolution| revolution.packets >= MIN_TYPICAL)?;
         let counted = revolution.count_until(self.angle);
@@ -120,7 +121,7 @@ impl Revolution {
         Revolution { angle, packets: 0, speeds: (f64::from(speed), 1), slowest: speed, fastest: speed }
     }
 
-    /// Returns the result for the packets before a packet whose first point is at `angle`.
+    /// Returns the result for the part of the revolution before `angle`, which is the angle of a packet's first point.
     fn count_until(&self, angle: f64) -> CountedRevolution {
         let (sum, count) = self.speeds;
         let points_per_revolution =
@@ -139,8 +140,8 @@ impl Revolution {
         f64::from(self.fastest) <= f64::from(self.slowest) * (1.0 + MAX_SPEED_VARIATION)
     }
 
-    /// Adds `packet`. `missing` is the number of missing packets before it. The points of `packet` belong to the
-    /// interval up to the next packet.
+    /// Adds `packet`. `missing` is the number of packets that are missing before `packet`. Counts the previous packet
+    /// and the missing packets, because the revolution now extends up to the first point of `packet`.
     fn add(&mut self, packet: &Packet<'_>, missing: u32) {
         let speed = packet.speed();
         self.packets += 1 + missing;
@@ -150,14 +151,14 @@ impl Revolution {
 }
 
 impl CountedRevolution {
-    /// Returns the model that measures this number of points per second. Several models may measure the same number.
-    /// The result is then one of them.
+    /// Returns the model that measures this number of points per second. If several models measure this number, returns
+    /// one of these models.
     pub(crate) fn model(&self) -> Model {
         Model::of_point_rate((self.points_per_revolution * self.revolutions_per_second) as f32)
     }
 
-    /// Returns the number of beams for this number of points. It is the model's number of beams if the two numbers are
-    /// close.
+    /// Returns the number of beams for this number of points. If the number of points is close to the model's number of
+    /// beams, returns the model's number.
     pub(crate) fn beams(&self) -> usize {
         let of_model = self.model().beams();
         let is_close = (self.points_per_revolution / of_model as f64 - 1.0).abs() <= MAX_COUNT_DEVIATION;
@@ -165,7 +166,7 @@ impl CountedRevolution {
     }
 
     /// Returns whether the number of points is reliable. At a speed that is not usual for the model, the head may still
-    /// be spinning up slowly. The speed must then be constant for longer.
+    /// be spinning up slowly. Such a speed must therefore be constant for a longer time than the usual speed.
     pub(crate) fn is_final(&self) -> bool {
         self.packets >= MIN_PACKETS && self.steady_time >= if self.is_usual() { 1 } else { SLOW_SPIN_UP_TIME }
     }
@@ -184,9 +185,10 @@ impl CountedRevolution {
 
 /// Minimum number of packets in a sequence for a reliable number of points.
 const MIN_PACKETS: u32 = 64;
-/// Minimum number of packets of a revolution for a comparison with the models.
+/// Minimum number of packets of a revolution before the revolution is compared with the models.
 const MIN_TYPICAL: u32 = 16;
-/// Maximum number of consecutive missing packets within a sequence. The hub cannot count more missing packets exactly.
+/// Maximum number of consecutive missing packets within a sequence. The count of the missing packets is not exact for a
+/// longer gap.
 const MAX_MISSING: u32 = 8;
 /// Maximum variation of a speed that counts as constant, as a ratio. The speed of real scanners varies by 1 %.
 const MAX_SPEED_VARIATION: f64 = 0.02;

@@ -1,9 +1,10 @@
-//! Position of each packet in its stream: the next packet, the first one after a gap, a repeated packet, or an outlier.
+//! Position of each packet in its stream: the first packet of a sequence, the next packet, a repeated packet, or an
+//! outlier.
 //!
-//! An 8-bit checksum alone does not prove a packet, so the angles, the speed and the milliseconds of consecutive
-//! packets must also agree. The sequencer counts missing packets. It also computes times in the scanner's clock that
-//! are finer than the milliseconds in the packets. The clock starts at 0 when the scanner starts, so it also shows
-//! [restarts](Restarts).
+//! An 8-bit checksum alone does not prove that bytes are a packet, so the angles, the speed and the milliseconds of
+//! consecutive packets must also agree. The sequencer counts missing packets. It also computes times in the scanner's
+//! clock that are finer than the milliseconds in the packets. The scanner's clock starts at 0 when the scanner starts,
+//! so the clock also reveals [restarts](Restarts) of the scanner.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -13,7 +14,8 @@ use crate::ld::packet::{CLOCK_PERIOD_MS, FULL_CIRCLE, POINTS_PER_PACKET, Packet}
 #[derive(Clone, Debug)]
 pub(crate) struct PacketSequencer {
     last: Option<LastPacket>,
-    /// Last packet that did not continue the sequence. The next packet may continue from it.
+    /// Last packet that did not continue the sequence. If the next packet continues from the outlier, a new sequence
+    /// starts.
     outlier: Option<LastPacket>,
     /// Number of consecutive outliers.
     outliers: u32,
@@ -30,9 +32,10 @@ struct LastPacket {
     span: u16,
     speed: u16,
     millis: u16,
-    /// Angle of the first point, in degrees clockwise over all revolutions.
+    /// Angle of the first point, in degrees clockwise, cumulative over all revolutions.
     angle: f64,
-    /// Time of the last point in the scanner's clock. `whole` has whole milliseconds, and `time` is the best estimate.
+    /// Time of the last point in the scanner's clock. `whole` is a whole number of milliseconds, as in the packet, and
+    /// `time` is the best estimate.
     whole: Nanos,
     time: Nanos,
 }
@@ -44,21 +47,21 @@ pub(crate) enum PacketPosition {
     First {
         /// Time of the packet's last point, in the scanner's clock.
         time: Nanos,
-        /// Angle of the packet's first point, in degrees clockwise over all revolutions.
+        /// Angle of the packet's first point, in degrees clockwise, cumulative over all revolutions.
         angle: f64,
     },
     /// The packet continues the sequence.
     Next {
         /// Time of the packet's last point, in the scanner's clock.
         time: Nanos,
-        /// Angle of the packet's first point, in degrees clockwise over all revolutions.
+        /// Angle of the packet's first point, in degrees clockwise, cumulative over all revolutions.
         angle: f64,
         /// Number of packets that are missing between the previous packet and this one.
         missing: u32,
-        /// Angle of the previous packet's last point, in degrees clockwise over all revolutions.
+        /// Angle of the previous packet's last point, in degrees clockwise, cumulative over all revolutions.
         from: f64,
     },
-    /// The packet equals the previous one.
+    /// The packet equals the previous packet.
     Repeated,
     /// The packet does not fit into the sequence.
     Outlier,
@@ -77,8 +80,8 @@ impl PacketPosition {
 
 /// Difference between two packets of a sequence.
 struct PacketStep {
-    /// Number of packets from the first to the second packet. It is 1 if the second packet is the next one, and 0 if
-    /// both are the same.
+    /// Number of packets from the first to the second packet. This number is 1 if the second packet directly follows
+    /// the first one, and 0 if the two packets are the same.
     packets: u32,
     /// Angle from the first point of the first packet to the first point of the second packet, in hundredths of a
     /// degree.
@@ -115,8 +118,8 @@ impl PacketSequencer {
         if self.learned_packets > 0 { 1e9 / self.points_per_second } else { 0.0 }
     }
 
-    /// Returns the last known time from one packet to the next, in nanoseconds. It is 0 if no time is known. The value
-    /// stays valid after the end of the stream.
+    /// Returns the last known time from one packet to the next, in nanoseconds, or 0 if this time was never known. The
+    /// end of the stream does not reset it.
     pub(crate) fn packet_ns(&self) -> f64 {
         if self.points_per_second > 0.0 {
             POINTS_PER_PACKET as f64 * 1e9 / f64::from(self.points_per_second)
@@ -130,7 +133,7 @@ impl PacketSequencer {
         (self.received, self.lost)
     }
 
-    /// Returns the position of the next received packet, and counts it.
+    /// Returns the position of the next received packet, and counts the packet.
     pub(crate) fn locate(&mut self, packet: &Packet<'_>) -> PacketPosition {
         self.received += 1;
         let Some(last) = self.last else { return self.locate_first(packet) };
@@ -231,12 +234,12 @@ impl LastPacket {
     }
 }
 
-/// Number of packets after which the number of points per second is known. The moving average covers
+/// Number of packets after which the number of points per second is known. The moving average of this number covers
 /// `WINDOW_PACKETS` packets.
 const LEARNING_PACKETS: u32 = 16;
 const WINDOW_PACKETS: u32 = 256;
-/// Minimum duration of a gap whose missing packets are counted with the clock, in milliseconds. A tenth of a revolution
-/// or more passes in this time.
+/// Minimum duration of a gap whose missing packets are counted with the clock, in milliseconds. The head rotates by a
+/// tenth of a revolution or more in this time.
 const LONG_GAP_MS: u16 = 30;
 /// Maximum gap within a sequence, in milliseconds. A session restarts after one second without a packet, so a later
 /// packet belongs to a new stream.
@@ -245,11 +248,10 @@ const MAX_GAP_MS: u16 = 1_500;
 /// Detector that counts the restarts of a scanner.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Restarts {
-    /// Clock of the last packet of a sequence in milliseconds, and the time of the hub's clock by which the packet had
-    /// arrived.
+    /// Milliseconds in the last packet of a sequence, and the time of the hub's clock by which this packet had arrived.
     last: Option<(u16, Nanos)>,
-    /// Whether the new sequence does not fit the previous one. The second packet of the new sequence then confirms the
-    /// restart.
+    /// Whether the clock in the new sequence does not continue the clock in the previous one, so that the scanner seems
+    /// to have restarted. The second packet of the new sequence confirms the restart.
     is_suspected: bool,
     pub(crate) count: u64,
 }
@@ -420,12 +422,12 @@ mod tests {
 
     #[test]
     fn backlog_of_the_host_is_not_a_restart() {
-        // The hub's process was stopped for 9 s and then read a packet. The scanner measured it at an unknown time in
-        // these 9 s.
+        // The hub's process was stopped for 9 s and then read a packet. The scanner measured this packet at an unknown
+        // time in these 9 s.
         for advance in [100, 2_000, 8_900] {
             assert!(!has_restarted(1_000, 1_000 + advance, (0, 9 * SECOND)), "{advance}");
         }
-        // The host was suspended, so the host's clock did not count the time.
+        // The host was suspended, so the host's clock did not count the time of the suspension.
         assert!(!has_restarted(1_000, 17_000, after(500 * MILLIS)));
     }
 

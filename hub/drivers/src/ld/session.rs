@@ -1,6 +1,7 @@
 //! Session with an LDROBOT scanner, which streams without a request. The session sends nothing. It listens at the
-//! model's baud rate, or alternates between both rates until packets arrive. It measures the number of points per
-//! second. It returns packets as they arrive, and complete revolutions.
+//! model's baud rate. If the model is unknown, it alternates between the two baud rates of the family until packets
+//! arrive. It measures the number of points per second. It returns packets as they arrive, and also complete
+//! revolutions.
 
 use core::fmt;
 
@@ -35,12 +36,14 @@ pub struct LdSession {
     baud: u32,
     change_baud: bool,
     point_count: PointCount,
-    /// Model and number of beams that the session derived from the measured points. They stay the same after a power
-    /// cycle.
+    /// Model and number of beams that the session derived from the measured points. A power cycle of the scanner does
+    /// not reset them.
     measured: Option<(Model, usize)>,
-    /// Time since which packets have been arriving although the number of beams is undecided.
+    /// Start of the stream. If the number of beams is still undecided [`DECISION_TIMEOUT`] later, the session uses a
+    /// default.
     undecided_since: Nanos,
-    /// New number of beams that fits the recent revolutions, and the time of the scanner's clock from which it fits.
+    /// Number of beams that fits the recent revolutions better than `measured`, and the time of the scanner's clock
+    /// since which this has been so.
     other_beams: Option<(usize, Nanos)>,
     /// Last change of the number of beams, and the time until which the session reports it.
     beams_change: Option<(Problem, Nanos)>,
@@ -76,7 +79,7 @@ struct PendingPackets {
     positions: [PacketPosition; MAX_PACKETS_PER_SAMPLE],
     /// Index of the first packet whose points are not completely processed.
     packet: usize,
-    /// Whether the points of this packet were added.
+    /// Whether the points of the packet at this index were added.
     is_added: bool,
 }
 
@@ -124,8 +127,8 @@ impl LdSession {
         Model::of(&self.settings).or(self.measured.map(|(model, _)| model))
     }
 
-    /// Returns the number of beams of a scan. It is the number in the settings. If that is missing, it is the default
-    /// of the configured model, and otherwise the measured number.
+    /// Returns the number of beams of a scan. The number in the settings takes precedence over the default of the
+    /// configured model, and this default over the measured number.
     fn known_beams(&self) -> Option<usize> {
         let of_model = || Model::of(&self.settings).map(Model::beams);
         let measured = || self.measured.map(|(_, beams)| beams);
@@ -133,9 +136,9 @@ impl LdSession {
         Some(beams.min(self.settings.max_beams.unwrap_or(usize::MAX)))
     }
 
-    /// Updates the measured model and number of beams with a revolution, if no model is configured. The first reliable
-    /// number of points determines both. Later, they change only if the number of points has been different for a long
-    /// time.
+    /// Updates the measured model and the measured number of beams with a revolution. The caller does this only if no
+    /// model is configured. The first reliable number of points determines the model and the number of beams. Later,
+    /// they change only if the number of points has been different for a long time.
     fn update_beams(&mut self, counted: CountedRevolution) {
         let Some((_, beams)) = self.measured else {
             self.measured = counted.is_final().then(|| (counted.model(), counted.beams()));
@@ -145,7 +148,7 @@ impl LdSession {
             self.other_beams = None;
             return;
         }
-        // If the scanner restarts, its clock restarts at 0. An earlier time is then not comparable.
+        // If the scanner restarts, its clock restarts at 0. A time from before the restart is then not comparable.
         let is_same = |&(other, since): &(usize, Nanos)| !counted.differs_from(other) && since <= counted.at;
         let known = self.other_beams.filter(is_same);
         let (other, since) = *self.other_beams.insert(known.unwrap_or((counted.beams(), counted.at)));
@@ -160,7 +163,7 @@ impl LdSession {
         }
     }
 
-    /// Returns the scanner's model if it differs from the configured one. Models with the same number of points per
+    /// Returns the scanner's model if it differs from the configured model. Models with the same number of points per
     /// second cannot be distinguished.
     fn unexpected_model_by_rate(&self) -> Option<Model> {
         let configured = Model::of(&self.settings)?;
@@ -207,7 +210,7 @@ impl LdSession {
     }
 
     /// Changes to the other baud rate because no packet arrived at the present one. Updates the duration in the
-    /// problem.
+    /// session's problem.
     fn listen_at_next_rate(&mut self, shown: State) {
         self.phase = Phase::Listening { shown, next_at: self.now + LISTEN_TIME };
         let rates = self.rates();
@@ -303,7 +306,7 @@ impl LdSession {
         let last = stamp(span.packets - 1).map_or(latest, |at| at + packet_time);
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
         // The stamp of a repeated packet is its arrival time. The stamp of the next packet comes from the scanner's
-        // clock, and may be earlier.
+        // clock, and may be earlier. `stamp_packet` therefore raises it.
         let last = self.reads.stamp_packet(last.max(at));
         self.current = Some(PendingPackets { span, positions, packet: 0, is_added: false });
         self.counters.note_packets(self.framer.buffer.byte_counters(), span.packets);
@@ -321,7 +324,7 @@ impl LdSession {
         }
     }
 
-    /// Returns the clock that stamps the packet with index `number` among those returned last.
+    /// Returns the clock that stamps the packet with index `number` among the packets that were returned last.
     fn clock_of(&self, number: usize) -> &SensorClock {
         match &self.clock_before {
             Some((first, clock)) if number < *first => clock,
@@ -562,7 +565,8 @@ impl line::ScannerSession for LdSession {
 pub enum Problem {
     /// No packet arrives.
     NoPackets {
-        /// The only baud rate at which the session listened. `None` if it listened at both.
+        /// The only baud rate at which the session listened. `None` if the session listened at both rates of the
+        /// family.
         baud: Option<u32>,
         /// Time without a packet in seconds, rounded down to 1, 2, 4, ..
         seconds: u32,
@@ -642,7 +646,7 @@ fn add_points(
     }
 }
 
-/// Returns the maximum number of packets that are returned together. These packets arrive within 10 ms.
+/// Returns the maximum number of packets in one event. This number of packets arrives within 10 ms at `baud`.
 const fn max_packets_per_sample(baud: u32) -> usize {
     if baud > 500_000 { MAX_PACKETS_PER_SAMPLE } else { 3 }
 }
@@ -652,13 +656,14 @@ const fn max_packets_per_sample(baud: u32) -> usize {
 const MAX_POINTS: usize = 4_400;
 /// Time for which the session listens at one baud rate. A stream has a packet at least every 3 ms.
 const LISTEN_TIME: Nanos = 300 * MILLIS;
-/// Time after which the session uses the default number of beams of the model that fits the number of points per
-/// second. Some scanners need it, because their speed is never constant or their sequence has a gap in every
-/// revolution.
+/// Time from the start of a stream after which the session no longer waits for a reliable measurement. It then uses the
+/// default number of beams of the model that fits the number of points per second. Some scanners need this timeout,
+/// because their speed is never constant or their sequence has a gap in every revolution.
 const DECISION_TIMEOUT: Nanos = 10_000 * MILLIS;
 /// Time for which the number of points per revolution must be different before the number of beams changes.
 const CHANGE_DELAY: Nanos = 10_000 * MILLIS;
 /// Time for which the session reports a change of the number of beams.
 const CHANGE_REPORT_TIME: Nanos = 60_000 * MILLIS;
-/// Maximum number of packets that are returned together. An STL27L sends a packet every 0.56 ms, so they cover 10 ms.
+/// Maximum number of packets in one event, for every baud rate. An STL27L sends a packet every 0.56 ms, so 17 packets
+/// cover 10 ms.
 pub(crate) const MAX_PACKETS_PER_SAMPLE: usize = 17;

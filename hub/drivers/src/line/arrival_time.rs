@@ -3,8 +3,8 @@
 
 use scanhub_schema::{Nanos, line_time};
 
-/// Log of the last `CAPACITY` reads. Each entry has the offset of the byte after the read, and the time of
-/// the read.
+/// Log of the last `CAPACITY` reads. Each entry has the offset of the first byte after the read, and the time of the
+/// read.
 #[derive(Clone, Debug, Default)]
 pub struct ReadLog {
     reads: [(u64, Nanos); ReadLog::CAPACITY],
@@ -25,8 +25,8 @@ pub struct StreamTiming {
 }
 
 impl ReadLog {
-    /// Number of stored reads. A packet may arrive in pieces of 16 bytes, and the next packet may begin inside it. The
-    /// log covers both packets.
+    /// Number of stored reads. A packet may arrive in pieces of 16 bytes, and the last piece may also contain the
+    /// beginning of the next packet. Eight pieces cover two packets of an LDROBOT.
     const CAPACITY: usize = 8;
 
     /// Adds a read of `len` bytes that returned at `now`. Ignores an empty read.
@@ -43,8 +43,9 @@ impl ReadLog {
         self.total
     }
 
-    /// Returns the latest time at which the byte at `offset` can have arrived. The later bytes of the same read came
-    /// after it, at `line_rate` bits per second. None of them had arrived at the previous read.
+    /// Returns the latest time at which the byte at `offset` can have arrived. The later bytes of the same read arrived
+    /// after this byte, at `line_rate` bits per second. The byte arrived after the previous read, because that read did
+    /// not return it.
     pub fn latest(&self, offset: u64, line_rate: Option<u32>) -> Nanos {
         let oldest = self.next.saturating_sub(ReadLog::CAPACITY);
         let mut latest = Nanos::MAX;
@@ -60,12 +61,12 @@ impl ReadLog {
         latest
     }
 
-    /// Returns the earliest time at which the byte at `offset` can have arrived. Returns `None` if it is unknown,
-    /// because the log has no earlier read, or because the byte may have been in a backlog. A read contains a backlog
-    /// if it has more bytes than the scanner can have sent since the previous read.
+    /// Returns the earliest time at which the byte at `offset` can have arrived. Returns `None` if this time is
+    /// unknown, because the log has no earlier read or because the byte may have been in a backlog. A read contains a
+    /// backlog if it has more bytes than the scanner can have sent since the previous read.
     pub fn earliest(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         // The last read of a backlog in a full tty is shorter than the reads before it. The tty may return some more
-        // bytes a moment later.
+        // bytes a moment later. These bytes were buffered too.
         let is_backlog_end = |n: usize| {
             n > self.oldest() + 2
                 && self.read(n - 2).0 - self.read(n - 3).0 >= MAX_TTY_READ as u64
@@ -75,14 +76,14 @@ impl ReadLog {
         self.earliest_in_read(n, offset, timing)
     }
 
-    /// Returns the [`earliest`](Self::earliest) arrival time of the byte at `offset`. Bytes are missing before this
-    /// byte, and it does not belong to the end of a backlog. If a full tty had a backlog, and almost no bytes follow
-    /// this byte, its time is known: it arrived when the tty had space again, or shortly before.
+    /// Returns the [`earliest`](Self::earliest) arrival time of the byte at `offset`. Assumes that bytes are missing
+    /// before this byte, and that the byte is not at the end of a backlog. If a full tty had a backlog and almost no
+    /// bytes follow this byte, the time is known: the byte arrived when the tty had space again, or shortly before.
     pub fn earliest_after_gap(&self, offset: u64, timing: StreamTiming) -> Option<Nanos> {
         let n = self.read_containing(offset)?;
         self.earliest_in_read(n, offset, timing).or_else(|| {
-            // The first of the consecutive reads that each had more bytes than the scanner can have sent since the
-            // previous read.
+            // `first` is the first of the consecutive reads up to read `n` that had more bytes than the scanner can
+            // have sent since the previous read.
             let first = (self.oldest() + 1..=n).rev().take_while(|&n| self.has_backlog(n, timing)).last()?;
             let ((begin, since), (end, now)) = (self.read(first - 1), self.read(n));
             let delay = end.saturating_sub(offset + ADAPTER_BUFFER_LEN) as f64 * timing.byte_ns;
@@ -125,10 +126,11 @@ impl ReadLog {
         }
         let line_time = |bytes: u64| timing.line_rate.map_or(0, |baud| line_time(bytes as usize, baud));
         let packet = timing.packet_len as u64;
-        // The line needed time for the bytes of this packet that are in this read.
+        // After the previous read, the line still needed time for the bytes of this packet that are in this read.
         let before = (before + line_time((offset + 1 - begin).min(packet))).min(now);
-        // Every adapter can buffer `ADAPTER_BUFFER_LEN` bytes. If the adapter had dropped bytes after this byte, it
-        // would have dropped this byte as well.
+        // Every adapter can buffer `ADAPTER_BUFFER_LEN` bytes. In a read of at most this length, no bytes are missing
+        // after this byte: an adapter that had dropped later bytes would have dropped this byte as well. The number of
+        // later bytes then limits the age of this byte.
         let idle = (packet as f64 * timing.byte_ns) as Nanos;
         let delay =
             ((end - offset) as f64 * timing.byte_ns) as Nanos + idle.saturating_sub(line_time(packet));
@@ -137,7 +139,7 @@ impl ReadLog {
     }
 }
 
-/// Number of bytes that every adapter buffers while the host does not read.
+/// Number of bytes that every adapter can buffer while the host does not read.
 const ADAPTER_BUFFER_LEN: u64 = 256;
 /// Maximum number of bytes that one read of a tty returns.
 pub(crate) const MAX_TTY_READ: usize = 4_095;
@@ -158,7 +160,7 @@ mod tests {
         assert_eq!(arrivals.latest(90, Some(1_000_000)), 1_000_000 - 9 * byte);
         assert_eq!(arrivals.latest(109, Some(1_000_000)), 2_000_000);
         assert_eq!(arrivals.latest(90, None), 1_000_000);
-        // Two reads of buffered bytes.
+        // The next two reads return buffered bytes.
         arrivals.note_read(2_000_001, 30);
         assert_eq!(arrivals.latest(109, Some(1_000_000)), 2_000_000, "not before it was read");
         arrivals.note_read(3_000_000, 200);
@@ -196,7 +198,7 @@ mod tests {
         let on_a_line = StreamTiming { line_rate: Some(400_000), ..packets };
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note_read(at(1_000), 84);
-        // A pause, and then a packet at the speed of the line.
+        // After a pause, a packet arrives at the speed of the line.
         arrivals.note_read(at(1_500), 16);
         arrivals.note_read(at(1_505), 68);
         assert_eq!(arrivals.earliest(167, flow), None);

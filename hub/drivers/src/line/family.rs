@@ -83,13 +83,13 @@ pub(crate) use table;
 
 /// Recognizer of one family's scanners in the bytes of a line.
 pub trait Probe: fmt::Debug + Send {
-    /// Returns the rates, steps and requests with which the search may find this family.
+    /// Returns the rates, steps and requests with which the search tries to find this family.
     fn search_steps(&self) -> &'static SearchSteps;
 
     /// Discards all bytes, because the baud rate has changed. After the call, the probe expects no reply.
     fn clear(&mut self);
 
-    /// Sets whether a reply to the family's own request is expected.
+    /// Sets whether the search waits for a reply to a request of this family.
     fn expect_reply(&mut self, is_expected: bool) {
         let _ = is_expected;
     }
@@ -123,7 +123,7 @@ pub enum Evidence {
     Partial,
     /// The bytes look like a stream of the family. Only a reply can prove the family.
     Stream,
-    /// The scanner belongs to the family. Contains the model, if the scanner has reported one.
+    /// The scanner belongs to the family. Contains the model, if the scanner has reported its model.
     Found(Option<&'static str>),
 }
 
@@ -136,12 +136,13 @@ pub struct SearchSteps {
     pub listen_steps: &'static [ListenStep],
     /// Steps that send requests. `None` for a family whose scanners accept no requests.
     pub request_steps: Option<RequestSteps>,
-    /// Baud rate at which a scanner sends its boot message, in bits per second. The search pauses at this rate.
+    /// Baud rate at which a scanner sends its boot message, in bits per second. Between two rounds, the search pauses
+    /// at this rate.
     pub boot_rate: Option<u32>,
     /// Maximum length of a transmission from the scanner, in bytes.
     pub max_transmission: usize,
-    /// Part of the message for a search that found no scanner: the properties of the scanner that the user should
-    /// check.
+    /// Part of the message that the hub shows if the search found no scanner. It names the properties of the scanner
+    /// that the user should check.
     pub advice: &'static str,
 }
 
@@ -168,18 +169,18 @@ pub struct ListenStep {
     pub needs_bytes: bool,
 }
 
-/// Steps that send requests, at each baud rate.
+/// Steps that send requests. Each baud rate has its own step.
 #[derive(Clone, Copy, Debug)]
 pub struct RequestSteps {
     /// Baud rates in bits per second, the most likely one first.
     pub rates: &'static [u32],
-    /// Time from a change of the baud rate to the first byte of a request.
+    /// Time that the search waits from a change of the baud rate to the first byte of a request.
     pub settle_time: Nanos,
-    /// Request that stops a stream. The search sends it before any other request.
+    /// Request that stops a stream. The search sends this request before any other request.
     pub stop: Option<StopRequest>,
     /// Requests to which the scanner replies. Each round of the search uses the next request.
     pub requests: &'static [&'static [u8]],
-    /// Minimum and maximum time between the end of one byte of a request and the start of the next. `None` if the
+    /// Minimum and maximum time between the end of one byte of a request and the start of the next byte. `None` if the
     /// scanner accepts any gap, so that one write can send the whole request.
     pub gap: Option<(Nanos, Nanos)>,
     /// Maximum time from the last byte of the request to the first byte of the reply.
@@ -200,7 +201,7 @@ pub struct StopRequest {
     pub request: &'static [u8],
     /// Time without a byte after which the stream has ended.
     pub quiet_time: Nanos,
-    /// Maximum time to wait for the end of the stream. After this time, the search sends its request even if bytes
+    /// Maximum time to wait for the end of the stream. After this time, the search sends its next request even if bytes
     /// still arrive.
     pub max_wait: Nanos,
 }

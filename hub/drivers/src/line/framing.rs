@@ -1,8 +1,8 @@
 //! Framing of packets that have a fixed length, in a stream that may lack bytes.
 //!
-//! An 8-bit checksum is right by chance in 1 of 256 cases, and a packet that lost bytes contains the beginning of the
-//! next packet. The framer therefore accepts a packet that contains another header only in two cases: a header follows
-//! the packet, or the bytes from the inner header on are not a packet.
+//! An 8-bit checksum is right by chance in 1 of 256 cases. If bytes of a packet were lost, the beginning of the next
+//! packet appears inside the length of this packet. The framer therefore accepts a packet that contains another header
+//! only in two cases: a header follows the packet, or the bytes from the inner header on are not a packet.
 
 use scanhub_schema::Nanos;
 
@@ -14,7 +14,8 @@ pub trait Format {
     /// Returns the length of a packet, in bytes.
     fn packet_len(&self) -> usize;
 
-    /// Returns whether `bytes` begins with a header, or with the first part of one. Returns `true` if `bytes` is empty.
+    /// Returns whether `bytes` begins with a header, or with the first part of a header. Returns `true` if `bytes` is
+    /// empty.
     fn begins(&self, bytes: &[u8]) -> bool;
 
     /// Checks the bytes of a packet.
@@ -86,9 +87,9 @@ pub struct Buffer<const N: usize> {
     /// The open bytes are `bytes[start..end]`.
     start: usize,
     end: usize,
-    /// Time without a byte after which no byte can still arrive from the line.
+    /// Time without a byte after which the rest of a packet can no longer arrive.
     hold_time: Nanos,
-    /// Whether the framer holds a packet back because another packet may begin inside it.
+    /// Whether the framer holds a packet back because another packet may begin inside this packet.
     is_held: bool,
     /// Whether the line has been idle long enough that the framer no longer holds packets back.
     is_released: bool,
@@ -202,7 +203,8 @@ impl<const N: usize> Buffer<N> {
     }
 }
 
-/// Moves bytes from the front of `bytes` into `buffer` until one of them is used up. Returns the number of bytes moved.
+/// Moves bytes from the front of `bytes` into `buffer` until `bytes` is empty or `buffer` is full. Returns the number
+/// of bytes moved.
 pub(crate) fn fill(buffer: &mut [u8], bytes: &mut &[u8]) -> usize {
     let len = buffer.len().min(bytes.len());
     let (now, later) = bytes.split_at(len);

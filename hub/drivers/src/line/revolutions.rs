@@ -2,8 +2,9 @@
 //!
 //! A revolution begins half a grid step before the scanner's zero, so that all points of the beam ahead belong to the
 //! same revolution. A point belongs to the revolution that contains its angle, and may arrive after points with larger
-//! angles. A revolution is therefore complete only when the angle between its end and the head is greater than the
-//! maximum lateness of a point. Until then, two revolutions are open. Times are in the scanner's clock.
+//! angles. A revolution is therefore complete only when the angle from the end of the revolution to the head exceeds
+//! the angle by which a point can be late. Until then, this revolution and the next one are open. Times are in the
+//! scanner's clock.
 
 use crate::line::{NO_RETURN, Point};
 use scanhub_schema::Nanos;
@@ -31,7 +32,7 @@ pub struct RevolutionAssembler<const N: usize> {
 #[derive(Clone, Copy, Debug, Default)]
 struct OpenRevolution {
     len: usize,
-    /// Time at the edge, in nanoseconds. `last` is the time of the last point.
+    /// Time at the edge where the revolution begins, in nanoseconds. `last` is the time of the last point.
     first: Option<f64>,
     last: f64,
     incomplete: bool,
@@ -108,7 +109,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         }
     }
 
-    /// Starts to assemble revolutions for a grid of `beams` beams, and discards the open ones.
+    /// Starts to assemble revolutions for a grid of `beams` beams, and discards the open revolutions.
     pub fn begin(&mut self, beams: usize) {
         self.edge = 180.0 / beams as f64;
         self.discard();
@@ -125,7 +126,7 @@ impl<const N: usize> RevolutionAssembler<N> {
         Some(self.close(open, open.first?, rate.revolution_ns()))
     }
 
-    /// Returns the points of `revolution`, which is the last complete revolution or the first open one.
+    /// Returns the points of `revolution`, which is the last complete revolution or the first open revolution.
     pub fn points(&self, revolution: &ClosedRevolution) -> &[Point] {
         &self.points[revolution.points][..revolution.len]
     }
@@ -150,11 +151,12 @@ impl<const N: usize> RevolutionAssembler<N> {
         rate: RotationRate,
     ) {
         let revolution = self.revolution_at(angle);
-        // The first point is somewhere inside its revolution. The next revolution is therefore the first one with all
-        // points.
+        // The first point is somewhere inside its revolution, so this revolution lacks points. The next revolution is
+        // the first one with all points.
         let number = *self.number.get_or_insert(revolution + 1);
         let Some(which) = usize::try_from(revolution - number).ok().filter(|which| *which < 2) else {
-            // The caller added the points of this revolution before it called `close_before`.
+            // This revolution is not open. Either it is already closed, or the caller has not yet called `close_before`
+            // for the revolutions before it. The revolution lacks this point.
             self.last_incomplete = self.last_incomplete.max(revolution);
             return;
         };
@@ -230,7 +232,8 @@ impl<const N: usize> RevolutionAssembler<N> {
         None
     }
 
-    /// Converts the first open revolution to a complete revolution. It began at `first` and takes `period` nanoseconds.
+    /// Converts the first open revolution to a complete revolution that began at `first` and takes `period`
+    /// nanoseconds.
     fn close(&self, open: &OpenRevolution, first: f64, period: f64) -> ClosedRevolution {
         ClosedRevolution {
             number: self.serial,
@@ -265,7 +268,7 @@ mod tests {
     fn revolution_lasts_from_edge_to_edge() {
         let mut turns = RevolutionAssembler::<400>::new();
         turns.begin(360);
-        // Points that are 1 degree apart. The head rotates faster after the second revolution.
+        // The points are 1 degree apart. The head rotates faster after the second revolution.
         for n in 0..735 {
             let angle = f64::from(n);
             let time = 1e6 * angle.min(722.0) + 0.9e6 * (angle - 722.0).max(0.0);

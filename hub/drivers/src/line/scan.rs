@@ -1,4 +1,4 @@
-//! A scan in the buffer of a session, complete or still arriving. Also the grid of beams to which a session assigns the
+//! Scan in the buffer of a session, complete or still arriving, and the grid of beams to which a session assigns the
 //! points of a revolution. [`RawScan::write`] converts the received values to ranges, directly in the shared memory
 //! that subscribers read.
 
@@ -139,8 +139,8 @@ pub fn revolution_head(
 /// One measurement of a rotating scanner.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// Angle in radians, 0 ahead, counterclockwise positive as seen from above. For a head that rotates clockwise,
-    /// angles go from 0 to -2 pi.
+    /// Angle in radians. 0 is straight ahead, and counterclockwise as seen from above is positive. For a head that
+    /// rotates clockwise, angles go from 0 to -2 pi.
     pub angle: f32,
     /// Range in millimeters, or [`NO_RETURN`].
     pub range: u16,
@@ -201,7 +201,8 @@ impl Grid {
         let bins_per_radian = -(beams as f32) / TAU;
         let mut collisions = 0;
         for point in points {
-            // Accept angles of up to one more revolution on either side. The sum is rounded to the nearest beam.
+            // Add one revolution, so that angles of up to one revolution on either side are accepted. Add 0.5, so that
+            // the conversion below rounds to the nearest beam.
             let bin_position = point.angle * bins_per_radian + (beams as f32 + 0.5);
             // NaN has no beam. The value is converted to 32 bits because a conversion to 64 bits takes three times as
             // long.

@@ -1,13 +1,14 @@
 //! Maps the scanner's clock to the hub's clock. A packet can be late for many reasons but never early. The smallest
-//! delay of the last few seconds therefore holds for every packet in them, even for packets that waited while the host
-//! was stopped. The drift between the clocks is estimated too.
+//! delay of the last few seconds therefore holds for every packet in these seconds, even for packets that waited while
+//! the host was stopped. The drift between the clocks is estimated too.
 
 use scanhub_schema::{MILLIS, Nanos};
 
 /// Clock of a scanner, with the minimum delays of the last seconds.
 #[derive(Clone, Debug)]
 pub struct SensorClock {
-    /// Minimum delay of each span. The newest span is at index `next`, and the oldest span follows it.
+    /// Minimum delay of each span of time. The newest span is at index `next`, and the oldest span is at the next
+    /// index.
     min_delays: [Option<Delay>; SensorClock::SPAN_COUNT],
     next: usize,
     /// Start of the newest span in the scanner's clock, and duration of a span. The first spans are short, so that the
@@ -18,8 +19,8 @@ pub struct SensorClock {
     min_delay: Option<Delay>,
     /// Time in nanoseconds that the hub's clock gains on the scanner's clock per nanosecond.
     drift: f64,
-    /// Time from which stamps may be wrong relative to earlier stamps, and the maximum error. `None` if no error is
-    /// possible, or once later spans have resolved it.
+    /// Time from which stamps may be wrong relative to earlier stamps, and the maximum error in nanoseconds. `None` if
+    /// no error is possible, or once later spans have resolved the uncertainty.
     uncertainty: Option<(Nanos, Nanos)>,
 }
 
@@ -55,8 +56,8 @@ impl SensorClock {
     }
 
     /// Records that times of the scanner's clock from `at` on may be wrong by up to `max_error` relative to earlier
-    /// times. The time between them was counted and not measured. Earlier delays stay valid until a later span has
-    /// confirmed them.
+    /// times. The caller counted the time before `at` and did not measure it. Delays from before `at` stay in use until
+    /// the delays after `at` agree with them within `max_error`.
     pub fn add_uncertainty(&mut self, at: Nanos, max_error: Nanos) {
         if self.min_delay.is_some() {
             self.uncertainty = Some((at, max_error));
@@ -101,8 +102,8 @@ impl SensorClock {
         self.span_began = at;
     }
 
-    /// Ends a span at `at`. Drops the spans before an [uncertain](Self::add_uncertainty) time if there are no earlier
-    /// spans, or once the later spans agree with the earlier ones within the maximum error.
+    /// Handles the end of a span at `at`. Ends an [uncertainty](Self::add_uncertainty) and drops the spans before it,
+    /// if the later spans agree with these spans within the maximum error or if there are no such spans.
     fn resolve_uncertainty(&mut self, at: Nanos) {
         let Some((from, max_error)) = self.uncertainty else { return };
         let offset_of = |known: Delay| known.offset_at(at, self.drift);

@@ -26,16 +26,17 @@ pub trait Protocol {
     fn poll_action(&mut self) -> Action<'_>;
 
     /// Checks whether `now` is too late for the bytes of [`Action::Transmit`], for example because the program did not
-    /// run for a few milliseconds. The driver calls it immediately before it writes these bytes. If the result is
-    /// `true`, the request starts over, and the driver continues to drain actions without writing the bytes.
+    /// run for a few milliseconds. The driver calls this method immediately before it writes these bytes. If the result
+    /// is `true`, the protocol restarts the request, and the driver continues to drain actions without writing the
+    /// bytes.
     fn restart_if_late(&mut self, now: Nanos) -> bool {
         let _ = now;
         false
     }
 
-    /// Handles the port's rejection of the baud rate in the last [`Action::SetRate`]. Before the first action, the call
-    /// means that the port rejected the rate at which it should open. The protocol then tries other rates, if it has
-    /// any.
+    /// Handles the port's rejection of the baud rate in the last [`Action::SetRate`]. A call before the first action
+    /// means that the port rejected the rate at which the driver tried to open it. The protocol then tries other rates,
+    /// if it has any.
     fn reject_rate(&mut self, now: Nanos) {
         let _ = now;
     }
@@ -63,8 +64,8 @@ pub trait ScannerSession: Protocol {
     /// Returns the reason why the session does not stream as it should.
     fn problem(&self) -> Option<Self::Problem>;
 
-    /// Returns the name of the transmissions that the session is waiting for, such as `LMS replies`, if the
-    /// [`problem`](Self::problem) is that no such transmission arrives. Other bytes may be arriving.
+    /// Returns the name of the transmissions whose absence is the [`problem`](Self::problem), such as `LMS replies`.
+    /// Returns `None` if the session has another problem, or none. Other bytes may be arriving.
     fn missing_transmission(&self) -> Option<&'static str>;
 
     /// Returns the baud rate at which the session sends and receives, in bits per second.
@@ -110,7 +111,7 @@ pub trait ScannerSession: Protocol {
         None
     }
 
-    /// Sets the baud rate that the search tries first. It is the [rate](Self::known_rate) at which the last search
+    /// Sets the baud rate that the search tries first. `known` is the [rate](Self::known_rate) at which the last search
     /// found the scanner. Call it before the first read.
     fn hint_rate(&mut self, known: KnownRate) {
         let _ = known;
@@ -123,8 +124,8 @@ pub trait ScannerSession: Protocol {
     }
 
     /// Restores the model and the number of beams that an earlier session measured on the same port. The session
-    /// ignores them if the scanner streams at a rate that this model does not have. Call it before the first read, and
-    /// after [`set_start_rate`](Self::set_start_rate).
+    /// ignores them if the scanner streams at a baud rate that this model does not have. Call it before the first read,
+    /// and after [`set_start_rate`](Self::set_start_rate).
     fn restore_beams(&mut self, model: Model, beams: usize) {
         let _ = (model, beams);
     }
@@ -215,7 +216,7 @@ pub trait ScannerSession: Protocol {
     }
 
     /// Marks the next returned packets as suspect for `reasons`, bits of [`crate::line::suspect`]. Used for a
-    /// recording: it contains the packets but not the damaged bytes between them.
+    /// recording, because a recording contains the packets but not the damaged bytes between them.
     fn mark_suspect(&mut self, reasons: u8) {
         let _ = reasons;
     }
@@ -223,7 +224,8 @@ pub trait ScannerSession: Protocol {
     /// Reads a complete telegram of a recording, for a family whose telegrams can be read without the bytes around
     /// them. The stamps of the result are 0. Writes what the telegram reports about the scanner into `status`.
     ///
-    /// `is_readable` states whether the recording hub had all settings that are necessary to interpret the values.
+    /// `is_readable` states whether the hub that made the recording had all settings that are necessary to interpret
+    /// the values.
     ///
     /// Returns `None` for other families, and if the bytes are not a telegram.
     fn read_recorded<'a>(
@@ -264,9 +266,9 @@ pub enum Action<'a> {
     /// Set the line DTR of a serial port to asserted or not asserted. Other ports do not have this line. Then continue
     /// draining.
     SetDtr(bool),
-    /// Write these bytes, then call [`Protocol::handle_transmitted`]. Do nothing else between the two, because the
-    /// bytes of a request may have to arrive without pauses. The action contains a single byte if the scanner requires
-    /// gaps between bytes.
+    /// Write these bytes, then call [`Protocol::handle_transmitted`]. Do nothing else between the write and this call,
+    /// because the bytes of a request may have to arrive without pauses. The action contains a single byte if the
+    /// scanner requires gaps between bytes.
     Transmit {
         /// The bytes.
         bytes: &'a [u8],
@@ -275,7 +277,8 @@ pub enum Action<'a> {
     },
     /// Publish this event.
     Event(Event<'a>),
-    /// Do not read before this time. No transmission can be complete earlier, or the read can wait.
+    /// Do not read before this time. Either no transmission can be complete earlier, or a later read returns more
+    /// bytes.
     SleepUntil(Nanos),
     /// Read when the port has bytes. If a read at the deadline returns no bytes, call [`Protocol::handle_timeout`].
     Wait {
@@ -303,7 +306,7 @@ pub struct ReceivedTelegram<'a> {
     pub first: Nanos,
     /// Time at which the last byte arrived.
     pub last: Nanos,
-    /// Whether `first` is an estimate, because all bytes arrived in one read.
+    /// Whether `first` is an estimate, for example because all bytes arrived in one read.
     pub estimated: bool,
     /// Reasons why the bytes are suspect: bits of [`crate::line::suspect`]; 0 means clean.
     pub reasons: u8,
@@ -321,8 +324,8 @@ pub struct ReceivedTelegram<'a> {
 /// Contents of a telegram that is a complete scan or reply.
 #[derive(Clone, Copy, Debug)]
 pub struct TelegramContents<'a> {
-    /// Serial [number](RawScan::number) of the telegram, which it also had as a partial scan. The session never
-    /// completes a partial scan with another number.
+    /// Serial [number](RawScan::number) of the telegram. The partial scan of the same telegram had the same number.
+    /// After this telegram, the session never completes an earlier partial scan with another number.
     pub number: u64,
     /// Number of beams with measured data; 0 for a reply.
     pub beams: usize,
@@ -406,8 +409,8 @@ pub enum Control {
     Resync,
 }
 
-/// Counters of a session. All of them except `buffered` only increase. Always `read == in_telegrams + acknowledge +
-/// discarded + buffered`, in bytes.
+/// Counters of a session. All of them except `buffered` only increase. In bytes, `read == in_telegrams + acknowledge +
+/// discarded + buffered` always holds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SessionStats {
     /// Bytes read.

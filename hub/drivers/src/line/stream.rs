@@ -76,9 +76,9 @@ impl ReadScheduler {
         }
     }
 
-    /// Returns the reasons for packets that end before the byte at `end`, and clears them. If these packets were read
-    /// before the caller marked the reasons, the reasons stay for later packets, because the framer may have held these
-    /// packets back.
+    /// Returns the reasons why packets that end before the byte at `end` are suspect, and clears these reasons. The
+    /// framer may have held the packets back: if they were read before the caller marked the reasons, returns 0, and
+    /// the reasons stay for later packets.
     pub fn take_suspect(&mut self, end: u64) -> u8 {
         if end > self.suspect.0 { core::mem::take(&mut self.suspect.1) } else { 0 }
     }
@@ -152,7 +152,8 @@ impl Watchdog {
         self.revolution_at = now;
     }
 
-    /// Extends both deadlines. Before `until`, the head may still be spinning up, and may not measure.
+    /// Extends the deadline for silence to `until`, and restarts the deadline for the next revolution at `until`.
+    /// Before this time, the head may still be spinning up, and the scanner may not measure.
     pub fn await_spin_up(&mut self, until: Nanos) {
         (self.revolution_at, self.silent_at) = (until, until);
     }
@@ -178,10 +179,10 @@ impl Watchdog {
     }
 }
 
-/// Counters of a session that its framer does not count.
+/// Counters of a session in addition to the counters of its framer.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct StreamCounters {
-    /// Discarded bytes of streams.
+    /// Number of bytes that were discarded during streams.
     damaged: u64,
     /// Number of all discarded bytes at the last update of `damaged`.
     discarded: u64,

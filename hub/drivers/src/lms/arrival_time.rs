@@ -7,8 +7,8 @@
 use crate::lms::variant::BYTES_PER_REVOLUTION;
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
-/// The last reads, in a ring buffer. The stamp of a byte follows from the read that returned the byte, and from the
-/// reads after it.
+/// Estimator of arrival times, with the last reads in a ring buffer. The stamp of a byte follows from the read that
+/// returned the byte, and from the reads after that read.
 #[derive(Clone, Debug)]
 pub(crate) struct ArrivalEstimator {
     reads: [ReadRecord; ArrivalEstimator::CAPACITY],
@@ -16,7 +16,7 @@ pub(crate) struct ArrivalEstimator {
     total: u64,
     /// Time of the last read with bytes, or of the last call of `note_unread`.
     last_checked: Nanos,
-    /// Present while the session reads bytes that were buffered while the host did not read.
+    /// `Some` while the session reads bytes that were buffered because the host did not read.
     backlog: Option<Backlog>,
 }
 
@@ -28,7 +28,8 @@ struct ReadRecord {
 }
 
 /// Bytes that were buffered while the host or the line was stopped. Their exact age is unknown. A full buffer keeps its
-/// oldest bytes. The backlog therefore arrived at the speed of the line, starting at the last read before the stop.
+/// oldest bytes. The bytes of the backlog therefore arrived at the speed of the line, starting at the last read before
+/// the stop.
 #[derive(Clone, Copy, Debug)]
 struct Backlog {
     /// Offset of the first byte of the backlog.
@@ -51,7 +52,7 @@ pub(crate) struct Timestamp {
 }
 
 impl ArrivalEstimator {
-    /// Number of stored reads. It is sufficient for two telegrams in chunks of 16 bytes.
+    /// Number of stored reads. This number is sufficient for two telegrams in chunks of 16 bytes.
     const CAPACITY: usize = 128;
 
     /// Creates an estimator at `now`. No byte gets a stamp before `now`.
@@ -140,8 +141,8 @@ impl ArrivalEstimator {
     }
 }
 
-/// Measured duration of a telegram of the stream. A busy host may measure too long a duration, but never too short a
-/// duration. The minimum over several telegrams is therefore used.
+/// Measured duration of a telegram of the stream. A busy host may measure a duration that is too long, but never one
+/// that is too short. The result is therefore the minimum over several telegrams.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct TelegramTiming {
     pub(crate) duration: Option<Nanos>,
@@ -237,8 +238,8 @@ impl TelegramTiming {
 }
 
 /// Time between the end of the host's sleep and the expected end of a telegram. The sleep should end between the last
-/// two chunks of a telegram, so that the host waits only once more. The lead therefore adapts to the chunks of the
-/// line, and to the delay with which the host's sleeps end.
+/// two chunks of a telegram, so that the host waits only once more, for the last chunk. The lead therefore adapts to
+/// the chunks of the line, and to the delay with which the host's sleeps end.
 #[derive(Clone, Copy, Debug)]
 pub struct WakeLead(Nanos);
 
@@ -247,10 +248,10 @@ impl WakeLead {
     const MAX: Nanos = 600 * MICROS;
     /// Minimum lead. On an idle host, sleeps end 50 to 100 us late.
     const MIN: Nanos = 100 * MICROS;
-    /// Increase after a sleep that ended too late.
+    /// Increase of the lead after a sleep that ended too late.
     const INCREASE: Nanos = 80 * MICROS;
-    /// Decrease after a telegram for which the host waited at least twice after the sleep. It is a fraction of
-    /// [`INCREASE`](Self::INCREASE), so that few sleeps end too late.
+    /// Decrease of the lead after a telegram for which the host waited at least twice after the sleep. The decrease is
+    /// a fraction of [`INCREASE`](Self::INCREASE), so that few sleeps end too late.
     const DECREASE: Nanos = 5 * MICROS;
 
     /// Returns the lead in ns.
@@ -278,21 +279,22 @@ impl Default for WakeLead {
 /// Maximum number of later bytes in the same read with which a stamp is still exact. A chunk of a USB adapter has 62
 /// bytes.
 const MAX_EXACT_BYTES: usize = 64;
-/// Minimum time without bytes before a read that may be a backlog. Sleeps at the highest rate are shorter, so the host
-/// or the line must have been stopped.
+/// Minimum time without bytes before a read whose bytes may be a backlog. At the highest baud rate, every sleep of the
+/// hub is shorter, so the host or the line must have been stopped.
 const STALL_THRESHOLD: Nanos = 50 * MILLIS;
-/// Time without a surplus of bytes after which a backlog has ended. It is shorter than a telegram. It is longer than
-/// the kernel needs to move bytes from one buffer to the next.
+/// Time after the last read with a surplus of bytes after which a backlog has ended. This time is shorter than the
+/// duration of a telegram, and longer than the kernel needs to move bytes from one buffer to the next.
 const BACKLOG_END_TIME: Nanos = 12 * MILLIS;
 /// Minimum sleep. The system call costs too much for a shorter sleep.
 const MIN_SLEEP: Nanos = 500 * MICROS;
 /// Number of telegrams that are measured before the first sleep.
 const LEARNING_TELEGRAMS: u32 = 3;
-/// Number of telegrams per minimum after the first sleep. If the host sleeps too long, the measured duration of the
-/// telegram is at most the sleep. The sleeps therefore become shorter again.
+/// Number of telegrams over which each minimum is computed after the first sleep. If the host sleeps too long, the
+/// telegram is complete before the sleep ends, so its measured duration is at most the duration of the sleep. The next
+/// sleeps therefore become shorter again.
 const WINDOW_TELEGRAMS: u32 = 16;
-/// A telegram is suspect if its duration exceeds the usual duration by more than this time (framing: quality, reason
-/// 4).
+/// A telegram is suspect, for reason [`SLOW`](crate::line::suspect::SLOW), if its duration exceeds the usual duration
+/// by more than this time.
 const SLOW_TOLERANCE: Nanos = 8 * MILLIS;
 
 #[cfg(test)]
@@ -346,7 +348,8 @@ mod tests {
             assert_eq!(seen(&arrivals, 16 + byte), (at, true));
         }
         assert_eq!(seen(&arrivals, 8_031), (3_010 * MILLIS, false));
-        // A silent line was read in time. A slow line kept its rate while the host slept.
+        // Bytes after a silence are not a backlog if their number is small. Bytes of a slow line are not a backlog
+        // either, because the line carried them at its own rate while the host slept.
         arrivals.note_read(5_000 * MILLIS, 62, Some(500_000));
         assert_eq!(seen(&arrivals, 8_109), (5_000 * MILLIS, false));
         arrivals.note_read(5_762 * MILLIS, 730, Some(9600));
@@ -462,7 +465,7 @@ mod tests {
             Some(117_400_000),
             "a late host skips pieces that have arrived"
         );
-        // With 200 reads per telegram, the last one would be at the end.
+        // With 200 reads per telegram, the last partial read would be at the end of the telegram.
         rhythm.set_partial_reads(200);
         rhythm.begin_telegram(0);
         let looks = core::iter::successors(rhythm.sleep_until(0), |&at| rhythm.sleep_until(at)).count();

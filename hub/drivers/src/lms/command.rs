@@ -1,7 +1,7 @@
 //! Requests of the LMS whose effect ends with a power cycle, and their parameters. The hub encodes them. The simulator,
 //! and the verbs that explain telegrams, decode them.
 //!
-//! Requests that write the EEPROM are in `lms_configure`, so code that has only a [`Request`] cannot write it.
+//! Requests that write the EEPROM are in `lms_configure`, so code that has only a [`Request`] cannot write the EEPROM.
 
 use crate::lms::operating::{self, Operating};
 use crate::lms::telegram::{EncodedTelegram, Telegram, Writer};
@@ -75,7 +75,7 @@ requests! {
         Stop = MODE + operating::ON_REQUEST,
         /// 20h 40h, 41h, 42h, 48h: change the baud rate until power-off. The scanner replies at the old rate.
         Baud(baud: Baud) = MODE,
-        /// 20h with any other operating mode.
+        /// 20h and another byte: change to any other operating mode.
         Operate(operating: Operating) = MODE,
         /// 30h: one telegram of values. The byte selects the values (Telegram listing 7-14): 1 all, 2 vertical minimum,
         /// 3 taught, 6 every second, 7 every twentieth, 8 the current partial scan.
@@ -84,7 +84,7 @@ requests! {
         Status = STATUS,
         /// 32h: present and past errors.
         Errors = ERRORS,
-        /// 35h: hours of operation and power-ons; LMS 211, 221 and 291 only.
+        /// 35h: hours of operation and number of power-ons; LMS 211, 221 and 291 only.
         Counters = COUNTERS,
         /// 36h: mean values over this number of scans, 2 to 250.
         Means(number: u8) = MEANS,

@@ -353,7 +353,7 @@ fn spans(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     Some(())
 }
 
-/// Returns the meaning of the parameter of 66h.
+/// Returns the meaning of the parameter of request 66h, which sets the baud rate after power-on.
 fn power_on(byte: u8) -> &'static str {
     match byte {
         0 => "9600",
@@ -375,14 +375,16 @@ fn selection(byte: u8) -> &'static str {
     }
 }
 
-/// Request that writes the EEPROM. It is explained here, and encoded only in `lms_configure`.
+/// Command byte of a request that writes the EEPROM. This module explains the request, and only `lms_configure` encodes
+/// it.
 const POWER_ON_RATE: u8 = 0x66;
-/// Request that writes the EEPROM. It is explained here, and encoded only in `lms_configure`.
+/// Command byte of a request that writes the EEPROM. This module explains the request, and only `lms_configure` encodes
+/// it.
 const WRITE_CONFIGURATION: u8 = 0x77;
-/// Bit of the first value of a sub-range: direct output of a partial scan.
+/// Bit of the first index of a sub-range that requests direct output of a partial scan.
 const DIRECT_OUTPUT: u16 = 1 << 15;
 
-/// Reads the data of a reply. Data without a known layout are left to the caller.
+/// Reports the data of a reply. Data without a known layout become one field.
 fn reply_fields(reader: &mut FieldReader<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
     match telegram.command() {
         RESET | REFUSED => Some(()),
@@ -528,7 +530,7 @@ fn status_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     Some(())
 }
 
-/// Reads the fields of the configuration, up to the end of the data if the data are shorter.
+/// Reads the fields of the configuration. If the data are shorter than a configuration, stops at the end of the data.
 fn configuration_fields(reader: &mut FieldReader<'_, '_>) -> Option<()> {
     for item in configuration::ITEMS {
         if reader.remaining() < item.len {

@@ -26,7 +26,7 @@ pub struct FramerCounters {
     pub read: u64,
     /// Bytes in delivered telegrams.
     pub in_telegrams: u64,
-    /// ACK and NAK bytes outside telegrams that arrived while a reply was expected.
+    /// ACK and NAK bytes that arrived outside telegrams while a reply was expected.
     pub acknowledge: u64,
     /// Bytes that are not part of a telegram or an acknowledgement.
     pub discarded: u64,
@@ -84,7 +84,7 @@ pub(crate) enum FoundItem {
     Nak,
 }
 
-/// Location of a telegram in the buffer. It is valid until the next bytes are committed.
+/// Location of a telegram in the buffer. The location is valid until the next bytes are committed.
 #[derive(Clone, Copy, Debug)]
 pub struct TelegramSpan {
     at: usize,
@@ -429,10 +429,10 @@ fn find_stx(bytes: &[u8]) -> Option<usize> {
 }
 
 /// Length of the buffer, in bytes. A held frame and a telegram that begins with the last byte of this frame fit into
-/// it.
+/// the buffer.
 pub(crate) const BUFFER_LEN: usize = 2 * MAX_TELEGRAM;
-/// Time without bytes after which the framer ignores a header inside a held frame. It is the longest pause inside a
-/// telegram (Telegram listing 4.3).
+/// Time without bytes after which the framer ignores a header inside a held frame. This time is the longest pause
+/// inside a telegram (Telegram listing 4.3).
 pub const VETO_HOLD_TIME: Nanos = 14 * MILLIS;
 /// Time without bytes after which the framer delivers a held frame whose last bytes may be the beginning of a header.
 pub const SUFFIX_HOLD_TIME: Nanos = 2 * MILLIS;
@@ -473,7 +473,8 @@ impl Candidates {
     }
 
     /// Returns the candidate that is complete first, if the bytes before `end` are available. If two candidates end at
-    /// the same position, returns the inner one, because it may prove that the outer one is wrong.
+    /// the same position, returns the inner candidate, because this candidate may prove that the outer candidate is
+    /// wrong.
     pub(crate) fn first_complete(&self, end: usize) -> Option<Candidate> {
         let complete = self.as_slice().iter().filter(|candidate| usize::from(candidate.end) <= end);
         complete.copied().min_by_key(|candidate| (candidate.end, core::cmp::Reverse(candidate.at)))

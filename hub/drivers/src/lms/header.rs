@@ -58,7 +58,8 @@ pub enum ExpectedHeaders {
     /// Any reply of at most [`MAX_LENGTH`] bytes. The length of a measured-value telegram must match its count word.
     Anything,
     /// Telegrams of a stream in a known mode, the reply to the open request, and the refusal of this request. Some
-    /// replies may arrive late, twice or after power-on. They are always accepted if they have their usual length.
+    /// replies may arrive late, twice or after power-on. The framer always accepts these replies if they have their
+    /// usual length.
     Stream {
         /// First bytes of each measured-value telegram.
         header: StreamHeader,
@@ -187,9 +188,9 @@ pub(crate) fn is_data(command: u8) -> bool {
 /// all values, means, a sub-range, a sub-range with field values, means of a sub-range, ranges with the reflectivity of
 /// a sub-range, ranges and reflectivities, and Cartesian coordinates.
 const STREAM_COMMANDS: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
-/// Replies to a session's requests, the refusal, and the boot message, each with its possible values of LENGTH. Types
-/// have 20 or 21 characters, and configurations have 32 or 34 bytes. Without this restriction, the bytes of scans would
-/// often look like one of these replies.
+/// Replies to a session's requests, the refusal, and the boot message, each with its possible values of LENGTH. Type
+/// texts have 20 or 21 characters, and configurations have 32 or 34 bytes. Without this restriction, the bytes of scans
+/// would often look like one of these replies.
 const REPLIES_IN_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
     (crate::lms::reply::POWER_ON, 20..=26),
     (crate::lms::reply::REFUSED, 2..=2),
@@ -199,12 +200,13 @@ const REPLIES_IN_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
     (command::VARIANT | REPLY, 7..=7),
     (command::CONFIGURATION | REPLY, 33..=36),
 ];
-/// Minimum LENGTH: the command byte and the status byte.
+/// Minimum LENGTH, of a telegram that has only the command byte and the status byte.
 const MIN_LENGTH: usize = 2;
 /// Number of bytes of the longest header.
 pub(crate) const MAX_HEADER_LEN: usize = 7;
 /// Minimum distance between two acceptable headers, in bytes. The high byte of a length is at most 3. It is therefore
-/// not a valid address, but it may be a start byte.
+/// not a valid address, so no acceptable header begins one byte before it. It may be a start byte, so the next header
+/// can begin three bytes after the first one.
 pub(crate) const MIN_HEADER_DISTANCE: usize = 3;
 
 const _: () = assert!(MAX_LENGTH < 0x0400, "MIN_HEADER_DISTANCE depends on it");

@@ -2,8 +2,8 @@
 //! mode, baud rate or settings. A scanner that streams continues to stream, but each reply costs a scan.
 //!
 //! The probe listens first, because a stream at the port's rate needs no request. Then it requests the status at each
-//! rate. It does this in two rounds, because a scanner may overlook a request. If telegrams arrived at a rate, the
-//! probe sends more requests at this rate.
+//! rate. There are two rounds of these requests, because a scanner may overlook a request. If telegrams arrived at a
+//! rate, the probe sends more requests at this rate.
 
 use scanhub_schema::{Nanos, line_time};
 
@@ -49,7 +49,7 @@ enum Phase {
     Requesting {
         question: usize,
     },
-    /// Bytes arrived, but no reply. The probe checks at each rate whether the bytes are a stream.
+    /// Bytes have arrived, but none of them were a reply. The probe checks at each rate whether the bytes are a stream.
     ListeningPerRate {
         attempt: usize,
         give_up_at: Nanos,
@@ -66,7 +66,8 @@ impl IdentityProbe {
     pub fn begin(rate: Option<u32>, now: Nanos) -> Self {
         match rate {
             Some(rate) => IdentityProbe::new(Baud::of_rate(rate).unwrap_or(Baud::B500000), now),
-            // The status will contain the rate. Timeouts for the slowest rate are long enough for every rate.
+            // The scanner's status will contain the baud rate. Timeouts for the slowest rate are long enough for every
+            // rate.
             None => IdentityProbe::at_fixed_rate(Baud::B9600, now),
         }
     }
@@ -161,8 +162,8 @@ impl IdentityProbe {
         }
     }
 
-    /// Returns whether the scanner may have counters. If its model is unknown, the probe sends the request, and the
-    /// scanner can refuse it.
+    /// Returns whether the scanner may have counters. If the scanner's model is unknown, the probe sends the request,
+    /// and the scanner can refuse it.
     fn has_counters(&self) -> bool {
         let family = self.report.kind().and_then(LmsModel::of_type);
         family.is_none_or(|family| family.refuses(Request::Counters).is_none())
@@ -180,8 +181,9 @@ impl IdentityProbe {
         self.channel.send_request(Request::Status, not_before, tries);
     }
 
-    /// Waits for a telegram at each baud rate. At each rate, it waits for the duration of two telegrams of the maximum
-    /// length. If the line is silent, or if telegrams have already arrived, ends the probe instead.
+    /// Waits for a telegram at each baud rate. At each rate, the probe waits for [`LISTEN_TIME`] and the duration of
+    /// two telegrams of the maximum length. If the line is silent, or if telegrams have already arrived, ends the probe
+    /// instead.
     fn listen_per_rate(&mut self, attempt: usize) {
         let is_silent = self.channel.byte_counters().0.read == 0;
         if is_silent || attempt >= self.count || self.unrequested.iter().any(|&count| count > 0) {

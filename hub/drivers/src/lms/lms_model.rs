@@ -14,11 +14,12 @@ named! {
         Lms200 "lms200",
         /// Outdoor scanner behind a window of 100 degrees.
         Lms211 "lms211",
-        /// Outdoor scanner. An LMS 220 counts as one.
+        /// Outdoor scanner. An LMS 220 counts as an LMS 221.
         Lms221 "lms221",
         /// Indoor scanner with long range.
         Lms291 "lms291",
-        /// Version S14 of an LMS 211, 221 or 291: twice as fast, with 90 degrees at 0.5 as its only variant.
+        /// Version S14 of an LMS 211, 221 or 291: twice as fast as the other versions, with 90 degrees at 0.5 as its
+        /// only variant.
         Fast "s14",
     }
 }
@@ -62,7 +63,7 @@ impl LmsModel {
         }
     }
 
-    /// Returns the reason why the model cannot scan `variant`. Returns `None` if it can.
+    /// Returns the reason why the model cannot scan `variant`. Returns `None` if the model can scan it.
     pub fn refuses_variant(self, variant: Variant) -> Option<&'static str> {
         match self {
             LmsModel::Lms211 if variant.angle_deg > 100 => Some("its window is 100 degrees wide"),
@@ -78,11 +79,11 @@ impl LmsModel {
             .then_some("only the LMS 291 has a sensitivity; here the byte is a peak threshold")
     }
 
-    /// Returns the reason why the model cannot execute `request`. Returns `None` if it can.
+    /// Returns the reason why the model cannot execute `request`. Returns `None` if the model can execute it.
     pub fn refuses(self, request: Request) -> Option<&'static str> {
         match request {
             Request::Variant(variant) => self.refuses_variant(variant),
-            // The model needs the command that requests the same data once.
+            // A model supports such a mode only if it supports the command that requests the same data once.
             Request::Operate(Operating::Reflectivity(_)) => self.refuses_command(REFLECTIVITY),
             Request::Operate(Operating::RangeFields(_)) => self.refuses_command(RANGE_FIELDS),
             Request::Operate(Operating::Reflectivities(_)) => self.refuses_command(REFLECTIVITIES),
@@ -90,8 +91,8 @@ impl LmsModel {
         }
     }
 
-    /// Returns the reason why the model does not support `command` (Telegram listing table 7-1). Returns `None` if it
-    /// does. `command` may also be a command that writes the EEPROM.
+    /// Returns the reason why the model does not support `command` (Telegram listing table 7-1). Returns `None` if the
+    /// model supports it. `command` may also be a command that writes the EEPROM.
     pub fn refuses_command(self, command: u8) -> Option<&'static str> {
         match (command, self) {
             (COUNTERS, LmsModel::Lms200) => Some("only the LMS 211, 221 and 291 count their hours"),
@@ -108,7 +109,8 @@ impl LmsModel {
     }
 }
 
-/// Commands that write fields. This module does not depend on `lms_configure`, which encodes them.
+/// Commands that write fields. This module does not depend on `lms_configure`, which encodes these commands, so their
+/// codes are repeated here.
 const FIELD_WRITE_COMMANDS: &[u8] = &[0x40, 0x46];
 
 #[cfg(test)]

@@ -214,8 +214,8 @@ impl<'a> Rows<'a> {
         Rows::check_len(data, reflectivities + 6 + count(data, reflectivities)?)
     }
 
-    /// Checks the data of BEh: a sub-range, with the range of each beam and the borders of the fields A, B and C in its
-    /// direction. A beam has four words, so 100 beams fill the longest telegram completely.
+    /// Checks the data of BEh: a sub-range, with the range of each beam and the distances to the borders of the fields
+    /// A, B and C along this beam. A beam has four words, so 100 beams fill the longest telegram completely.
     pub fn of_fields(data: &'a [u8]) -> Option<Self> {
         Rows::check_len(data, 6 + 8 * count(data, 4)?)
     }

@@ -8,7 +8,7 @@ use crate::lms::variant::Baud;
 requests! {
     /// An operating mode other than [`crate::lms::command::Request::Stream`], `Stop` and `Baud` (Telegram listing 7.3).
     Operating by byte {
-        /// 00h: installation, the only mode in which the EEPROM can be written. It blocks the field outputs.
+        /// 00h: installation, the only mode in which the EEPROM can be written. This mode blocks the field outputs.
         Installation(password: Password) = INSTALLATION,
         /// 10h: diagnosis.
         Diagnosis = 0x10,

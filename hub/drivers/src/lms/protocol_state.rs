@@ -1,7 +1,7 @@
 //! Protocol state of a session: it finds the scanner, starts its stream, monitors it, and stops it.
 //!
-//! It handles telegrams and deadlines. The session handles bytes. No request changes a setting that the scanner keeps
-//! after a power cycle.
+//! This state machine handles telegrams and deadlines, and the session handles bytes. No request changes a setting that
+//! the scanner keeps after a power cycle.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -46,9 +46,9 @@ pub(crate) struct ProtocolState {
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// Waits for a stream without sending. Meanwhile, the reported state is `shown`. Then the session sends request
-    /// number `attempt` of the search. It sends the request at `quiet_at` if no byte has arrived, and otherwise at
-    /// `deadline`.
+    /// Waits for a stream and sends nothing. Meanwhile, the session reports the state `shown`. If no stream arrives,
+    /// the session then sends request number `attempt` of the search: at `quiet_at` if no byte has arrived, and
+    /// otherwise at `deadline`.
     Listening { deadline: Nanos, quiet_at: Nanos, shown: State, attempt: usize },
     /// Sends a request at each baud rate.
     Probing { attempt: usize },
@@ -107,7 +107,7 @@ impl ProtocolState {
         self.rate.reject();
     }
 
-    /// Returns the rate to which the port must be set now.
+    /// Returns the rate to which the port must be set now. Returns `None` if the port has the right rate.
     pub(crate) fn take_rate_change(&mut self) -> Option<Baud> {
         self.rate.take_change()
     }
@@ -137,8 +137,8 @@ impl ProtocolState {
         }
     }
 
-    /// Returns the current problem. Without one, returns a problem that lasts longer. During a pause, such a problem is
-    /// irrelevant.
+    /// Returns the current problem. If there is none, returns a lasting problem, such as a refused setting. Lasting
+    /// problems are irrelevant during a pause, so a paused session reports only the current problem.
     pub(crate) fn problem(&self) -> Option<Problem> {
         if self.is_paused {
             return self.problem;
@@ -147,7 +147,7 @@ impl ProtocolState {
         let no_ranges = self.sensor.mode.filter(|mode| !mode.has_ranges()).map(Problem::NoRanges);
         let variant_refused = self.variant_refused.then_some(Problem::VariantRefused);
         let needs_rs422 = self.rate.problem();
-        // If the scanner was lost after a switch, this is the cause of all other problems.
+        // If the scanner was lost after a switch of the baud rate, this loss is the cause of all other problems.
         let main_problem = needs_rs422.filter(|_| self.rate.has_lost_scanner()).or(self.problem);
         main_problem.or(has_other_angles).or(no_ranges).or(needs_rs422).or(variant_refused)
     }
@@ -231,8 +231,9 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a NAK. Ignores it during a search and while a stream is being stopped. The rest of a scan, or a stream
-    /// at another rate, contains bytes that look like a NAK. Only the timeout counts then.
+    /// Handles a NAK. Ignores the NAK during a search and while a stream is being stopped, because the rest of a scan,
+    /// or a stream at another rate, contains bytes that look like a NAK. In these cases, only the timeout ends the wait
+    /// for the reply.
     pub(crate) fn on_nak(&mut self, now: Nanos) {
         let is_credible = !matches!(self.phase, Phase::Probing { .. }) && !self.sensor.streams;
         if is_credible && self.open_request.as_ref().is_some_and(PendingRequest::is_sent) {
@@ -240,8 +241,9 @@ impl ProtocolState {
         }
     }
 
-    /// Handles a telegram whose first byte arrived at `first`. The telegram counts as the reply to the open request
-    /// even if `reply` is `None`. `is_line_damaged` is whether the line has recently damaged telegrams.
+    /// Handles a telegram whose first byte arrived at `first`. `reply` is the decoded telegram. Even a telegram that
+    /// cannot be decoded counts as the reply to the open request. `is_line_damaged` is whether the line has recently
+    /// damaged telegrams.
     pub(crate) fn on_telegram(
         &mut self,
         telegram: Telegram<'_>,
@@ -251,7 +253,7 @@ impl ProtocolState {
         now: Nanos,
     ) {
         self.no_telegram_since = now;
-        // A lost scanner needs a power cycle. The restart is then not a sign of a weak power supply.
+        // A lost scanner needs a power cycle, so its restart is expected. It is not a sign of a weak power supply.
         let is_expected_restart = self.rate.has_lost_scanner();
         self.rate.note_telegram();
         self.sensor.set_line_damaged(is_line_damaged);
@@ -363,7 +365,7 @@ impl ProtocolState {
                 self.problem.take_if(|problem| matches!(problem, Problem::NoReply { .. } | Problem::Silence));
                 if request == Request::Type {
                     // The line was silent before the request, so the scanner does not stream. The session requests the
-                    // status at the target rate.
+                    // status later, at the target rate.
                     self.sensor.streams = false;
                 }
                 self.proceed(Start::CHECK.after_reply(request, reply.as_ref()), now);
@@ -386,7 +388,8 @@ impl ProtocolState {
     fn retry(&mut self, not_before: Nanos) {
         let Some(pending) = &mut self.open_request else { return };
         let request = pending.request;
-        // The scanner may have executed a mode change. Check the state instead of repeating the request.
+        // The scanner has acknowledged the mode change and may have executed it. Check the state instead of repeating
+        // the request.
         let is_acknowledged = pending.reply() == MODE_REPLY && pending.is_acknowledged;
         if !is_acknowledged && pending.retry(not_before) {
             return;
@@ -444,7 +447,7 @@ impl ProtocolState {
 
     /// Sends request number `attempt` of the search, which normally requests the status. On a silent line at a rate
     /// other than the target rate, it requests the type instead, because the 160 bytes of a status take 0.17 s at 9,600
-    /// baud. The session then requests the status after the change of the rate. Every other round always requests the
+    /// baud. The session then requests the status after the change of the rate. Every second round requests only the
     /// status, because some scanners do not report their type.
     fn probe(&mut self, now: Nanos, attempt: usize) {
         self.phase = Phase::Probing { attempt };
@@ -493,13 +496,13 @@ impl ProtocolState {
             Phase::Listening { deadline: until, quiet_at: until, shown: State::Probing, attempt: next };
     }
 
-    /// Continues a start after the scanner has reported its status.
+    /// Continues the start of a stream after the scanner has reported its status.
     fn proceed(&mut self, start: Start, now: Nanos) {
         let is_at_rate = self.rate.baud == self.rate.target;
         self.enter_step(start.proceed(&self.sensor, is_at_rate, self.settings.variant), now);
     }
 
-    /// Enters the step of `start` and sends its request.
+    /// Enters the step of `start` and sends the request of this step.
     fn enter_step(&mut self, start: Start, now: Nanos) {
         let (request, tries) = start.request(self.rate.target, self.settings.variant);
         self.restarts.streamed_at = None;
@@ -535,7 +538,8 @@ impl ProtocolState {
                 }
                 self.enter_step(start.next_setting(&self.sensor, self.settings.variant), now);
             }
-            // The stream begins with its first telegram. Until then, the timeout is the timeout of a stream.
+            // The stream begins with its first telegram. Until this telegram arrives, the timeout is the same as within
+            // a stream.
             Step::Stream => {
                 let until = self.silence_deadline(now);
                 self.phase =
@@ -579,13 +583,13 @@ impl ProtocolState {
         variant.period(2 * variant.beams() + OVERHEAD_BYTES, self.rate.target.rate())
     }
 
-    /// Returns the time at which the stream counts as silent if no more data arrive. It is one second from `now`, or on
-    /// a slow line two and a half telegram periods.
+    /// Returns the time at which the stream counts as silent if no more data arrive. This time is one second after
+    /// `now`, or on a slow line two and a half telegram periods after `now`.
     fn silence_deadline(&self, now: Nanos) -> Nanos {
         now + SILENCE_TIMEOUT.max(5 * self.scan_period() / 2)
     }
 
-    /// Starts to stream with the first measured data. Accepts the settings that these data show.
+    /// Starts to stream with the first measured data. Accepts the scanner's settings as these data show them.
     fn begin_stream(&mut self, telegram: Telegram<'_>, measured: Option<MeasuredValues<'_>>, now: Nanos) {
         let Some(&header) = telegram.bytes().first_chunk::<{ size_of::<StreamHeader>() }>() else { return };
         let is_requested = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
@@ -696,8 +700,9 @@ impl Restarts {
         self.streamed_at = None;
     }
 
-    /// Records that a search found the scanner at `baud`. A scanner that streamed, and that no request has stopped, has
-    /// restarted if it now has another rate or `is_idle`. Its boot message was then lost.
+    /// Records that a search found the scanner at `baud`. `is_idle` is whether the scanner has reported that it does
+    /// not stream. A scanner that streamed, and that no request has stopped, has restarted if it now has another rate
+    /// or is idle. The boot message of this restart was lost.
     fn note_found(&mut self, baud: Baud, is_idle: bool) {
         let has_restarted = self.streamed_at.take().is_some_and(|old_rate| old_rate != baud || is_idle);
         self.count += u64::from(has_restarted);
@@ -718,22 +723,23 @@ const MODE_REPLY: u8 = MODE | REPLY;
 /// is slower than the scans, the session listens longer.
 pub(crate) const LISTEN_TIME: Nanos = 120 * MILLIS;
 /// Silence after which a line carries no stream of complete scans. It is the duration of two telegrams of the usual
-/// variant. The slowest variant begins a scan every 53 ms, and its bytes are on the line for at least a third of this
-/// time.
+/// variant. The slowest variant begins a scan every 53 ms, and the bytes of a scan are on the line for at least a third
+/// of these 53 ms.
 const QUIET_TIME: Nanos = 55 * MILLIS;
 /// Time without measured data after which the session restarts (paper: resynchronize after one second).
 pub const SILENCE_TIMEOUT: Nanos = 1_000 * MILLIS;
 /// Pause after a refusal, before the search begins.
 const REFUSAL_PAUSE: Nanos = 500 * MILLIS;
-/// If a complete scan begins this long after a request, the scanner overlooked the request, because a reply would have
-/// interrupted the stream. The time also covers bytes that an adapter still buffers.
+/// Minimum time from a request to the start of a complete scan that shows that the scanner overlooked the request. A
+/// reply would have interrupted the stream. This time also covers bytes that an adapter still buffers.
 const OVERLOOK_TIME: Nanos = 25 * MILLIS;
-/// Pauses before the next round of the search. The index is the number of completed rounds.
+/// Pauses before the next round of the search. The index is the number of completed rounds minus 1. The last pause
+/// applies to all later rounds.
 const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
-/// Number of rounds of the search for a scanner that must stop: one round with short timeouts and one round with long
-/// timeouts.
+/// Maximum number of rounds of the search in a paused session, which searches for the scanner in order to stop it. One
+/// round has short timeouts, and the other round has long timeouts.
 const STOP_SEARCH_ROUNDS: usize = 2;
-/// Additional time for the reply in every other round, so that a slow scanner is found too.
+/// Additional time for the reply in every second round, so that the search also finds a slow scanner.
 const EXTRA_REPLY_TIME: Nanos = 250 * MILLIS;
 /// Number of bytes of a telegram in addition to its values: STX to count word, status and checksum.
 const OVERHEAD_BYTES: usize = 10;

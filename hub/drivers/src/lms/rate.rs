@@ -1,14 +1,14 @@
-//! Baud rate of the line. It consists of the target rate for the stream, and the order in which the search tries the
-//! other rates.
+//! Baud rates of a session: the current rate of the line, the target rate for the stream, and the order in which the
+//! search tries all rates.
 //!
-//! A line such as RS-232 cannot carry 500,000 baud. On this line, the scanner acknowledges the switch to 500,000 baud
+//! A line such as RS-232 cannot carry 500,000 baud. On such a line, the scanner acknowledges the switch to 500,000 baud
 //! and is then unreachable until a power cycle. After [`MAX_SILENT_SWITCHES`] consecutive switches with this result, a
 //! session with an automatic rate streams at 38,400 baud, the highest rate of RS-232. The count survives boot messages,
 //! sessions and runs of the hub, because the scanner's power is often cycled together with the host's power.
 //!
-//! The port may not support 500,000 baud either. On a link with a configured LMS, the port then fails to open at this
-//! rate. If a search has found the scanner at another rate, the session therefore sets the port to 500,000 baud for a
-//! moment before it switches the scanner.
+//! The port may not support 500,000 baud either. On a link with a configured LMS, such a port fails to open at this
+//! rate. If a search has found the scanner at another rate, the port is open at that rate. The session then tests the
+//! port: it sets the port to 500,000 baud for a moment before it switches the scanner.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -72,7 +72,7 @@ impl LineRate {
         }
     }
 
-    /// Returns the rate to which the port must be set now.
+    /// Returns the rate to which the port must be set now. Returns `None` if the port has the right rate.
     pub(crate) fn take_change(&mut self) -> Option<Baud> {
         match self.trial {
             Trial::Due => {
@@ -163,7 +163,7 @@ impl LineRate {
         }
     }
 
-    /// Restores the rate at which an earlier session found the scanner. The search tries it first.
+    /// Restores the rate at which an earlier session found the scanner. The search tries this rate first.
     pub(crate) fn restore(&mut self, baud: Baud) {
         (self.idle_rate, self.first_tried) = (baud, baud);
     }
@@ -181,7 +181,8 @@ impl LineRate {
     }
 
     /// Returns the rate that the next session should try first, and the number of silent switches. If the line cannot
-    /// carry 500,000 baud, this rate is the rate in use. Returns `None` if there was no search.
+    /// carry 500,000 baud, the first rate to try is the rate that the session uses instead. Returns `None` if there was
+    /// no search.
     pub(crate) fn known(&self) -> Option<KnownRate> {
         let baud = self.replacement().or(self.found_at)?;
         Some(KnownRate { baud: baud.rate(), silent_switches: self.silent_switches() })
@@ -279,10 +280,10 @@ const MAX_SILENT_SWITCHES: u8 = 2;
 const FAST_BAUD: Baud = Baud::B500000;
 /// Highest baud rate of RS-232.
 const RS232_BAUD: Baud = Baud::B38400;
-/// Baud rate of a scanner after power-on, unless its EEPROM contains another one.
+/// Baud rate of a scanner after power-on, unless the scanner's EEPROM contains another rate.
 pub(crate) const POWER_ON_BAUD: Baud = Baud::B9600;
-/// Baud rates in the order of a search, the most likely rates first: the rate after power-on, the rate that a hub
-/// leaves behind, and the other rates.
+/// Baud rates in the order of a search, the most likely rates first: the rate after power-on, the rate at which an
+/// earlier hub may have left the scanner, and the other rates.
 pub(crate) const SEARCH_ORDER: [Baud; 4] = [Baud::B9600, Baud::B500000, Baud::B38400, Baud::B19200];
 /// Pause after a change of the baud rate, for the UARTs of scanner and adapter.
 pub(crate) const SETTLE_TIME: Nanos = 20 * MILLIS;

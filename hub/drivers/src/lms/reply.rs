@@ -1,5 +1,5 @@
-//! Replies of a scanner. A scanner also sends some of them without a request, in a stream and after power-on. Every
-//! reply ends with a status byte, see [`crate::lms::status::StatusByte`].
+//! Replies of a scanner. A scanner also sends some of these replies without a request, in a stream and after power-on.
+//! Every reply ends with a status byte, see [`crate::lms::status::StatusByte`].
 
 use crate::lms::command as request;
 use crate::lms::command::{Parameter as _, SubRange};
@@ -19,7 +19,7 @@ pub enum Reply<'a> {
     PowerOn(&'a [u8]),
     /// 91h: the reset begins. 90h follows within 60 s.
     Reset,
-    /// 92h: the command is well-formed, but the scanner cannot execute it, or cannot execute it now.
+    /// 92h: the command is well-formed, but the scanner cannot execute it at all, or cannot execute it now.
     Refused,
     /// A0h: result of a change of the operating mode or of the baud rate.
     Mode {
@@ -34,7 +34,7 @@ pub enum Reply<'a> {
     Errors(Errors<'a>),
     /// B5h: operating data counters.
     Counters {
-        /// Hours of operation, in units of two.
+        /// Time of operation, in units of two hours.
         hours_by_2: u16,
         /// Number of power-ons.
         power_ons: u16,
@@ -77,7 +77,7 @@ pub enum Reply<'a> {
     },
     /// C4h: ranges, and reflectivities of a sub-range; version S14 only.
     Reflectivity(Rows<'a>),
-    /// E6h: result of a change of the baud rate after power-on.
+    /// E6h: result of a request that sets the baud rate after power-on.
     PowerOnSet {
         /// Result code. [`StatusReport::has_permanent_baud`] returns the present state.
         outcome: u8,
@@ -104,7 +104,7 @@ pub enum Reply<'a> {
         /// The bytes in effect.
         parameters: &'a [u8],
     },
-    /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h. This module does not know their layout.
+    /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h. This module does not decode them.
     Undecoded {
         /// The command byte.
         command: u8,
@@ -115,7 +115,7 @@ pub enum Reply<'a> {
 
 impl<'a> Reply<'a> {
     /// Returns the measuring mode in the reply. Returns `Some(None)` for the boot message, because the mode in earlier
-    /// replies is no longer valid.
+    /// replies is no longer valid, and `None` for a reply without a mode.
     pub fn mode(&self) -> Option<Option<Mode>> {
         match self {
             Reply::Configuration(configuration) => Some(Some(configuration.mode())),
@@ -304,7 +304,7 @@ const REFLECTIVITIES: u8 = request::REFLECTIVITIES | REPLY;
 const CONFIGURATION_WRITTEN: u8 = 0xF7;
 const CONFIGURATION_2: u8 = request::CONFIGURATION_2 | REPLY;
 const CONFIGURATION_2_WRITTEN: u8 = 0xFC;
-/// Command bytes of replies whose layout this module does not know.
+/// Command bytes of replies that this module does not decode.
 const UNDECODED_COMMANDS: [u8; 8] = [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6];
 /// Number of characters of the text with model, number and firmware.
 const NAME_LEN: usize = 21;

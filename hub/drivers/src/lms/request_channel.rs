@@ -1,5 +1,5 @@
-//! Sends requests, and handles their timeouts and retries. [`crate::lms::identity_probe`] and a change of the configuration
-//! use [`RequestChannel`]. A session has its own framer and uses only `PendingRequest`.
+//! Sends requests, and handles their timeouts and retries. [`crate::lms::identity_probe`] and the code that changes the
+//! configuration use [`RequestChannel`]. A session has its own framer and uses only `PendingRequest`.
 //!
 //! The scanner requires at least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror
 //! rotates (Telegram listing 4.3). A request is therefore sent byte by byte.
@@ -125,7 +125,7 @@ impl<R: EncodeRequest> RequestChannel<R> {
         self.open_request.take_if(is_answer).map(|open| open.request)
     }
 
-    /// Returns the next telegram or NAK in the received bytes. Handles the acknowledgments before it.
+    /// Returns the next telegram or NAK in the received bytes. Handles the acknowledgments before this telegram or NAK.
     pub fn advance(&mut self) -> Option<ChannelEvent> {
         // Bytes that arrived before a change of the rate are discarded.
         while !self.change_baud {
@@ -193,8 +193,8 @@ pub trait EncodeRequest {
     fn command(&self) -> u8;
     /// Returns the maximum time from the acknowledgment to the reply.
     fn reply_timeout(&self) -> Nanos;
-    /// Returns the maximum time to the acknowledgment. If the scanner sends none, this is the maximum time to the first
-    /// byte of the reply.
+    /// Returns the maximum time to the acknowledgment. If the scanner sends no acknowledgment, this is the maximum time
+    /// to the first byte of the reply.
     fn acknowledge_timeout(&self) -> Nanos {
         ACKNOWLEDGE_TIMEOUT
     }
@@ -241,7 +241,7 @@ pub(crate) struct PendingRequest<R = Request> {
     has_received: bool,
     /// Time at which the last byte of the request was sent.
     pub(crate) sent_at: Option<Nanos>,
-    /// End of the wait for the reply, which begins with the last byte of the request.
+    /// End of the wait for the reply. This wait begins when the last byte of the request was sent.
     pub(crate) deadline: Nanos,
 }
 
@@ -324,9 +324,9 @@ impl<R: EncodeRequest> PendingRequest<R> {
         self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
     }
 
-    /// Restarts the request if `now` is too late for its next byte. Returns whether it did. The scanner has discarded
-    /// the incomplete request. A restart does not use up a try. After [`MAX_RESTARTS`] restarts, the whole request is
-    /// sent even if bytes are late, so that the wait for its reply ends.
+    /// Restarts the request if `now` is too late for its next byte. The scanner has then discarded the incomplete
+    /// request. Returns whether the request was restarted. A restart does not use up a try. After [`MAX_RESTARTS`]
+    /// restarts, the whole request is sent even if bytes are late, so that the wait for its reply ends.
     pub(crate) fn restart_if_late(&mut self, now: Nanos, baud: Baud) -> bool {
         let is_gap =
             self.is_partly_sent() && now > self.min_sent_at + line_time(1, baud.rate()) + MAX_BYTE_GAP;
@@ -360,15 +360,17 @@ impl<R: EncodeRequest> PendingRequest<R> {
 pub const TRIES: u8 = 3;
 /// Number of tries of requests that are necessary for a stream.
 pub const ESSENTIAL_TRIES: u8 = 5;
-/// Time after which the scanner has discarded a partly sent request. It discards the request after 6 ms (Telegram
-/// listing 4.3).
+/// Time after which the scanner has certainly discarded a partly sent request. The scanner discards such a request
+/// after 6 ms (Telegram listing 4.3).
 pub(crate) const PARTIAL_REQUEST_TIMEOUT: Nanos = 10 * MILLIS;
-/// Time from the end of a byte to the next one: more than 55 us, and much less than 6 ms (Telegram listing 4.3).
+/// Time from the end of a byte to the start of the next byte: more than 55 us, and much less than 6 ms (Telegram
+/// listing 4.3).
 const BYTE_GAP: Nanos = 120 * MICROS;
 /// Maximum number of restarts of a request because a byte was late. If a machine is late more often, it cannot send the
 /// request.
 const MAX_RESTARTS: u8 = 50;
-/// Maximum time from the end of a byte to the next one: 6 ms (Telegram listing 4.3), minus the duration of the write.
+/// Maximum time from the end of a byte to the start of the next byte: 6 ms (Telegram listing 4.3), minus the duration
+/// of the write.
 const MAX_BYTE_GAP: Nanos = 5 * MILLIS;
 /// Maximum time before a byte is due at which the session returns the byte. Until then, the session returns a deadline.
 pub(crate) const SEND_AHEAD: Nanos = 5 * MILLIS;

@@ -1,8 +1,8 @@
 //! Counts the losses of a stream: scans that were due but did not arrive, and bytes that the line damaged.
 //!
-//! A scanner sends scans one period apart, even if they do not arrive. The schedule can therefore count lost scans and
-//! stamp a scan in a backlog. A silence that is longer than the session's timeout is not a loss on the line, because
-//! the session then restarts the stream.
+//! A scanner sends scans one period apart, even if the line loses some of them. The schedule can therefore count lost
+//! scans and stamp a scan in a backlog. A silence that is longer than the session's timeout is not a loss on the line,
+//! because the session then restarts the stream.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -26,7 +26,8 @@ pub(crate) struct ScanSchedule {
     arrived: u64,
     /// Number of scans that counted as lost because they were missing for a second.
     pub(crate) lost: u64,
-    /// Minimum number of missing scans since `min_since`. A scan that is only late is missing for a short time.
+    /// Minimum number of missing scans since `min_since`. A scan that is only late is missing for a short time, so it
+    /// does not increase this minimum.
     min_missing: u64,
     min_since: Nanos,
 }
@@ -159,7 +160,7 @@ impl LineDamage {
         self.checked = None;
     }
 
-    /// Returns the number of damaged bytes, including those since the last check.
+    /// Returns the number of damaged bytes, including the bytes since the last check.
     pub(crate) fn damaged(&self, counters: &FramerCounters) -> u64 {
         self.damaged + self.checked.map_or(0, |checked| unassigned_bytes(counters) - checked)
     }
@@ -174,7 +175,7 @@ fn unassigned_bytes(counters: &FramerCounters) -> u64 {
     counters.discarded - counters.broken_off
 }
 
-/// Time after the last damage during which the line counts as damaging.
+/// Time after the last damage during which every telegram on the line may be damaged.
 const RECENT_DAMAGE_TIME: Nanos = 10_000 * MILLIS;
 
 #[cfg(test)]
@@ -236,7 +237,7 @@ mod tests {
 
     #[test]
     fn ambiguous_gaps_are_not_counted() {
-        // The scanner always skips every other scan.
+        // The scanner always skips every second scan.
         let slow = after_scans((0..100).map(|n| f64::from(2 * n)));
         assert_eq!((slow.due, slow.lost), (0, 0));
         // The scanner pauses.

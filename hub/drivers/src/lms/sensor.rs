@@ -1,5 +1,5 @@
-//! State of a scanner according to its telegrams, for messages and for the next session. The session discards it when
-//! the next telegram may come from another scanner.
+//! State of a scanner according to its telegrams, for messages and for the next session. The session discards the
+//! identity when the next telegram may come from another scanner.
 
 use core::fmt;
 
@@ -26,7 +26,7 @@ pub enum Problem {
     Unanswered(Request),
     /// The scanner refused a request.
     Refused(Request),
-    /// The scanner keeps an angle or resolution that differs from the requested one, and streams with it.
+    /// The scanner keeps an angle or a resolution that the session did not request, and streams with this setting.
     VariantRefused,
     /// No measured data arrived for one second.
     Silence,
@@ -98,18 +98,19 @@ impl fmt::Display for Problem {
 /// State of a scanner according to its telegrams. A field is `None` before its first report.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sensor {
-    /// Address byte of the scanner's telegrams: its own address + 80h.
+    /// Address byte of the scanner's telegrams: the scanner's own address + 80h.
     pub address: Option<u8>,
     /// Measuring mode, which determines the range bits and the upper bits of a value.
     pub mode: Option<Mode>,
-    /// Unit of its ranges.
+    /// Unit of the ranges.
     pub unit: Option<Unit>,
     /// Angle and resolution.
     pub variant: Option<Variant>,
     /// Whether the scanner sends scans without a request, or is in a mode in which it does not measure.
     pub streams: bool,
-    /// Status byte of the telegrams. The session accepts a worse status byte at once, but a better one only after some
-    /// hundred telegrams, because the status byte may change with every scan.
+    /// Status byte of the telegrams. The session accepts a worse status byte at once, unless the line damages
+    /// telegrams. It accepts a better status byte only after some hundred telegrams with better status bytes, because
+    /// the status byte may change with every scan.
     pub status_byte: Option<StatusByte>,
     /// Whether the scanner reports that it is defective.
     pub defective: Option<bool>,
@@ -117,8 +118,8 @@ pub struct Sensor {
     pub permanent_baud: Option<bool>,
     /// Laser power in percent of the nominal power. Real scanners report 156 to 161.
     pub laser_power_percent: Option<u16>,
-    /// Transmission of the dirtiest channel of the window, in percent of a clean one. The scanner warns below 75, and
-    /// reports an error below 30.
+    /// Transmission of the dirtiest channel of the window, in percent of a clean window. The scanner warns below 75,
+    /// and reports an error below 30.
     pub window_percent: Option<u16>,
     software: [u8; SOFTWARE_NAME_LEN],
     kind: [u8; MAX_TYPE_LEN],
@@ -145,13 +146,14 @@ pub struct Sensor {
 type HealthIssues = (bool, bool);
 
 impl Sensor {
-    /// Returns model, number and firmware as ASCII, such as `LMS200;S18063;V02.19`. Empty if the scanner has not
-    /// reported them yet.
+    /// Returns model, number and firmware as ASCII, such as `LMS200;S18063;V02.19`. Returns an empty slice if the
+    /// scanner has not reported them yet.
     pub fn kind(&self) -> &[u8] {
         &self.kind[..self.kind_len]
     }
 
-    /// Returns whether the scans have angles that no [`Variant`] has, although a variant has their number of values.
+    /// Returns whether the scans have angles that no [`Variant`] has, although their number of values is that of a
+    /// variant.
     pub fn has_other_angles(&self) -> bool {
         self.family == Some(LmsModel::Fast)
     }
@@ -162,7 +164,7 @@ impl Sensor {
         self.mode.filter(|mode| mode.has_ranges() && !self.has_other_angles())
     }
 
-    /// Returns the firmware as ASCII, such as `V02.19`. Empty if the scanner has not reported it yet.
+    /// Returns the firmware as ASCII, such as `V02.19`. Returns an empty slice if the scanner has not reported it yet.
     pub fn software(&self) -> &[u8] {
         self.software.trim_ascii()
     }
@@ -278,8 +280,8 @@ impl Sensor {
     }
 
     /// Counts a report of a worse status on a line that damages telegrams. Returns whether enough reports have arrived.
-    /// For a fatal status, two reports with any time between them are sufficient, because a scanner may report it only
-    /// from time to time.
+    /// For a fatal status, two reports with any time between them are sufficient, because a scanner may report a fatal
+    /// status only from time to time.
     fn count_worse_report(&mut self, is_fatal: bool) -> bool {
         if is_fatal {
             self.fatal_reports += 1;
@@ -312,8 +314,8 @@ impl Sensor {
     }
 }
 
-/// Identity of a scanner that streams. Its scans do not contain it. With the identity, a session that continues the
-/// same stream can decode values before it sends a request.
+/// Identity of a scanner that streams. The scans themselves do not contain the identity. With it, a session that
+/// continues the same stream can decode values before it sends a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Identity {
     /// First bytes of each scan.
@@ -350,7 +352,7 @@ const _: () = assert!(size_of::<StreamHeader>() + 1 + MAX_TYPE_LEN == size_of::<
 /// Condition that the user should know about although scans arrive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Notice {
-    /// The status report says that the scanner is defective.
+    /// The scanner's status report states that the scanner is defective.
     Defective,
     /// The status byte reports a fatal error.
     Fatal,
@@ -392,14 +394,14 @@ fn severity_rank(condition: Option<StatusByte>) -> u8 {
     if severity >= Severity::Error { 2 * severity.code() + u8::from(polluted) } else { u8::from(polluted) }
 }
 
-/// Number of consecutive telegrams with a better status byte after which it replaces the worse one. They take some
-/// seconds.
+/// Number of consecutive telegrams with a better status byte after which the better status byte replaces the stored
+/// one. These telegrams take some seconds.
 const RECOVERY_TELEGRAMS: u16 = 200;
-/// Number of reports of a worse status that prove it on a line that damages telegrams. They must be among
-/// [`RECOVERY_TELEGRAMS`] telegrams.
+/// Number of reports of a worse status that prove this status on a line that damages telegrams. The reports must be
+/// among [`RECOVERY_TELEGRAMS`] telegrams.
 const CONFIRMATIONS: u8 = 3;
-/// Number of reports of a fatal status that prove it on a line that damages telegrams. They may be among any number of
-/// telegrams.
+/// Number of reports of a fatal status that prove this status on a line that damages telegrams. Any number of telegrams
+/// may be between the reports.
 const FATAL_CONFIRMATIONS: u8 = 2;
 /// Length of the firmware version, in bytes.
 const SOFTWARE_NAME_LEN: usize = 7;

@@ -35,12 +35,12 @@ pub struct Settings {
     /// at 38,400 baud after two switches to 500,000 baud that the scanner acknowledged and after which the line was
     /// silent.
     pub keep_baud: bool,
-    /// Measuring mode for a recording that does not contain it.
+    /// Measuring mode for a recording that does not contain the mode.
     pub mode: Option<Mode>,
 }
 
-/// Session with one scanner. If the scanner is replaced within a second, the session does not detect this if the new
-/// scanner already streams with the same number of values and the same address.
+/// Session with one scanner. The session does not detect that a user has replaced the scanner, if this took less than a
+/// second and the new scanner already streams with the same number of values and the same address.
 #[derive(Clone, Debug)]
 pub struct LmsSession {
     settings: Settings,
@@ -133,7 +133,7 @@ impl LmsSession {
         let period = self.period(telegram, reply.as_ref());
         let mut first = self.arrivals.stamp(span.offset, baud);
         let last = self.arrivals.stamp(span.offset + len - 1, baud);
-        // The line may have delayed only the end of a telegram.
+        // The line may have delayed only the end of a telegram, so check both stamps.
         let estimated = first.estimated || last.estimated;
         let due = period.and(self.due_time(&first, span.offset, len));
         // A later read may show that bytes are older than estimated. Stamps of earlier bytes are already published, so
@@ -185,8 +185,8 @@ impl LmsSession {
         self.arrivals.stamp(open, self.baud().rate()).at
     }
 
-    /// Returns the time between two scans like `telegram`. `reply` is the decoded telegram. Returns `None` unless
-    /// `telegram` is a complete scan of a live stream and its number of beams belongs to a variant.
+    /// Returns the time between two scans of the same length as `telegram`. `reply` is the decoded telegram. Returns
+    /// `None` if `telegram` is not a complete scan of a live stream, or if no variant has this number of beams.
     fn period(&self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>) -> Option<Nanos> {
         let Some(Reply::Measured(measured)) = reply.filter(|_| self.is_live()) else { return None };
         let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
@@ -311,7 +311,7 @@ impl line::ScannerSession for LmsSession {
     fn can_defer_read(&self) -> bool {
         let is_between_telegrams =
             self.framer.buffered() == 0 && !self.has_more && self.deferred_until.is_none();
-        // A reply takes less time than a scan.
+        // A reply takes less time than a scan, so the measured duration of a telegram does not apply to a reply.
         let has_no_request = self.protocol.open_request().is_none();
         is_between_telegrams
             && has_no_request
@@ -322,8 +322,8 @@ impl line::ScannerSession for LmsSession {
 
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
         self.now = now;
-        // If the host has more unread bytes than the scanner sends in a revolution, the host was stopped. The read must
-        // then determine the age of these bytes.
+        // If the host has more unread bytes than the scanner sends in a revolution, the host was stopped. The session
+        // must then read these bytes at once, because the read determines their age.
         if (1..=BYTES_PER_REVOLUTION).contains(&waiting) && self.can_defer_read() {
             self.arrivals.note_unread(now, waiting);
             let start = self.next_start();
@@ -401,7 +401,8 @@ impl line::ScannerSession for LmsSession {
         }
     }
 
-    /// Returns the rate in use if the line cannot carry 500,000 baud.
+    /// Returns the rate at which a search found the scanner. If the line cannot carry 500,000 baud, returns the rate
+    /// that the session uses instead.
     fn known_rate(&self) -> Option<KnownRate> {
         self.protocol.rate.known()
     }
@@ -534,8 +535,8 @@ impl From<settings::Settings> for Settings {
     }
 }
 
-/// Counters of rejected telegrams, by reason. A wrong checksum is missing here, because it has a counter in every
-/// family.
+/// Counters of rejected telegrams, by reason. The reason "wrong checksum" is missing here, because every family has a
+/// counter for it.
 const REJECTS: [(Reject, Counter); Reject::COUNT - 1] = [
     (Reject::Address, Counter::RejectedAddress),
     (Reject::Length, Counter::RejectedLength),

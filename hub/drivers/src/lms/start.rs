@@ -9,9 +9,9 @@ use crate::lms::request_channel::{ESSENTIAL_TRIES, TRIES};
 use crate::lms::sensor::Sensor;
 use crate::lms::variant::{Baud, Variant};
 
-/// Step of a [`Start`], which sends one request. The replies to a change of mode and to a change of rate look the same.
-/// Another step is therefore always between two changes, so that a late or repeated reply does not count as the reply
-/// to the next change.
+/// Step of a [`Start`]. Each step sends one request. The replies to a change of mode and to a change of rate look the
+/// same. Another step is therefore always between two changes, so that a late or repeated reply does not count as the
+/// reply to the next change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Step {
     /// Ends a stream or the installation mode.
@@ -26,8 +26,8 @@ pub(crate) enum Step {
     Stream,
 }
 
-/// Progress of a start. The scanner receives requests. The steps stop its stream, change its baud rate and its
-/// settings, and start the requested stream.
+/// Progress of the start of a stream. The scanner already receives requests. The steps stop a running stream, change
+/// the scanner's baud rate and settings, and start the requested stream.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Start {
     pub(crate) step: Step,
@@ -74,13 +74,13 @@ impl Start {
         }
     }
 
-    /// Returns the start with a check as its step.
+    /// Returns the start with [`Step::Check`] as its step.
     pub(crate) fn with_check(self) -> Start {
         Start { step: Step::Check, ..self }
     }
 
-    /// Returns whether the scanner may have refused to change its rate because of its mode. This is the case if its
-    /// status is unknown and no stop request was sent.
+    /// Returns whether the scanner may have refused to change its rate because of its mode. This is the case if the
+    /// scanner's status is unknown and no stop request was sent.
     pub(crate) fn may_be_in_other_mode(&self) -> bool {
         !self.has_status && self.stops_left > MAX_STOPS
     }
@@ -114,9 +114,10 @@ impl Start {
     }
 }
 
-/// Requests to a scanner that already streams. It requests the type, because other angles may follow from it, and the
-/// measuring mode, which two replies report. A reply costs the scan that it interrupts. After some rounds, requests are
-/// rare. They continue only while the measuring mode is unknown, because the session cannot return scans without it.
+/// Requests to a scanner that already streams. The session requests the type, because a version S14 has other angles,
+/// and the measuring mode, which the status and the configuration contain. A reply costs the scan that it interrupts,
+/// so requests become rare after some rounds. The session then continues to send them only while the measuring mode is
+/// unknown, because it cannot return scans without the mode.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StreamQueries {
     /// Remaining requests of this round.
@@ -177,7 +178,8 @@ impl StreamQueries {
     }
 }
 
-/// Number of stop requests after the first one. A scanner that streams even after them does not receive requests.
+/// Maximum number of stop requests after the first one. A scanner that still streams after all these requests does not
+/// receive requests.
 pub(crate) const MAX_STOPS: u8 = 2;
 const STATUS_REQUESTS: &[Request] = &[Request::Type, Request::Status, Request::Configuration];
 /// Number of rounds of requests before the first pause.

@@ -1,8 +1,9 @@
 //! Health of a scanner: the status byte that ends every reply, the status report B1h, and the errors of B2h (Telegram
 //! listing 7-5, 7-18, 8 and 9).
 //!
-//! The status byte of the same scanner may be 10h on one day and 11h on the next. Only its single bits therefore have a
-//! meaning. The offsets in the status report were checked against a real scanner.
+//! The status byte of the same scanner may be 10h on one day and 11h on the next. Only the single bits of the status
+//! byte therefore have a meaning, and not the whole byte. The offsets in the status report were checked against a real
+//! scanner.
 
 use core::fmt;
 
@@ -52,7 +53,7 @@ impl fmt::Display for StatusByte {
 pub enum Severity {
     /// No error.
     Ok,
-    /// For information.
+    /// The report is only for information.
     Info,
     /// The scanner still works.
     Warning,
@@ -217,8 +218,8 @@ pub fn status_reply(address: u8, health: &SimulatedStatus, status: u8) -> Encode
         .finish()
 }
 
-/// Returns the divisor word of a baud rate. Its upper bit is set, and the other bits are n in the equation rate = 16
-/// MHz / (16 (n + 1)).
+/// Returns the divisor word of a baud rate. The upper bit of the word is set, and the other bits are n in the equation
+/// rate = 16 MHz / (16 (n + 1)).
 fn divisor_of(baud: Baud) -> u16 {
     match baud {
         Baud::B500000 => 0x8001,

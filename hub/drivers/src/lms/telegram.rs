@@ -194,9 +194,10 @@ pub fn crc(bytes: &[u8]) -> u16 {
 
 /// Incremental checksum of a telegram.
 ///
-/// The manual defines it byte by byte: `crc = crc * x + previous * x^8 + byte`, modulo x^16 + x^15 + x^2 + 1 over GF(2)
-/// (Telegram listing 4, checked against 54 printed telegrams). It also follows from a sum S, in which each byte is
-/// multiplied by x once for every byte after it: `crc = S + (S + last byte) * x^7`. Each step adds eight bytes to S.
+/// The manual defines the checksum byte by byte: `crc = crc * x + previous * x^8 + byte`, modulo x^16 + x^15 + x^2 + 1
+/// over GF(2) (Telegram listing 4, checked against 54 printed telegrams). The checksum also follows from a sum S, in
+/// which each byte is multiplied by x once for every byte after it: `crc = S + (S + last byte) * x^7`. Each step adds
+/// eight bytes to S.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Checksum {
     /// Number of bytes in the sum, a multiple of 8.
@@ -234,23 +235,24 @@ fn times_x(sum: u16, power: u32) -> u16 {
     product ^ residue(high)
 }
 
-/// Returns `sum * x^power` without the [`residue`] of the polynomial, and that polynomial h, the part of the product
-/// from x^16 on. `h * x^16` is `h * (x^2 + x)` plus the residue.
+/// Multiplies `sum` by `x^power`. Returns a partly reduced product, and h, which is the part of the unreduced product
+/// from x^16 on. The caller must add the [`residue`] of h to the product, because `h * x^16` is `h * (x^2 + x)` plus
+/// this residue.
 #[inline]
 fn shift(sum: u16, power: u32) -> (u16, u16) {
     let high = sum >> (16 - power);
     ((sum << power) ^ (high << 2) ^ (high << 1), high)
 }
 
-/// Returns x^15 + x + 1 if `polynomial` has an odd number of terms, otherwise 0. A product with x has the same residue,
-/// so the residues of many steps can be added at once.
+/// Returns x^15 + x + 1 if `polynomial` has an odd number of terms, otherwise 0. The product of a polynomial and x has
+/// the same residue as the polynomial, so the residues of many steps can be added at once.
 #[inline]
 fn residue(polynomial: u16) -> u16 {
     let odd = (polynomial.count_ones() as u16 & 1).wrapping_neg();
     odd & 0x8003
 }
 
-/// Returns the sum of eight bytes. The first byte is multiplied by x^7, and the last one by 1.
+/// Returns the sum of eight bytes. The first byte is multiplied by x^7, and the last byte by 1.
 #[inline]
 fn polynomial(bytes: [u8; 8]) -> u16 {
     const LOW: u64 = 0x00FF_00FF_00FF_00FF;

@@ -65,8 +65,8 @@ impl Variant {
         -500 * i32::from(self.angle_deg)
     }
 
-    /// Returns the time between telegrams of `telegram_len` bytes at `baud`. It is the smallest multiple of the scan
-    /// time that the line can carry (Telegram listing table 10-17).
+    /// Returns the time between telegrams of `telegram_len` bytes at `baud`. This time is the smallest multiple of the
+    /// scan time in which the line can carry a telegram (Telegram listing table 10-17).
     pub fn period(self, telegram_len: usize, baud: u32) -> Nanos {
         let scan = self.revolutions() * MIRROR_PERIOD;
         scan * scanhub_schema::line_time(telegram_len, baud).div_ceil(scan).max(1)
@@ -278,7 +278,8 @@ mod tests {
         assert_eq!(Variant::ALL.map(Variant::beams), [181, 361, 101, 201, 401]);
         assert_eq!(Variant::of_beams(361), Some(Variant::HALF));
         assert_eq!(Variant::new(180, 25), None);
-        // Table 10-17: one telegram of 361 beams in 29, 15, 8, 1 scans.
+        // Table 10-17: depending on the baud rate, the scanner sends a telegram of 361 beams in every 29, 15, 8 or 1
+        // scans.
         let scans = Baud::ALL.map(|b| Variant::HALF.period(732, b.rate()) / (2 * MIRROR_PERIOD));
         assert_eq!(scans, [29, 15, 8, 1]);
         assert_eq!(Variant::new(100, 25).unwrap().period(812, 9_600) / MIRROR_PERIOD, 64);
@@ -294,7 +295,7 @@ mod tests {
 
     #[test]
     fn codes_match_the_listing() {
-        // 13, 14 and 15 bits; the listing prints 16385 for 16375.
+        // The modes have 13, 14 and 15 range bits. The listing has a misprint: 16385 in place of 16375.
         for (mode, words) in [
             (Mode(0), [8191, 8190, 8189, 8187, 8186, 8183]),
             (Mode(4), [16383, 16382, 16381, 16379, 16378, 16375]),

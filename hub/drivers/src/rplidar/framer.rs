@@ -1,8 +1,8 @@
 //! Framer of RPLIDAR responses, packets and boot messages, in a stream that may lack bytes.
 //!
-//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like such a packet. The framer accepts
-//! these packets only after several consecutive packets with similar angles. It accepts each of them only if another
-//! packet follows it.
+//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like such a packet. The framer starts to
+//! accept such packets only when several consecutive packets have similar angles. Even then, it accepts a packet only
+//! if another packet follows.
 
 use crate::line::framing::{Format, FrameCheck};
 use crate::line::{Buffer, suspect};
@@ -20,8 +20,8 @@ pub(crate) enum ExpectedBytes {
     Responses,
     /// Packets of this format.
     Packets(PacketFormat),
-    /// Packets of any format. Express and dense packets look alike, and are treated as packets of the given format. It
-    /// is `None` if the format is unknown.
+    /// Packets of any format. Express and dense packets look alike, so the framer treats both as packets of the given
+    /// format. The given format is `None` if it is unknown.
     AnyPackets(Option<PacketFormat>),
 }
 
@@ -41,7 +41,7 @@ pub(crate) enum FramerEvent {
     },
 }
 
-/// Range of bytes in the framer's buffer. It is valid until the next bytes are committed.
+/// Range of bytes in the framer's buffer. The range is valid until the next bytes are committed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Span {
     at: usize,
@@ -50,7 +50,7 @@ pub(crate) struct Span {
     pub(crate) packets: usize,
     /// Offset of the first byte, counted from the first committed byte.
     pub(crate) offset: u64,
-    /// Number of discarded bytes between the previous packet and this one.
+    /// Number of discarded bytes between the previous packet and the first byte of this range.
     pub(crate) skipped: u32,
     /// Reasons why the first packet is suspect: bits of [`suspect`]; 0 means clean.
     pub(crate) reasons: u8,
@@ -61,18 +61,18 @@ pub(crate) struct Span {
 pub(crate) struct Framer {
     pub(crate) buffer: Buffer<CAPACITY>,
     expect: ExpectedBytes,
-    /// Whether the next packet must start where the last one ended.
+    /// Whether the next packet must start where the last packet ended.
     is_locked: bool,
     /// Whether a packet has arrived since the last descriptor of a stream.
     has_packet: bool,
     /// Number of bytes discarded since the last packet.
     skipped: u32,
-    /// Number of consecutive printable bytes. `last_text` contains the last of them, and `is_named` is whether they
-    /// contain [`BOOT_MESSAGE_NAME`].
+    /// Number of consecutive printable bytes. `last_text` contains the last of these bytes, and `is_named` is whether
+    /// the bytes contain [`BOOT_MESSAGE_NAME`].
     text_len: usize,
     last_text: [u8; BOOT_MESSAGE_NAME.len()],
     is_named: bool,
-    /// Whether packets that look alike have arrived whose format is unknown.
+    /// Whether packets have arrived that may be express or dense packets, so that their format is unknown.
     is_ambiguous: bool,
 }
 
@@ -92,7 +92,7 @@ impl Format for PacketFormat {
     }
 }
 
-/// Next step of the framer with the first open bytes.
+/// Action of the framer for the first open bytes.
 enum FramerStep {
     Take(usize),
     Discard,
@@ -189,7 +189,7 @@ impl Framer {
         if let ExpectedBytes::Packets(kind) = self.expect { Some(kind) } else { None }
     }
 
-    /// Returns whether packets of an unknown format have arrived.
+    /// Returns whether packets have arrived that may be express or dense packets, so that their format is unknown.
     pub(crate) fn is_ambiguous(&self) -> bool {
         self.is_ambiguous
     }
@@ -200,7 +200,8 @@ impl Framer {
     }
 
     /// Returns whether the open bytes follow a packet and may be the next packet. The framer then treats them as a
-    /// packet even if they look like a response. Before the first packet, a scanner may respond to a repeated request.
+    /// packet even if they look like a response. Returns `false` before the first packet of a stream, because a scanner
+    /// may then respond to a repeated request.
     fn is_at_packet(&self) -> bool {
         let may_be = |kind: PacketFormat| match self.buffer.open_bytes().get(..kind.byte_len()) {
             Some(packet) => kind.is_valid(packet),
@@ -294,7 +295,7 @@ impl Framer {
         Span { at: self.buffer.take(len, packets), len, packets, offset, skipped, reasons }
     }
 
-    /// Discards the first open byte. Returns whether it completes a boot message.
+    /// Discards the first open byte. Returns whether this byte completes a boot message.
     fn discard(&mut self) -> bool {
         let byte = self.buffer.open_bytes().first().copied().unwrap_or_default();
         let is_text = matches!(byte, b' '..=b'~' | b'\r' | b'\n');
@@ -331,14 +332,14 @@ fn count_run(open: &[u8], max_packets: usize) -> (usize, bool) {
     (points.len().min(max_packets), is_open)
 }
 
-/// Capacity of the buffer, in bytes. It holds the bytes that a tty can buffer while the hub does not read, and two
-/// packets.
+/// Capacity of the buffer, in bytes. The buffer has room for the bytes that a tty can buffer while the hub does not
+/// read, and for two packets.
 const CAPACITY: usize = 4_096 + 2 * PacketFormat::MAX_LEN;
-/// Time without a byte after which no byte of a packet can still arrive. In the slowest stream, an adapter forwards a
-/// packet every 6 ms.
+/// Time without a byte after which the rest of a packet can no longer arrive. In the slowest stream, an adapter
+/// forwards a packet every 6 ms.
 const HOLD_TIME: Nanos = 10 * MILLIS;
-/// Minimum number of consecutive packets of one point. A wrong position looks like this number of packets only once in
-/// millions.
+/// Minimum number of consecutive packets of one point before the framer accepts such packets. A wrong position looks
+/// like this number of packets only once in millions.
 const MIN_RUN: usize = 6;
 /// Maximum angle between consecutive points in degrees, even if some points are missing between them.
 const MAX_STEP_DEG: f32 = 30.0;

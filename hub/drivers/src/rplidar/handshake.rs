@@ -1,10 +1,11 @@
 //! Steps from an open port to a stream: the search for the baud rate of the line, and the handshake with the scanner.
 //!
-//! [`RateSearch`] tries each baud rate. A scanner that has lost power soon restarts at the rate of its last stream and
-//! sends its boot message at this rate. The search therefore stores the rate of the last stream.
+//! [`RateSearch`] tries each baud rate. A scanner that loses power usually restarts soon, and then sends its boot
+//! message at the rate of its last stream. The search therefore stores the rate of the last stream.
 //!
 //! [`Handshake`] contains the queries in their order, the data that the scanner has reported, and the scan mode that
-//! follows from these data. It decides the next step. The session carries out the step and waits for responses.
+//! follows from these data. The handshake decides the next step. The session carries out the step and waits for
+//! responses.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -139,7 +140,7 @@ impl Handshake {
         }
     }
 
-    /// Returns the model that the scanner has reported, or the configured one.
+    /// Returns the model that the scanner has reported. Before its report, returns the configured model.
     pub(crate) fn model(&self) -> Option<Model> {
         self.info.and_then(|info| info.model()).or(Model::of(&self.settings))
     }
@@ -153,7 +154,8 @@ impl Handshake {
     }
 
     /// Returns the format of packets that may be express or dense packets and whose descriptor is missing. The
-    /// configured mode determines the format. If no mode is configured, it is the format of the model's fastest mode.
+    /// configured mode determines the format. If no mode is configured, the result is the format of the model's fastest
+    /// mode.
     pub(crate) fn ambiguous_format(&self) -> Option<PacketFormat> {
         match (Mode::of(&self.settings), self.model()) {
             (Some(Mode::DenseBoost), _) => Some(PacketFormat::Dense),
@@ -247,7 +249,7 @@ impl Handshake {
         }
     }
 
-    /// Returns the step after `query`, which is about the list of modes.
+    /// Returns the step after `query`, which is one of the queries about the list of modes.
     fn after(&mut self, query: Query, baud: u32) -> NextStep {
         let next = match query {
             Query::SampleTime(mode) => Query::Kind(mode),
@@ -306,8 +308,8 @@ impl Handshake {
         NextStep::Scan(mode)
     }
 
-    /// Returns the configured scan mode. If none is configured, or the scanner or the line does not support it, returns
-    /// the fastest mode.
+    /// Returns the configured scan mode. If no mode is configured, or if the scanner or the line does not support the
+    /// configured mode, returns the fastest mode.
     fn choose_mode(&mut self, baud: u32) -> ScanMode {
         let baud = (!self.settings.fixed_rate).then_some(baud);
         let requested = Mode::of(&self.settings);
@@ -398,7 +400,7 @@ impl ScanModes {
     }
 
     /// Returns the two modes that every scanner has, for a scanner that does not list its modes. The times per point
-    /// are in microseconds. A time of 0 means that it is unknown.
+    /// are in microseconds. A value of 0 means that the time is unknown.
     fn without_list(standard_us: u16, express_us: u16) -> ScanModes {
         let mode_of = |us: u16, kind, mode| ScanMode {
             id: 0,
@@ -441,8 +443,8 @@ impl ScanModes {
         })
     }
 
-    /// Returns the time per point for packets of format `kind`, in microseconds. It is the time of `mode` if this mode
-    /// has packets of this format. Otherwise, it is the time of the fastest mode with packets of this format.
+    /// Returns the time per point for packets of format `kind`, in microseconds. If `mode` has packets of this format,
+    /// returns the time of `mode`. Otherwise, returns the time of the fastest mode with packets of this format.
     pub(crate) fn sample_us(&self, kind: PacketFormat, mode: Option<Mode>) -> Option<f32> {
         let of_kind = || self.of_kind(kind);
         let in_mode = of_kind().filter(|(named, _)| mode.is_some() && *named == mode).map(|(_, us)| us);
@@ -457,7 +459,7 @@ impl ScanModes {
             .min_by(|a, b| (a - us).abs().total_cmp(&(b - us).abs()))
     }
 
-    /// Returns the mode with packets of format `kind`, if there is only one and scanhub supports it.
+    /// Returns the mode with packets of format `kind`, if only one mode has this format and scanhub supports this mode.
     fn single_mode(&self, kind: PacketFormat) -> Option<Mode> {
         let mut modes = self.list[..self.count].iter().filter(|mode| mode.kind == Some(kind));
         let single = modes.next().filter(|_| modes.next().is_none());
@@ -504,12 +506,14 @@ fn sample_us(data: &[u8]) -> f32 {
     number(data) as f32 / 256.0
 }
 
-/// Speed of the motor that the session requests, in revolutions per minute. It is the manufacturer's default for an S1.
+/// Speed of the motor that the session requests, in revolutions per minute. This speed is the manufacturer's default
+/// for an S1.
 const MOTOR_SPEED_RPM: u16 = 600;
-/// Duty cycle of the motor that the session requests, out of 1,023. It is the manufacturer's default for an A2.
+/// Duty cycle of the motor that the session requests, out of 1,023. This duty cycle is the manufacturer's default for
+/// an A2.
 const MOTOR_PWM: u16 = 660;
 
-/// Baud rate of the line, and the state of the search for it.
+/// Baud rate of the line, and the state of the search for this rate.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RateSearch {
     pub(crate) baud: u32,
@@ -564,9 +568,10 @@ impl RateSearch {
         since
     }
 
-    /// Returns whether the search has just started. If bytes still arrive after the stop request, the scanner uses
-    /// another baud rate, because it would have stopped at this one. The session then does not send a query. Later, it
-    /// sends queries even if bytes arrive, because the line may never be quiet.
+    /// Returns whether the search has just started. At the start of a search, bytes that arrive after the stop request
+    /// show that the scanner uses another baud rate, because the request would have stopped the scanner at the current
+    /// rate. The session then tries the next rate without a query. Later, it sends queries even if bytes arrive,
+    /// because the line may never be quiet.
     pub(crate) fn is_quick(&self, now: Nanos) -> bool {
         self.no_response_since.is_none_or(|(since, _)| now < since + QUICK_SEARCH_TIME)
             && self.next_rate().is_some()

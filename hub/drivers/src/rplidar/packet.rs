@@ -20,8 +20,8 @@ pub enum PacketFormat {
 /// Point of a packet.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PacketPoint {
-    /// Angle in degrees by which the point lies before its evenly spaced angle. Negative if the point lies after this
-    /// angle.
+    /// Angle in degrees by which the point lies before its evenly spaced angle, which is the angle that it would have
+    /// if all points were evenly spaced. Negative if the point lies after this angle.
     pub before: f32,
     /// Range in millimeters; 0 means no return.
     pub range: u16,
@@ -111,8 +111,7 @@ impl PacketFormat {
         }
     }
 
-    /// Returns whether `packet` is valid. Checks its first bytes and its angle. Also checks its checksum if the format
-    /// has one.
+    /// Returns whether `packet` is valid. Checks the first bytes, the angle and, if the format has one, the checksum.
     pub(crate) fn is_valid(self, packet: &[u8]) -> bool {
         let is_sum_valid = || {
             let sum = packet[2..].iter().fold(0, |sum, byte| sum ^ byte);
@@ -167,7 +166,7 @@ fn ultra(packet: &[u8], next: &[u8], i: usize) -> PacketPoint {
     let this_triple = triple(packet, n);
     let next_triple = if n + 1 < cabins { triple(packet, n + 1) } else { triple(next, 0) };
     let ((major, level), (next_major, next_level)) = (major(this_triple), major(next_triple));
-    // Two signed numbers of ten bits.
+    // A triple also contains two signed numbers of ten bits.
     let (first, second) = ((this_triple << 10) as i32 >> 22, this_triple as i32 >> 22);
     let differs = |difference: i32, base: i32, level: u32| {
         if matches!(difference, -512 | 511) { 0 } else { base + (difference << level) }
@@ -231,7 +230,7 @@ mod tests {
 
     #[test]
     fn decodes_standard_points() {
-        // Quality 15, 90 degrees, 2 m.
+        // This point has quality 15, angle 90 degrees and range 2 m.
         let node = [0x3D, 0x01, 0x2D, 0x40, 0x1F];
         assert!(PacketFormat::Standard.is_valid(&node));
         assert_eq!(PacketFormat::Standard.start_angle(&node), 90.0);
@@ -248,7 +247,7 @@ mod tests {
 
     #[test]
     fn express_points_have_angle_corrections() {
-        // 1,234 mm with 37/8 degrees, and 40 mm with 26/8 degrees.
+        // The first point has 1,234 mm and 37/8 degrees. The second point has 40 mm and 26/8 degrees.
         let [a, b] = [1_234 << 2 | 2u16, 40 << 2 | 1].map(u16::to_le_bytes);
         let bytes = packet(PacketFormat::Express, &[0x80, 0x16, a[0], a[1], b[0], b[1], 0xA5]);
         assert!(PacketFormat::Express.is_valid(&bytes[..84]));
@@ -284,7 +283,8 @@ mod tests {
         let three = |major: u32, first: i32, second: i32| {
             (major | (first as u32 & 0x3FF) << 12 | (second as u32 & 0x3FF) << 22).to_le_bytes()
         };
-        // 688 mm in steps of 2, 2,128 mm in steps of 4, no return, and 2,128 mm.
+        // The groups begin with these ranges: 688 mm with differences in steps of 2 mm, 2,128 mm with differences in
+        // steps of 4 mm, no return, and 2,128 mm.
         let threes = [three(600, 10, -3), three(1_300, -512, 511), three(0, 5, -1), three(1_300, 0, 0)];
         let mut body = [0; 18];
         body[2..].copy_from_slice(threes.as_flattened());
@@ -302,9 +302,9 @@ mod tests {
     #[test]
     fn ultra_angles_depend_on_the_range() {
         assert_eq!((before(0), before(49)), (7.5, 7.5));
-        // k is 491: 0.479492 and 0.018374 radians.
+        // k is 491, so the two terms of the angle are 0.479492 and 0.018374 radians.
         assert!((before(50) + 20.525_6).abs() < 1e-3, "{}", before(50));
-        // k is 24: 0.0234375 and 0.000002 radians.
+        // k is 24, so the two terms of the angle are 0.0234375 and 0.000002 radians.
         assert!((before(1_000) - 6.657).abs() < 1e-3, "{}", before(1_000));
         assert_eq!(before(25_000), 8.0);
         let kinds = PacketFormat::ALL.map(|kind| (kind.max_before(), kind.max_after()));

@@ -1,6 +1,6 @@
 //! Requests to a scanner, the descriptors of its responses, and the identity and health that it reports, according to
-//! the manufacturer's protocol description. Only this module can create requests. None of them changes a setting that
-//! the scanner keeps without power.
+//! the manufacturer's protocol description. Only this module can create requests. None of the requests changes a
+//! setting that the scanner keeps without power.
 
 use core::fmt;
 
@@ -95,7 +95,7 @@ impl RequestQueue {
         }
     }
 
-    /// Returns the bytes to send. The scanner does not require gaps between them.
+    /// Returns the bytes to send. The scanner does not require gaps between these bytes.
     pub(crate) fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
@@ -118,7 +118,7 @@ pub(crate) mod key {
 /// Descriptor at the start of a response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ResponseDescriptor {
-    /// A single response of this type follows. It has this number of bytes.
+    /// A single response of this type follows. The response has this number of bytes.
     Reply(ResponseType, usize),
     /// A stream of packets of this format follows, until the stop request.
     Stream(PacketFormat),
@@ -127,15 +127,15 @@ pub(crate) enum ResponseDescriptor {
 /// Type of a response, by the request to which it responds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ResponseType {
-    /// [`Request::INFO`].
+    /// Response to [`Request::INFO`].
     Info,
-    /// [`Request::HEALTH`].
+    /// Response to [`Request::HEALTH`].
     Health,
-    /// [`Request::SAMPLE_TIMES`].
+    /// Response to [`Request::SAMPLE_TIMES`].
     SampleTimes,
-    /// [`Request::configuration`].
+    /// Response to [`Request::configuration`].
     Configuration,
-    /// [`Request::accessory_board`].
+    /// Response to [`Request::accessory_board`].
     Board,
 }
 
@@ -156,7 +156,8 @@ impl ResponseDescriptor {
     /// Length of a descriptor, in bytes.
     pub(crate) const LEN: usize = 7;
 
-    /// Decodes the descriptor at the start of `bytes`. Returns `None` if there is no descriptor, or it is incomplete.
+    /// Decodes the descriptor at the start of `bytes`. Returns `None` if there is no descriptor, or if the descriptor
+    /// is incomplete.
     pub(crate) fn parse(bytes: &[u8]) -> Option<ResponseDescriptor> {
         let &[START_BYTE, 0x5A, a, b, c, d, response] = bytes.first_chunk()? else { return None };
         let word = u32::from_le_bytes([a, b, c, d]);
@@ -197,7 +198,7 @@ impl ResponseDescriptor {
 }
 
 const START_BYTE: u8 = 0xA5;
-/// Maximum length of a response, in bytes. The longest name of a mode fits into it.
+/// Maximum length of a response, in bytes. The longest name of a mode fits into a response of this length.
 const MAX_RESPONSE_LEN: usize = 64;
 
 /// Identity of a scanner, from its reply to `A5 50`.
@@ -217,15 +218,15 @@ impl Info {
     /// Length of the reply, in bytes.
     pub(crate) const LEN: usize = 20;
 
-    /// Decodes a reply. Returns `None` if it is too short.
+    /// Decodes a reply. Returns `None` if `reply` is too short.
     pub(crate) fn parse(reply: &[u8]) -> Option<Info> {
         let &[id, minor, major, hardware, ref serial @ ..] = reply.first_chunk::<{ Info::LEN }>()?;
         Some(Info { id, firmware: (major, minor), hardware, serial: *serial })
     }
 
     /// Returns the identity of a scanner from a status whose type is `text`, such as `S2 denseboost 1.02`. A status
-    /// contains neither the hardware revision nor the serial number, so they are 0. Returns `None` if neither `model`
-    /// nor `text` gives the number of the model.
+    /// contains neither the hardware revision nor the serial number, so these values are 0 in the result. Returns
+    /// `None` if neither `model` nor `text` gives the number of the model.
     pub(crate) fn of_status(model: Option<Model>, text: &str) -> Option<Info> {
         let words: Vec<&str> = text.split_whitespace().collect();
         let number = |word: &&str| u8::from_str_radix(word.strip_prefix("0x")?, 16).ok();
@@ -274,7 +275,7 @@ pub enum Health {
 }
 
 impl Health {
-    /// Decodes a reply. Returns `None` if it is too short.
+    /// Decodes a reply. Returns `None` if `reply` is too short.
     pub(crate) fn parse(reply: &[u8]) -> Option<Health> {
         let &[status, low, high] = reply.first_chunk()?;
         let code = u16::from_le_bytes([low, high]);

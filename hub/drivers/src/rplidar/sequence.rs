@@ -1,4 +1,5 @@
-//! Position of each packet in its stream: the next packet, the first one after a gap, or an outlier.
+//! Position of each packet in its stream: the first packet of a sequence, the next packet, the first packet after a
+//! gap, or an outlier.
 //!
 //! Packets have no counter. A head rotates at a constant speed, so the angle from one packet to the next is known. The
 //! number of missing packets follows from the angle of the gap. The number of missing revolutions follows from the
@@ -9,10 +10,10 @@
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PacketSequencer {
     last: Option<LastPacket>,
-    /// Angle of the last outlier, in degrees. The next packet may show that it belongs to the stream.
+    /// Angle of the last outlier, in degrees. If the next packets continue from this angle, a new sequence starts.
     outlier: Option<f32>,
     outliers: u32,
-    /// Angle from one packet to the next in degrees, and the number of packets from which it was measured.
+    /// Angle from one packet to the next in degrees, and the number of packets from which this angle was measured.
     advance: f64,
     learned_packets: u32,
     /// For packets of one point: the angle at which the measurement of a revolution started, and the number of packets
@@ -37,22 +38,22 @@ struct LastPacket {
 pub(crate) struct PacketPosition {
     /// Relation to the last packet.
     pub(crate) step: Step,
-    /// Angle of the first point, in degrees clockwise over all revolutions.
+    /// Angle of the first point, in degrees clockwise, cumulative over all revolutions.
     pub(crate) angle: f64,
     /// Time of the first point in the scanner's clock, in nanoseconds.
     pub(crate) time: f64,
 }
 
-/// Relation of a packet to the previous one.
+/// Relation of a packet to the previous packet.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Step {
     /// The packet starts a new sequence, with a new clock.
     First,
-    /// The packet follows the previous one directly.
+    /// The packet follows the previous packet directly.
     Next,
-    /// Packets are missing before this packet, or may be missing. The previous packet was at the angle `from`.
+    /// Packets are missing before this packet, or may be missing.
     Gap {
-        /// Angle in degrees, as in [`PacketPosition::angle`].
+        /// Angle of the previous packet in degrees, as in [`PacketPosition::angle`].
         from: f64,
         /// Duration of the gap in nanoseconds, according to the number of counted packets.
         ns: f64,
@@ -94,7 +95,7 @@ impl PacketSequencer {
         }
     }
 
-    /// Ends the sequence. The next packet starts a new one.
+    /// Ends the sequence. The next packet starts a new sequence.
     pub(crate) fn end(&mut self) {
         (self.last, self.outlier, self.outliers, self.learned_packets) = (None, None, 0, 0);
     }
@@ -116,8 +117,8 @@ impl PacketSequencer {
     }
 
     /// Returns the position of a packet of several points. `delay` is called with the time of the packet's first point,
-    /// and with whether there is a gap before the packet. It returns by how many nanoseconds the packet arrived later
-    /// than usual.
+    /// and with whether there is a gap before the packet. `delay` returns by how many nanoseconds the packet arrived
+    /// later than usual.
     pub(crate) fn locate(
         &mut self,
         packet: ReceivedPacket,
@@ -164,7 +165,8 @@ impl PacketSequencer {
         self.locate_next(last, packet, angle, packets, Step::Gap { from: last.angle, ns })
     }
 
-    /// Returns the position of a packet of one point. Its angle may be smaller than the angle of an earlier packet.
+    /// Returns the position of a packet of one point. The angle of the packet may be smaller than the angle of an
+    /// earlier packet.
     pub(crate) fn locate_point(
         &mut self,
         packet: ReceivedPacket,
@@ -317,8 +319,8 @@ impl RotationSpeed {
         f64::from((late.max(0.0) / self.time(360.0) + 0.5) as u32)
     }
 
-    /// Returns whether a packet arrived earlier than the scanner can have measured it. It is `angle` degrees after the
-    /// previous packet. The tolerance covers the drift of the clocks.
+    /// Returns whether a packet arrived earlier than the scanner can have measured it. The packet is `angle` degrees
+    /// after the previous packet. The tolerance covers the drift of the clocks.
     fn is_early(self, late: f64, angle: f64) -> bool {
         late < -(MAX_EARLY_NS + MAX_DRIFT * self.time(angle))
     }
@@ -329,8 +331,8 @@ impl RotationSpeed {
     }
 }
 
-/// Number of packets that must agree before the angle between them counts. Also the number of consecutive outliers that
-/// start a new sequence.
+/// Number of packets that must agree before the angle from one packet to the next counts as known. It is also the
+/// number of consecutive outliers that start a new sequence.
 const LEARNING_PACKETS: u32 = 3;
 /// Number of packets that must agree before missing packets count as lost. Before that, the head may still be spinning
 /// up.
@@ -340,7 +342,7 @@ const STEADY_PACKETS: u32 = 12;
 const MAX_PACKET_DEG: f64 = 100.0;
 /// Maximum angle from one packet to the next at which the head counts as stopped, in degrees.
 const MIN_PACKET_DEG: f64 = 0.02;
-/// Start of the scanner's clock in nanoseconds. It is large enough that no time is negative.
+/// Start of the scanner's clock in nanoseconds. This start is so large that no time is negative.
 const CLOCK_START_NS: f64 = 1e10;
 /// Maximum angle by which a point may precede the previous point, in degrees. `MAX_FORWARD_DEG` is the maximum angle by
 /// which a point may follow the previous point without a gap.
@@ -352,7 +354,7 @@ const MAX_EARLY_NS: f64 = 3e6;
 const MAX_DRIFT: f64 = 0.02;
 /// Length of a packet of one point, in bytes.
 const POINT_LEN: u32 = 5;
-/// Maximum number of single points that may be missing without a gap.
+/// Maximum number of single points that may be missing before the sequencer reports a gap.
 const MAX_MISSING_POINTS: u32 = 30;
 
 #[cfg(test)]
@@ -404,7 +406,8 @@ mod tests {
         (0..3_000).for_each(|n| {
             place(n, 0);
         });
-        // 12 bytes after each point, then 4,693 bytes at once, and later the rest of ten lost points.
+        // The skipped bytes are 12 bytes after each point, then 4,693 bytes at once, and later the rest of ten lost
+        // points.
         let steps: [Step; 49] = core::array::from_fn(|i| place(3_001 + i as u32, 12).step);
         assert!(matches!(steps, [Step::Next, .., Step::Gap { .. }]), "that many bytes may have been points");
         place(3_051, 4_693);

@@ -1,8 +1,9 @@
 //! Session with an RPLIDAR. It requests the identity of the scanner and starts a scan mode. It returns packets as they
 //! arrive, and complete revolutions.
 //!
-//! The session stops a stream that another program has left running, and never continues it. Express and dense packets
-//! look alike, and a scanner does not respond to requests while it streams.
+//! The session stops a stream that another program has left running, and never continues it. The session could not find
+//! out the mode of such a stream, because express and dense packets look alike, and a scanner does not respond to
+//! requests while it streams.
 
 use core::fmt;
 
@@ -55,13 +56,14 @@ enum Phase {
     Draining { attempts: u8, until: Nanos, at_most: Nanos },
     /// The session waits for the response to `query` until `until`.
     Querying { query: Query, attempts: u8, until: Nanos },
-    /// The scanner is restarting.
+    /// The scanner is restarting. The session starts again at `until`.
     Booting { until: Nanos },
-    /// The scanner reports an error. The session requests its health again at `until`.
+    /// The scanner reports an error. The session requests the scanner's health again at `until`.
     Unhealthy { until: Nanos },
     /// Packets are arriving.
     Streaming(Watchdog),
-    /// A user has paused the session. If `is_idle`, the session has paused because the sensor has no subscribers.
+    /// The session is paused. If `is_idle`, the reason is that the sensor has no subscribers. Otherwise, a user has
+    /// paused the session.
     Paused { is_idle: bool },
 }
 
@@ -160,7 +162,7 @@ impl RplidarSession {
         match self.handshake.motor_request(is_on) {
             _ if self.settings.listen_only => {}
             Some(request) => self.requests.push(&request),
-            // Every session clears DTR at its start.
+            // Every session clears DTR at its start, so the motor already runs.
             None if is_on => {}
             None => self.change_dtr = Some(true),
         }
@@ -172,7 +174,7 @@ impl RplidarSession {
         if self.settings.listen_only {
             return;
         }
-        // The framer would take the start of the next response for the rest of an incomplete response.
+        // Otherwise, the framer would take the start of the next response for the rest of an incomplete response.
         self.framer.clear();
         self.requests.push(&query.request());
         self.phase = Phase::Querying { query, attempts, until: self.now + self.response_timeout() };
@@ -204,8 +206,8 @@ impl RplidarSession {
 
     /// Handles a missing response to `query`.
     fn on_no_response(&mut self, query: Query, attempts: u8) {
-        // Bytes arrived, but no valid response. The response may have been damaged, so this does not mean that the
-        // scanner does not support the request.
+        // Bytes arrived, but no valid response. The response may have been damaged, so the scanner may support the
+        // request.
         let is_damaged =
             self.reads.last_byte() + self.response_timeout() > self.now && attempts < MAX_ATTEMPTS;
         match query {
@@ -309,8 +311,8 @@ impl RplidarSession {
     /// Handles the descriptor of a stream.
     fn on_stream_begin(&mut self) {
         match self.phase {
-            // The descriptor announces another stream, whose mode is unknown. It comes from another program or another
-            // scanner.
+            // The descriptor announces another stream, whose mode is unknown. Another program has started this stream,
+            // or another scanner sends it.
             Phase::Streaming(_) if !self.settings.listen_only && !self.is_repeated_announcement() => {
                 self.counters.note_resync();
                 self.begin(State::Starting);
@@ -682,7 +684,8 @@ impl line::ScannerSession for RplidarSession {
     }
 
     fn device_info(&self) -> Option<DeviceInfo> {
-        // The session knows the health, unless the scanner does not respond to this request.
+        // After these phases, the session has the health, unless the scanner did not respond to the request for its
+        // health.
         let is_unconfirmed = matches!(
             self.phase,
             Phase::Draining { .. } | Phase::Querying { query: Query::Info | Query::Health, .. }
@@ -791,7 +794,7 @@ const BOOT_MESSAGE_LEN: u32 = 64;
 const SETTLE_TIME: Nanos = 10 * MILLIS;
 /// Interval between requests for the health of a scanner that reports an error.
 const HEALTH_RETRY_INTERVAL: Nanos = 2_000 * MILLIS;
-/// Maximum time until a head has reached its speed. Some heads measure only then.
+/// Maximum time until a head has reached its speed. Some scanners do not measure before this time.
 const SPIN_UP_TIME: Nanos = 3_000 * MILLIS;
 /// Time without subscribers after which the motor stops. A program that restarts subscribes again in less time.
 const IDLE_TIME: Nanos = 5_000 * MILLIS;

@@ -93,8 +93,8 @@ impl Stream {
         ((1e7 / packet_ns) as usize).clamp(1, (MAX_SAMPLE_LEN / kind.byte_len()).min(MAX_PACKETS))
     }
 
-    /// Measures the time per point with the packets of `span`, unless the scanner has reported it. Returns whether the
-    /// time is known.
+    /// Measures the time per point with the packets of `span`, unless the scanner has reported this time. Returns
+    /// whether the time is known.
     pub(crate) fn measure_point_time(
         &mut self,
         kind: PacketFormat,
@@ -120,7 +120,7 @@ impl Stream {
     /// Locates the packets of `span` in the sequence, and keeps them for [`advance`](Self::advance). If there is a gap
     /// within the span, returns the packets after the gap to the framer and shortens `span`, so that these packets form
     /// the next span. Returns the stamps of the first and the last packet. A packet's stamp is the stamp of its last
-    /// point, if this is known.
+    /// point. Returns `None` if the time per point or one of the two stamps is unknown.
     pub(crate) fn locate(
         &mut self,
         kind: PacketFormat,
@@ -217,10 +217,11 @@ impl Stream {
         self.revolutions.begin(beams);
     }
 
-    /// Returns the number of beams of a `model` that takes `point_ns` nanoseconds per point. It is the number for the
-    /// configured mode. If none is configured, it normally is the number for the model's fastest mode. For a recording,
-    /// and for a scanner that a search has found without a configured model, it is the number for the mode that the
-    /// scanner reports. An A1 with old firmware measures half as many points as other scanners of this model.
+    /// Returns the number of beams of a `model` that takes `point_ns` nanoseconds per point. If a mode is configured,
+    /// this is the number for the configured mode. Otherwise, it normally is the number for the model's fastest mode.
+    /// It is the number for the mode that the scanner reports if the bytes come from a recording, or if a search has
+    /// found the scanner and no model is configured. The reason is that an A1 with old firmware measures half as many
+    /// points as other scanners of this model.
     fn beams_of(&self, model: Model, kind: PacketFormat, point_ns: f64, handshake: &Handshake) -> usize {
         let Settings { model: configured, mode, is_found, listen_only, .. } = self.settings;
         let point_us = (point_ns / 1e3) as f32;
@@ -232,9 +233,9 @@ impl Stream {
         mode_us.map_or(model.beams(), |us| model.beams_in_mode(1e6 / us))
     }
 
-    /// Returns the time per point that a scanner of this `model` must have reported, in microseconds. It is the
-    /// measured time, unless the number of `beams` of its scans shows that the reported time was different. A real A1
-    /// takes 0.7 % longer than it reports.
+    /// Returns the time per point that a scanner of this `model` must have reported, in microseconds. This is the
+    /// measured time, unless the number of `beams` of the scanner's scans shows that the reported time was different. A
+    /// real A1 takes 0.7 % longer than it reports.
     pub(crate) fn reported_us(&self, model: Option<Model>, beams: Option<usize>) -> Option<f64> {
         let measured = self.point_time.ns? / 1e3;
         let of_scans = model.zip(beams).and_then(|(model, beams)| {
@@ -308,10 +309,10 @@ impl Measurement {
 }
 
 impl PointTime {
-    /// Continues the measurement with the packets of `span`, whose last packet arrived at `at`. The result is the
-    /// nearest of the reported times for modes with packets of format `kind`. If there is none, it is the measured
-    /// time, and the measurement is repeated with twice the duration. Returns the relative change of a time that was
-    /// known before.
+    /// Continues the measurement with the packets of `span`, whose last packet arrived at `at`. A complete measurement
+    /// stores a new time per point: the reported time that is nearest to the measured time, among the modes with
+    /// packets of format `kind`. If the scanner has reported no such time, it stores the measured time. The next
+    /// measurement takes twice as long. Returns the relative change of a time that was known before.
     fn measure_span(
         &mut self,
         kind: PacketFormat,
@@ -377,7 +378,7 @@ struct CurrentSpan {
     span: Span,
     /// Index of the first packet whose points are not completely processed.
     next_packet: usize,
-    /// Whether the points of this packet were added.
+    /// Whether the points of the packet at this index were added.
     is_added: bool,
 }
 
@@ -438,8 +439,8 @@ impl Revolutions {
         None
     }
 
-    /// Adds the points that are known once the packet `bytes` has arrived: the point of this packet, or the points of
-    /// the previous packet.
+    /// Adds the points that are known once the packet `bytes` has arrived. For a packet of one point, this is the point
+    /// of the packet. Otherwise, these are the points of the previous packet.
     fn add_packet(
         &mut self,
         kind: PacketFormat,
@@ -504,11 +505,12 @@ impl Revolutions {
     }
 }
 
-/// Duration of the first measurement of the time per point. The assembly of revolutions starts after it.
+/// Duration of the first measurement of the time per point. The assembly of revolutions starts after this measurement.
 const FIRST_MEASUREMENT_TIME: Nanos = 250 * MILLIS;
 /// Maximum change of the head's speed during a gap, as a ratio.
 const SPEED_VARIATION: f64 = 0.005;
-/// Maximum delay in nanoseconds of packets that arrive together.
+/// Additional time in nanoseconds after which packets count as late. They may be delayed by this time because they
+/// arrive together with later packets.
 const LATE_TOLERANCE_NS: f64 = 15e6;
 /// Maximum deviation of the time per point from the reported time, as a ratio.
 const MAX_POINT_TIME_DEVIATION: f64 = 0.02;

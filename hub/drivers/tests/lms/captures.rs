@@ -1,6 +1,6 @@
 //! Tests of the framer on recordings of real scanners. The framer must find every telegram at its position, bit by bit,
-//! and nothing else. It must have a reason for every rejected start byte. The recordings are not part of this project.
-//! Without them, the tests pass without a check.
+//! and nothing else. The framer must have a reason for every rejected start byte. The recordings are not part of this
+//! project. Without them, the tests pass without a check.
 
 #[path = "../../../../tests/testkit/skip.rs"]
 mod skip;
@@ -107,8 +107,7 @@ impl FramedCapture {
         tally
     }
 
-    /// Checks each start byte outside of telegrams. It was rejected for exactly one reason, or it began an aborted
-    /// scan.
+    /// Checks that each start byte outside of telegrams was rejected for exactly one reason, or began an aborted scan.
     fn assert_every_start_byte_has_a_reason(&self, tally: &FramerCounters) {
         let inside = |at: usize| self.found.iter().any(|&(start, len)| (start..start + len).contains(&at));
         let starts = (0..self.bytes.len()).filter(|&at| self.bytes[at] == STX && !inside(at)).count();

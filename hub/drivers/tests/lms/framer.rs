@@ -136,7 +136,7 @@ fn frame_is_held_until_the_inner_header_fails() {
     let mut late = Vec::new();
     drain(&mut framer, &mut late);
     assert_eq!(late, [(spelled.clone(), suspect::HEADER_INSIDE)]);
-    // Alternatively, the next telegram arrives completely, and the false telegram would overlap it.
+    // If the next telegram arrives completely, it refutes the header, because the false telegram would overlap it.
     let next = scan(|_| 4000);
     let mut framer = self::framer(STREAM_EXPECT);
     let mut bytes = spelled.clone();
@@ -186,8 +186,8 @@ fn every_rejected_frame_is_counted_by_reason() {
     wrong[400] ^= 1;
     feed(&mut framer, &wrong, 100);
     let mut expected = [0; Reject::COUNT];
-    // The rejected headers are 02 02; D6 02 B0 and D6 02 B1, in which the high byte of the length is a start byte; and
-    // D7 02 02.
+    // Five start bytes are rejected because the next byte is not the address: the first byte of 02 02, and the high
+    // byte of a length in D7 02 02, in D6 02 B1, and twice in D6 02 B0.
     expected[Reject::Length as usize] = 1;
     expected[Reject::Command as usize] = 1;
     expected[Reject::Count as usize] = 1;
@@ -211,7 +211,8 @@ fn flood_of_headers_is_bounded() {
 
 #[test]
 fn overlapping_frames_do_not_fill_the_buffer() {
-    // The longest frames. Each has a valid checksum, and each begins eight bytes before the end of the previous frame.
+    // These frames have the maximum length. Each has a valid checksum, and each begins eight bytes before the end of
+    // the previous frame.
     let header = [0x02, 0x80, 0x28, 0x03, 0xB1];
     let frame = |begins_with: &[u8]| {
         let mut writer = lms::telegram::Writer::new(0x80, 0xB1).slice(begins_with);

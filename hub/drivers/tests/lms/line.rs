@@ -1,14 +1,15 @@
-//! Simulated line that loses bytes in bursts, in virtual time. It contains the chunks that a reader receives and the
-//! telegrams that the scanner sent. [`TelegramCounts`] runs a parser on the line and counts the result for each
+//! Simulated line that loses bytes in bursts, in virtual time. The line contains the chunks that a reader receives and
+//! the telegrams that the scanner sent. [`TelegramCounts`] runs a parser on the line and counts the result for each
 //! telegram.
 //!
-//! Two ordinary parsers serve as a comparison. Both check headers as strictly as the framer. They differ only in how
-//! they treat bytes that are not a telegram. The test of the framer and the benches `line_loss` and `host_load` use
-//! this file.
+//! Two ordinary parsers serve as a comparison. Both parsers check headers as strictly as the framer. The parsers differ
+//! only in how they treat bytes that are not a telegram. The test of the framer and the benches `line_loss` and
+//! `host_load` use this file.
 //!
-//! Losses come in bursts (paper III.B.4: 0.135 % of the bytes, 40.8 % of the telegrams). A burst begins at a byte with
-//! probability 7.14e-4, and its length is geometric with mean 1.89. The scanner sends 508 bytes of a telegram, pauses,
-//! and sends the rest. The reader receives chunks of 16 bytes, as the FIFO of a UART passes them on.
+//! Losses come in bursts (paper III.B.4: 0.135 % of the bytes are lost, and 40.8 % of the telegrams are damaged). A
+//! burst begins at a byte with probability 7.14e-4, and the length of the burst has a geometric distribution with mean
+//! 1.89. The scanner sends 508 bytes of a telegram, pauses, and sends the rest. The reader receives chunks of 16 bytes,
+//! as the FIFO of a UART passes them on.
 
 use fastrand::Rng;
 use scanhub_drivers::line::suspect;
@@ -21,7 +22,7 @@ use scanhub_schema::{MICROS, MILLIS, Nanos};
 
 /// Number of bytes of each telegram, with 361 beams.
 pub(crate) const TELEGRAM_LEN: usize = 732;
-/// Time from the first byte of a telegram to the first byte of the next one: 361 beams take two revolutions.
+/// Time from the first byte of a telegram to the first byte of the next telegram: 361 beams take two revolutions.
 const TELEGRAM_PERIOD: Nanos = 2 * MIRROR_PERIOD;
 /// Transmission time of a byte at 500,000 baud.
 const BYTE_TIME: Nanos = 20 * MICROS;
@@ -53,7 +54,7 @@ pub(crate) struct SimulatedLine {
     lost_runs: Vec<(usize, usize)>,
     /// For each run of lost bytes, its position in `received`.
     cuts: Vec<usize>,
-    /// For each run of lost bytes, the number of bytes lost up to its end.
+    /// For each run of lost bytes, the number of bytes lost up to the end of this run.
     lost: Vec<usize>,
 }
 
@@ -200,7 +201,7 @@ pub(crate) trait Parser {
     /// Reads `bytes` and passes each accepted frame to `accept`.
     fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(AcceptedFrame<'_>));
 
-    /// Returns the time without bytes after which [`Parser::release`] may return more.
+    /// Returns the time without bytes after which [`Parser::release`] may accept more frames.
     fn hold_time(&self) -> Option<Nanos> {
         None
     }
@@ -271,8 +272,8 @@ pub(crate) struct TelegramCounts {
 }
 
 impl TelegramCounts {
-    /// Runs `parser` on the whole `line` like a session. It reads every chunk on its arrival. It calls `release` when
-    /// no byte has arrived for the hold.
+    /// Runs `parser` on the whole `line`, as a session does. Passes each chunk to the parser when the chunk becomes
+    /// readable. Calls `release` when no byte has arrived for the parser's hold time.
     pub(crate) fn run_parser(&mut self, line: &SimulatedLine, parser: &mut impl Parser) {
         let mut delivered = vec![false; line.telegrams()];
         let mut begin = 0;
@@ -297,12 +298,13 @@ impl TelegramCounts {
         }
     }
 
-    /// Returns the mean extra latency in ms, over `telegrams - lost - held`.
+    /// Returns the mean time from the arrival of the last byte to the delivery, in ms, over `telegrams - lost - held`.
     pub(crate) fn extra_mean_ms(&self) -> f64 {
         self.extra_time as f64 / MILLIS as f64 / (self.telegrams - self.lost - self.held).max(1) as f64
     }
 
-    /// Returns the largest extra latency in ms.
+    /// Returns the maximum time from the arrival of the last byte to the delivery, in ms, for telegrams that were not
+    /// held.
     pub(crate) fn extra_max_ms(&self) -> f64 {
         self.extra_time_max as f64 / MILLIS as f64
     }
@@ -320,8 +322,8 @@ impl TelegramCounts {
         let number = line.origin(offset) / TELEGRAM_LEN;
         let held = reasons & suspect::HEADER_INSIDE != 0;
         self.held += u64::from(held);
-        // Only the bytes count. If equal bytes of the next telegram complete a damaged telegram, the result equals the
-        // telegram that the scanner sent.
+        // Only the bytes decide whether a frame is the sent telegram. If equal bytes of the next telegram complete a
+        // damaged telegram, the result equals the telegram that the scanner sent.
         if bytes == line.telegram(number) && !delivered[number] {
             delivered[number] = true;
             let extra = now - line.readable_at(last);
@@ -332,7 +334,7 @@ impl TelegramCounts {
             return;
         }
         self.wrong += 1;
-        // The session adds this reason to the framer's reasons.
+        // If the telegram was slow, the session adds reason `SLOW` to the framer's reasons.
         let transmit_time = sent_at(line.origin(last)) - sent_at(line.origin(offset));
         let slow = transmit_time > sent_at(TELEGRAM_LEN - 1) - sent_at(0) + SUSPECT_DELAY;
         self.wrong_clean += u64::from(reasons == 0 && !slow);
@@ -356,8 +358,8 @@ impl core::ops::AddAssign for TelegramCounts {
 /// Maximum additional transmission time of a telegram that is not suspect.
 const SUSPECT_DELAY: Nanos = 8 * MILLIS;
 
-/// A parser with six states that collects a telegram. If the collected bytes are not a telegram, it discards all of
-/// them.
+/// A parser with six states that collects a telegram. If the collected bytes are not a telegram, the parser discards
+/// all of them.
 pub(crate) struct DiscardingParser {
     header: StreamHeader,
     collected: Vec<u8>,
@@ -400,8 +402,8 @@ impl Parser for DiscardingParser {
     }
 }
 
-/// A parser that collects a telegram after a strict header. If the collected bytes are not a telegram, it continues
-/// with the byte after the start byte.
+/// A parser that collects a telegram after a strict header. If the collected bytes are not a telegram, the parser
+/// continues with the byte after the start byte.
 pub(crate) struct RewindingParser {
     header: StreamHeader,
     open: Vec<u8>,
@@ -448,8 +450,8 @@ const BEAM_COUNT: usize = 361;
 pub(crate) enum LineContent {
     /// Walls and furniture with noise, in mm, as in an ordinary room.
     Furnished,
-    /// Only a few grains of dust are in range. There are long runs of equal bytes. In such a run, different losses look
-    /// the same.
+    /// Only a few grains of dust are in range. The telegrams have long runs of equal bytes. In such a run, different
+    /// losses look the same.
     Empty,
     /// A wall at 640 cm in all directions. The value of each beam equals the first two bytes of a header.
     Wall,

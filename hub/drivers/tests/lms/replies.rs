@@ -1,4 +1,4 @@
-//! Tests of the codec of replies, in both directions. They use printed replies, recorded replies, and replies that
+//! Tests of the codec of replies, in both directions. The tests use printed replies, recorded replies, and replies that
 //! follow from the layout. The checksum reveals the misprints of the documents. Telegrams with any bytes and a valid
 //! checksum cause no panic, and are encoded as they were decoded.
 
@@ -84,20 +84,20 @@ fn misprinted_telegrams_are_refused() {
     let a_zero_lost =
         format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {} 02 00 10 C5 7A", &ZERO_BYTES[3..]);
     for text in [
-        // Installation mode with the checksum of table 6-4. Programs have copied this checksum.
+        // The request for installation mode, with the checksum of table 6-4. Programs have copied this checksum.
         "02 00 0A 00 20 00 \"SICK_LMS\" 5F B2",
         // The boot message of tables 6-2 and 7-5.
         "02 80 17 00 90 \"LMS200;301063;V02.10 \" 10 63 56",
         // STX and address are swapped, with a matching checksum (7-105).
         "00 02 01 00 69 7D 0A",
-        // A byte is missing in the document, as in 6-8.
+        // A zero byte is missing, as in 6-8 of the document.
         &a_zero_lost,
-        // LENGTH 0, as in C1h, C2h and E6h.
+        // LENGTH is 0, as in the C1h, C2h and E6h of the document.
         "02 80 00 00 C1 10 00 00",
     ] {
         assert_eq!(Telegram::check(&bytes(text)), None, "{text}");
     }
-    // The right telegrams.
+    // Two of these telegrams without the misprints.
     assert!(Telegram::check(&bytes("02 00 0A 00 20 00 \"SICK_LMS\" BE C5")).is_some());
     let up = bytes("02 80 17 00 90 \"LMS200;301063;V02.10 \" 10 63 5E");
     let up = Telegram::check(&up).map(Reply::decode);
@@ -153,7 +153,7 @@ fn rejects_malformed_and_oversized_replies() {
     assert_eq!(Reply::decode(request.telegram()), None, "a host sends no reply");
     assert!(Reply::Configuration2(&[0; 900]).encode(0, 0x10).is_none());
     assert!(Reply::Type(&[b'x'; 900]).encode(0, 0x10).is_none());
-    // The longest telegram of values, and one byte more.
+    // The longest telegram of values can be encoded. Replies with the same values and more data cannot.
     let frame = ScanFrame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) };
     let longest = measured::encode_with(0, frame, &[7; 401], 0x10);
     let values = MeasuredValues::decode(longest.telegram()).expect("is one");
@@ -171,7 +171,7 @@ fn telegram(address: u8, command: u8, data: &[u8]) -> EncodedTelegram {
     Writer::new(address, command).slice(data).finish()
 }
 
-/// Generates commands, most of them known ones.
+/// Generates commands, most of which are known.
 fn commands() -> impl Strategy<Value = u8> {
     let known: Vec<u8> = (0x10..=0x7C).chain(0x90..=0xFC).collect();
     prop_oneof![proptest::sample::select(known), any::<u8>()]

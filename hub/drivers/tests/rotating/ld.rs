@@ -17,7 +17,7 @@ use crate::{DamageRates, DamagedLine, SentPacket};
 struct DeliveredRevolution {
     /// Indices of the scanner's points.
     points: Vec<u64>,
-    /// Number of points whose range and angle do not match.
+    /// Number of points whose angle does not belong to the point that their range identifies.
     wrong: usize,
     first: Nanos,
     period: Nanos,
@@ -131,8 +131,8 @@ impl TestBench {
         }
     }
 
-    /// Checks the points of every revolution: they are right, in order, and from one revolution of the head. An
-    /// unmarked revolution must be complete. Returns the largest error of a stamp.
+    /// Checks the points of every revolution: they are right, in order, and from one revolution of the head. A
+    /// revolution that is not marked as incomplete must have all points. Returns the largest error of a stamp.
     fn check_revolutions(&self) -> Nanos {
         let beams = self.session.beams().expect("known");
         let edge = 18_000.0 / beams as f64;
@@ -140,7 +140,7 @@ impl TestBench {
         let turn_of = |point: u64| ((self.scanner.angle(point) + edge) / 36_000.0).floor();
         for revolution in &self.log.revolutions {
             let (first, last) = (revolution.points[0], revolution.points[revolution.points.len() - 1]);
-            // Because angles are rounded, a point may appear in another revolution.
+            // Because angles are rounded, a point may appear in the previous or next revolution.
             let is_whole = revolution.points.len() as u64 == last - first + 1;
             assert!(revolution.points.windows(2).all(|pair| pair[0] < pair[1]), "{revolution:?}");
             assert!(
@@ -217,7 +217,7 @@ fn receives_every_revolution_of_every_model() {
         assert_eq!(stats.due, stats.telegrams);
         assert_eq!(bench.session.state(), State::Streaming);
         assert_eq!(bench.session.beams(), Some(model.beams()));
-        // About one read every 5 ms, not one per byte.
+        // The session reads about once every 5 ms, and not once per byte.
         assert!(bench.log.reads < 1_900, "{model:?}: {} reads", bench.log.reads);
         assert!(bench.log.max_packets <= 17 && bench.log.bauds.is_empty());
     }
@@ -335,8 +335,8 @@ fn revolution_cut_by_a_gap_keeps_previous_period() {
         settings_of(Model::Ld19),
         SimulatedScanner::new(Model::Ld19, 450.0, 3, DamageRates::default()),
     );
-    // In the twentieth revolution, the head slows down. At the end of the gap, the head has the same angle as at its
-    // start, one revolution later.
+    // In the twentieth revolution, the head slows down. At the end of the gap, the head has the same angle as at the
+    // start of the gap, one revolution later.
     bench.run(ONE_SECOND + 1_970 * MILLIS);
     bench.scanner.points_per_revolution = 450.0 * 19.7 / 18.7;
     bench.scanner.lose_until(bench.now + 200 * MILLIS);
@@ -443,19 +443,19 @@ fn revolution_fills_a_grid_of_constant_beams() {
     }
 }
 
-/// A scanner whose head rotates evenly. The range of each point identifies it.
+/// A scanner whose head rotates evenly. The range of each point identifies the point.
 struct SimulatedScanner {
     model: Model,
     /// Points per revolution.
     points_per_revolution: f64,
     /// Fraction by which the scanner's clock is slow.
     drift: f64,
-    /// Fraction by which the speed in every other packet differs from the true speed.
+    /// Fraction by which the speed in every second packet differs from the true speed.
     jitter: f64,
     random: fastrand::Rng,
     line: DamagedLine,
     sent: Vec<SentPacket>,
-    /// Time of power-on; and number of packets sent since then.
+    /// Time of power-on. `packets` is the number of packets sent since then.
     switched_on_at: Nanos,
     packets: u64,
 }
@@ -481,12 +481,12 @@ impl SimulatedScanner {
         self.switched_on_at + (sensor_s / (1.0 - self.drift) * 1e9) as Nanos
     }
 
-    /// Returns the angle of the point with index `point` in hundredths of a degree, summed over all revolutions.
+    /// Returns the angle of the point with index `point` in hundredths of a degree, cumulative over all revolutions.
     fn angle(&self, point: u64) -> f64 {
         point as f64 * f64::from(FULL_CIRCLE) / self.points_per_revolution
     }
 
-    /// Returns the range of the point with index `point`, which identifies it.
+    /// Returns the range of the point with index `point`. The range identifies the point.
     fn range(point: u64) -> u16 {
         100 + (point % 20_011) as u16
     }

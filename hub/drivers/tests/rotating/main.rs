@@ -31,7 +31,7 @@ pub(crate) struct DamagedLine {
 pub(crate) struct SentPacket {
     bytes: Vec<u8>,
     intact: bool,
-    /// Time at which the packet's last byte has left the line, or would have left it without a loss.
+    /// Time at which the packet's last byte has left the line, or would have left the line if no byte were lost.
     at: Nanos,
 }
 

@@ -1,6 +1,6 @@
 //! Test bench with a session, a simulated RPLIDAR and the line between them, in virtual time; and the invariants of all
-//! tests. The scanner replies to requests and measures without a room: the range of each point identifies the point.
-//! The packets are encoded according to the description of the formats, independently of the decoder.
+//! tests. The scanner replies to requests. The scanner does not simulate a room: the range of each point identifies the
+//! point. The packets are encoded according to the description of the formats, independently of the decoder.
 
 mod start;
 mod stream;
@@ -20,7 +20,7 @@ const TTY_READ_LEN: usize = 4_095;
 /// A revolution as the session returned it.
 #[derive(Debug)]
 pub(crate) struct DeliveredRevolution {
-    /// Points: clockwise angle in degrees, 0 to 360, and range in mm.
+    /// Clockwise angle in degrees, 0 to 360, and range in mm of each point.
     pub(crate) points: Vec<(f64, u16)>,
     pub(crate) first: Nanos,
     pub(crate) incomplete: bool,
@@ -157,9 +157,9 @@ impl TestBench {
         }
     }
 
-    /// Checks the revolutions of the current stream. Each contains points of one revolution of the head, at the right
-    /// angles. An unmarked revolution must be complete. Returns the largest error of a stamp, and the number of wrong
-    /// points in unmarked revolutions.
+    /// Checks the revolutions of the current stream. Each of them contains points of one revolution of the head, at the
+    /// right angles. A revolution that is neither incomplete nor suspect must have all points. Returns the largest
+    /// error of a stamp, and the number of wrong points in such revolutions.
     pub(crate) fn check_revolutions(&self, revolutions: &[DeliveredRevolution]) -> (Nanos, usize) {
         let kind = self.scanner.kind().expect("measuring");
         let (step, mut worst, mut wrong) = (self.scanner.step(), 0, 0);
@@ -201,7 +201,8 @@ impl TestBench {
         (from.max(0.0) as u64..to.max(0.0) as u64).any(|point| {
             let sample = SimulatedScanner::sample(point);
             let range = if range == line::NO_RETURN { 0 } else { u32::from(range) };
-            // The packet format encodes differences, and cannot encode the difference to a point without a return.
+            // An ultra packet contains differences between ranges, and cannot contain the difference to a point without
+            // a return.
             let is_unencodable = kind == PacketFormat::Ultra
                 && point % 3 == 2
                 && SimulatedScanner::sample(point + 1).range == 0;
@@ -237,7 +238,8 @@ enum ScannerState {
     Booting {
         until: Nanos,
     },
-    /// Packet format, microseconds per point, time of the first point of the stream, number of packets.
+    /// The scanner sends packets of format `kind`. `us` is the time per point in microseconds, and `packets` is the
+    /// number of packets sent in this stream.
     Measuring {
         kind: PacketFormat,
         us: f64,
@@ -255,7 +257,7 @@ pub(crate) struct SimulatedScanner {
     pub(crate) is_old: bool,
     /// Revolutions per second.
     pub(crate) hz: f64,
-    /// Additional time from a request to its first point.
+    /// Additional time from the request that starts a stream to the first point of the stream.
     pub(crate) spin_up: Nanos,
     /// Fraction by which the scanner's points take longer than the scanner reports.
     pub(crate) drift: f64,
@@ -400,7 +402,7 @@ impl SimulatedScanner {
         self.us().map(|(zero, ns)| zero + (point * ns) as Nanos)
     }
 
-    /// Returns the raw angle between two points in degrees.
+    /// Returns the nominal angle from one point to the next, in degrees.
     pub(crate) fn step(&self) -> f64 {
         self.us().map_or(0.0, |(_, ns)| 360.0 * self.hz * ns / 1e9)
     }
@@ -608,8 +610,8 @@ impl SimulatedScanner {
         self.sent.iter_mut().filter(is_hit).for_each(|sent| sent.intact = false);
     }
 
-    /// Drops complete packets. This happens if the host does not read until `until` and the buffer has room for only
-    /// about `room` bytes.
+    /// Drops complete packets, as if the host does not read until `until` and the buffer has room for only about `room`
+    /// bytes.
     pub(crate) fn overflow(&mut self, until: Nanos, room: usize) {
         self.send_until(until);
         let Some(kind) = self.kind() else { return };
@@ -629,7 +631,7 @@ impl SimulatedScanner {
     }
 }
 
-/// A point before it is encoded. Its raw angle follows from its index.
+/// A point before it is encoded. The nominal angle of the point follows from its index.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct TestPoint {
     /// Range in mm; 0 for no return.

@@ -441,7 +441,8 @@ fn boot_message_after_other_bytes_is_a_restart() {
 
 #[test]
 fn text_like_ranges_are_no_boot_message() {
-    // A single point counts if another point follows it.
+    // The framer accepts a packet of one point only if another point follows it, so it also discards the 5 bytes of the
+    // point before the text.
     for (mode, lost) in [(Mode::Standard, 65), (Mode::DenseBoost, 60)] {
         let mut bench = TestBench::new(
             Settings { mode: Some(mode.name()), ..settings_of(Model::S2) },

@@ -139,9 +139,8 @@ fn counts_packets_lost_in_a_full_buffer() {
     }
 }
 
-/// Checks that the session counts dropped packets. The remaining packets begin where the previous packet ended, even if
-/// whole revolutions were dropped.
-/// whole revolutions were dropped.
+/// Checks that the session counts dropped packets. Only complete packets are dropped. The bytes of the next packet
+/// therefore follow directly after the bytes of the previous packet, even if whole revolutions were dropped.
 #[test]
 fn counts_loss_of_whole_packets_in_a_full_buffer() {
     for kind in PACKET_KINDS {
@@ -380,7 +379,8 @@ fn recording_from_mid_stream_has_revolutions_soon() {
     }
 }
 
-/// Returns the smallest difference between the stamp of each of `revolutions` and the stamp of a delivered revolution.
+/// Returns, for each of `revolutions`, the difference between its stamp and the nearest stamp of a revolution of the
+/// live session.
 fn stamp_errors(live: &TestBench, revolutions: &[ReplayedRevolution]) -> Vec<Nanos> {
     let off = |replayed: &ReplayedRevolution| {
         live.log.revolutions.iter().map(|delivered| delivered.first.abs_diff(replayed.first)).min()
@@ -451,7 +451,7 @@ fn refuses_packets_of_ambiguous_format() {
     assert!(revolutions.len() > 10);
 }
 
-/// Descriptors of replies, of packets of all formats, and of unknown ones.
+/// Descriptors of replies, of packets of all formats, and of packets of an unknown format.
 const REPLY_DESCRIPTORS: [[u8; 7]; 12] = [
     [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04],
     [0xA5, 0x5A, 0x03, 0, 0, 0, 0x06],
@@ -467,7 +467,8 @@ const REPLY_DESCRIPTORS: [[u8; 7]; 12] = [
     [0xA5, 0x5A, 0xFF, 0xFF, 0xFF, 0xFF, 0x83],
 ];
 
-/// Returns a packet with random content and a right checksum. Its angle may continue from the previous packet.
+/// Returns a packet with random content and a right checksum. The angle of the packet may continue from the previous
+/// packet.
 fn random_packet(random: &mut fastrand::Rng, kind: PacketFormat, angle: &mut u16, jumps: u16) -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..kind.byte_len()).map(|_| random.u8(..)).collect();
     *angle = if random.u16(..jumps) == 0 { random.u16(..) } else { (*angle % 23_040 + 1_152) % 23_040 };
