@@ -1,5 +1,6 @@
 //! Requests of users to the links of a hub. The supervisor's thread receives each request and puts it into the bounded
-//! queue of its link's thread. It replies when the link has handled the request, and never blocks on a link in between.
+//! queue of its link's thread. The supervisor's thread replies when the link has handled the request, and never blocks
+//! while it waits for the link.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, TrySendError, channel, sync_channel};
@@ -55,8 +56,8 @@ pub(crate) struct QueuedRequest {
 }
 
 impl CommandSender {
-    /// Creates a queue for the link of each sensor in `sensors`. The second value has the links' ends, in the same
-    /// order.
+    /// Creates a queue for the link of each sensor in `sensors`. The second value contains the links' ends of the
+    /// queues, in the order of `sensors`.
     ///
     /// # Errors
     ///
@@ -99,13 +100,13 @@ impl CommandSender {
         }
     }
 
-    /// Queues a request for the link of `sensor`, and returns its number in [`outcome`](Self::outcome). `model` is the
-    /// model of [`Verb::Load`].
+    /// Queues a request for the link of `sensor`, and returns the number under which [`outcome`](Self::outcome) reports
+    /// it. `model` is the model of [`Verb::Load`].
     ///
     /// # Errors
     ///
-    /// [`Kind::NoTopic`] if there is no such link, [`Kind::ResourceExhausted`] if too many requests wait for it,
-    /// [`Kind::Failed`] if it has ended.
+    /// [`Kind::NoTopic`] if there is no link of `sensor`, [`Kind::ResourceExhausted`] if too many requests wait for the
+    /// link, [`Kind::Failed`] if the link has ended.
     pub fn enqueue(&mut self, sensor: &str, verb: Verb, model: Box<Background>) -> Result<u64, Failure> {
         let link = self.links.iter().find(|link| link.sensor == sensor).ok_or_else(|| {
             let sensors: Vec<_> = self.links.iter().map(|link| link.sensor.as_str()).collect();
@@ -134,7 +135,8 @@ impl CommandSender {
 }
 
 impl ControlServer {
-    /// Opens the control service for the link of each sensor in `sensors`. The second value has the links' queues.
+    /// Opens the control service for the link of each sensor in `sensors`. The second value contains the links' ends of
+    /// the queues, in the order of `sensors`.
     ///
     /// # Errors
     ///
@@ -279,7 +281,7 @@ impl ControlQueue {
 
     /// Reports the outcome of request `id` to the server.
     pub(crate) fn report_outcome(&self, id: u64, outcome: Outcome) {
-        // Without a server, no client waits.
+        // If the server no longer exists, no client waits for the outcome.
         if self.outcomes.send((id, outcome)).is_ok() {
             self.server.signal();
         }
@@ -298,7 +300,8 @@ impl AsFd for ControlQueue {
     }
 }
 
-/// Descriptors of a connection to a client: both directions, and the memory of its requests.
+/// Number of descriptors that the connection to one client needs: for both directions, and for the shared memory of its
+/// requests.
 const CLIENT_DESCRIPTORS: u64 = 4;
 /// Maximum number of waiting requests for each link. Further requests are refused.
 const QUEUE_CAPACITY: usize = 4;

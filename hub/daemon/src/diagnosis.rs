@@ -1,13 +1,13 @@
 //! Diagnosis of the problem that a link's status reports:
 //!
-//! - the problem of the session, or a unit other than the configured one
+//! - the problem of the session, or a unit that differs from the configured unit
 //! - more bytes than the line can carry, or a line that damages most bytes
 //! - bytes of another scanner, or a scanner that restarts
 //! - settings of the port that another process changed
 //! - subscribers that receive nothing
 //!
-//! Every change of the message is a log line. Numbers in a message are therefore rounded, and stay while they vary a
-//! little.
+//! Every change of the message is a log line. Numbers in a message are therefore rounded, and a number in a message
+//! stays while the measured one varies only a little.
 
 use std::path::Path;
 
@@ -22,7 +22,7 @@ use crate::link_stats::LineHealth;
 /// Problems of one link.
 pub(crate) struct Diagnosis<'a> {
     link: &'a Link,
-    /// Findings that the message was made from; `None` if it must be made again.
+    /// Findings that the message was made from; `None` if the message must be made again.
     findings: Option<Findings>,
     /// Message about the problem; empty if there is none.
     message: String,
@@ -36,11 +36,11 @@ pub(crate) struct Diagnosis<'a> {
     family: Option<Family>,
     /// Time of the scanner's last telegram. `None` before the first one.
     last_telegram: Option<Nanos>,
-    /// Time of a telegram since the last update.
+    /// Time of the latest telegram since the last update; `None` if none has arrived.
     new_telegram: Option<Nanos>,
     /// Whether the scanner has streamed since the port was opened.
     has_streamed: bool,
-    /// Message that the scanner was exchanged, until the next one is found. Otherwise empty.
+    /// Message that the scanner was exchanged, until the session has found the new scanner. Otherwise empty.
     exchange: String,
     /// Time of the last update.
     now: Nanos,
@@ -50,13 +50,13 @@ pub(crate) struct Diagnosis<'a> {
     is_flooded: bool,
     /// Share of the bytes that the line damages, in percent, while it damages most of them.
     damaged_percent: Option<u32>,
-    /// Maximum number of restarts of the scanner in 10 s, since the last 10 s without one.
+    /// Highest number of restarts of the scanner within 10 s, since there were last 10 s without a restart.
     restarts: u64,
     /// Attached subscribers that receive nothing, as of the last status.
     starved: usize,
-    /// Consecutive statuses with such subscribers.
+    /// Number of consecutive statuses at which subscribers received nothing.
     starved_statuses: u32,
-    /// Measuring mode that was last checked for marks.
+    /// Measuring mode of the last status, so that a mode without marks is logged only once.
     logged_mode: u8,
 }
 
@@ -169,7 +169,8 @@ impl<'a> Diagnosis<'a> {
     }
 
     /// Returns whether another scanner must have been connected: a stream of bytes arrives, but no telegram of the
-    /// scanner that has streamed. If the line has damaged most bytes before, it may damage all of them now.
+    /// scanner that has streamed. Returns `false` if the line has damaged most bytes before, because it may damage all
+    /// of them now.
     fn is_exchanged(&self, session: &PortSession, bytes_per_second: Option<u64>) -> bool {
         session.state() != line::State::Paused
             && self.has_streamed
@@ -178,19 +179,19 @@ impl<'a> Diagnosis<'a> {
             && bytes_per_second.is_some_and(|rate| rate >= MIN_STREAM_RATE)
     }
 
-    /// Handles that the port has been opened, as `device` if that is known.
+    /// Handles that the port has been opened. `device` is the device that the port's name resolved to, if known.
     pub(crate) fn on_port_opened(&mut self, device: Option<&Path>) {
         self.device = device.map(|device| device.display().to_string());
         self.byte_rate = ByteRate::default();
         (self.last_telegram, self.new_telegram, self.has_streamed) = (None, None, false);
         self.exchange.clear();
-        // This describes the previous connection.
+        // The share of damaged bytes belongs to the previous connection.
         self.damaged_percent = None;
     }
 
-    /// Notes the `change` that the hub has undone at `now`. `program` searches for the program that made it. A
-    /// message that already names the change stays: a program that keeps changing the port does not cause a
-    /// search each time.
+    /// Notes the `change` that the hub has undone at `now`. `program` searches for the program that made it. If the
+    /// current message already names the change, the message stays. A program that keeps changing the port therefore
+    /// does not cause a search every time.
     pub(crate) fn note_settings_change(
         &mut self,
         change: SettingsChange,
@@ -222,13 +223,14 @@ impl<'a> Diagnosis<'a> {
         &self.message
     }
 
-    /// Handles the end of the session. The next one has its own problems.
+    /// Handles the end of the session. The next session has its own problems.
     pub(crate) fn end_session(&mut self) {
         self.findings = None;
     }
 
-    /// Notes `message` if the last connection closed without delivering a byte; otherwise it is empty. While the next
-    /// one may do so too, the port counts as absent.
+    /// Stores `message`, which says that the last connection closed without delivering a byte. An empty `message` means
+    /// that the last connection delivered bytes. While the next connection may also close in this way, the port counts
+    /// as absent.
     pub(crate) fn note_empty_connection(&mut self, message: String) {
         self.empty_connection = message;
     }
@@ -240,20 +242,22 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
-    /// Handles the end of the port, and of its flood.
+    /// Handles that the port was closed, which also ends a flood.
     pub(crate) fn end_flood(&mut self) {
         self.is_flooded = false;
     }
 
     /// Notes the state of the line in the last ten seconds. Called once per status.
     pub(crate) fn note_line(&mut self, line: LineHealth) {
-        // Where scans do not arrive, bytes of a scanner that was received count too, unless nothing is wrong.
+        // `damaged` counts only while scans arrive. If there is a problem and telegrams still arrive, bytes outside
+        // telegrams therefore count as damaged too.
         let has_problem = self.findings.is_some_and(|findings| findings.problem.is_some());
         let is_received = has_problem && line.telegrams >= MIN_TELEGRAMS;
         let share = if is_received { line.damaged.max(line.discarded) } else { line.damaged };
         let percent = (100.0 * share).round() as u32;
         let damaged_percent = match self.damaged_percent {
-            // Another scanner may have sent bytes without any telegram among them.
+            // Without telegrams, the bytes may come from another scanner, so do not conclude that the line damages
+            // them.
             None if self.family.is_none() || self.is_silent_for(MIN_SILENCE) => None,
             None => Some(percent).filter(|&percent| percent >= UNRELIABLE_PERCENT),
             // A number that changes every second would be logged every second.
@@ -275,7 +279,7 @@ impl<'a> Diagnosis<'a> {
         if self.starved_statuses == MAX_STARVED_STATUSES
             || before >= MAX_STARVED_STATUSES && self.starved_statuses == 0
         {
-            // The subscribers that do receive something read it in the status.
+            // Subscribers that do receive samples read the message in the status.
             self.findings = None;
         }
         if self.starved_statuses == MAX_STARVED_STATUSES {
@@ -347,12 +351,12 @@ impl<'a> Diagnosis<'a> {
         if let Some((missing, rate)) = session.missing_transmission().zip(rate) {
             return self.unrecognized_bytes(missing, rate);
         }
-        // Soon the rate of the bytes gives a better message than "no reply".
+        // Keep the message until the rate of the bytes is known, which gives a better message than "no reply".
         if session.missing_transmission().is_some() && self.byte_rate.is_settling(self.now, stats.read) {
             return self.message.clone();
         }
         match session.problem() {
-            // Another family's scanner may be connected, or one at a rate that this family does not have.
+            // The connected scanner may belong to another family, or use a baud rate that this family does not have.
             Some(Problem::Search(problem)) => self.search_problem(problem),
             // The search has just begun.
             Some(_) if self.family.is_none() && !self.exchange.is_empty() => self.exchange.clone(),
@@ -382,7 +386,7 @@ impl<'a> Diagnosis<'a> {
     fn bytes_of_other_scanner(&self, session: &PortSession, rate: u64) -> String {
         let name = scanner_name(session);
         let is_server = matches!(self.link.port, PortSpec::Tcp { .. });
-        // The bytes are the same in both cases.
+        // The hub cannot distinguish the two causes by the bytes.
         let other = if is_server { "another rate of the server" } else { "a damaged line" };
         let bytes = with_commas(rate);
         let text =
@@ -393,9 +397,9 @@ impl<'a> Diagnosis<'a> {
         self.with_remedy(&text)
     }
 
-    /// Returns `text` about a scanner that does not reply, and how to find out whether it belongs to another family, if
-    /// the family is configured and both fit into a status. `scanhub probe` cannot search the port while the hub has
-    /// it.
+    /// Returns `text` about a scanner that does not reply. If the family is configured, adds how to find out whether
+    /// the scanner belongs to another family, as far as this fits into a status. The user must stop the hub first,
+    /// because `scanhub probe` cannot search a port that the hub has open.
     fn without_reply(&self, text: &str) -> String {
         let Some(keys) = self.family_keys() else { return text.to_owned() };
         let text = format!("{text} Another scanner?");
@@ -417,7 +421,7 @@ impl<'a> Diagnosis<'a> {
         (!keys.is_empty() && !matches!(self.link.port, PortSpec::File { .. })).then_some(keys)
     }
 
-    /// Returns `text` and the remedy, if the family is configured and they fit into a status: the scanner may belong to
+    /// Returns `text`. If the family is configured, adds the remedy if it fits into a status: the scanner may belong to
     /// another family.
     fn with_remedy(&self, text: &str) -> String {
         let Some(keys) = self.family_keys() else { return text.to_owned() };
@@ -437,8 +441,8 @@ impl<'a> Diagnosis<'a> {
         self.with_port(|port| problem.message(port)).unwrap_or_else(|| problem.to_string())
     }
 
-    /// Returns the message for the name of the port, otherwise for its device. `None` if the port cannot be probed, or
-    /// no message fits into a status.
+    /// Returns `message` for the configured name of the port, or for its device if the first message does not fit into
+    /// a status. `None` if the port cannot be probed, or if neither message fits.
     fn with_port(&self, message: impl Fn(&str) -> String) -> Option<String> {
         let ports = match self.link.port {
             PortSpec::Tty(_) | PortSpec::Tcp { .. } => vec![Some(self.link.port.name()), self.device.clone()],
@@ -489,8 +493,8 @@ impl<'a> Diagnosis<'a> {
 struct ByteRate {
     /// Start of the window, and the number of bytes read by then.
     window: Option<(Nanos, u64)>,
-    /// Result of the last complete window, in bytes per second; `None` before there is one, or if almost nothing
-    /// arrived.
+    /// Result of the last complete window, in bytes per second; `None` before the first window is complete, or if
+    /// almost nothing arrived.
     last_rate: Option<u64>,
     is_complete: bool,
     /// Consecutive windows in which almost nothing arrived.
@@ -531,7 +535,7 @@ impl ByteRate {
         Some(self.reported)
     }
 
-    /// Returns whether bytes have begun to arrive, but not long enough for a rate.
+    /// Returns whether bytes have begun to arrive, but too recently to compute a rate.
     fn is_settling(&self, now: Nanos, read: u64) -> bool {
         let is_begun = |(since, before)| read > before + MAX_NOISE_BYTES && now < since + MIN_RATE_TIME;
         !self.is_complete && self.window.is_some_and(is_begun)
@@ -545,13 +549,13 @@ impl ByteRate {
     }
 }
 
-/// Returns the name of the scanner of `session`: that of its model, or of its family if the model is unknown.
+/// Returns the name of the scanner of `session`: the name of its model, or of its family if the model is unknown.
 fn scanner_name(session: &PortSession) -> String {
     let family = session.family().map_or("", |family| family.name());
     session.model().map_or_else(|| format!("{family} scanner"), |model| model.name.to_owned())
 }
 
-/// Returns the state of `session` as that of its link.
+/// Converts the state of `session` into the state of its link.
 fn state_of(session: &PortSession) -> State {
     match session.state() {
         line::State::Probing => State::Probing,
@@ -563,7 +567,7 @@ fn state_of(session: &PortSession) -> State {
     }
 }
 
-/// Rounds to three digits.
+/// Rounds to three significant digits.
 fn rounded(rate: u64) -> u64 {
     let unit = 10_u64.pow(rate.checked_ilog10().unwrap_or(0).saturating_sub(2));
     (rate + unit / 2) / unit * unit
@@ -582,28 +586,32 @@ fn with_commas(number: u64) -> String {
     text
 }
 
-/// Minimum share of damaged bytes, in percent, at which the others prove nothing.
+/// Minimum share of damaged bytes, in percent, at which the status reports a damaged line. The undamaged bytes then
+/// prove nothing about the scanner.
 const UNRELIABLE_PERCENT: u32 = 50;
-/// Steps in which that share is reported.
+/// Minimum change of the share of damaged bytes, in percent, that changes the reported share.
 const PERCENT_STEP: u32 = 10;
 /// Minimum silence of a scanner after which damage is not concluded from bytes alone.
 const MIN_SILENCE: Nanos = 1_000 * MILLIS;
-/// Minimum silence of a scanner after which other bytes are reported as those of another scanner.
+/// Minimum silence of a scanner after which other bytes are reported as bytes of another scanner.
 const MIN_EXCHANGE_SILENCE: Nanos = 2_000 * MILLIS;
 /// Minimum number of bytes per second of a stream: an LMS at 9,600 baud sends twice that. A boot message is shorter.
 const MIN_STREAM_RATE: u64 = 500;
-/// Fewer telegrams in 10 s may be chance matches in the bytes of another scanner.
+/// Minimum number of telegrams in 10 s that prove that the scanner is received. Fewer telegrams may be chance matches
+/// in the bytes of another scanner.
 const MIN_TELEGRAMS: u64 = 3;
 /// Time for which a status reports that another process changed the port's settings.
 const SETTINGS_CHANGE_TIME: Nanos = 10_000 * MILLIS;
-/// Number of statuses after which subscribers without samples do not count as just attaching any more.
+/// Number of consecutive statuses after which subscribers without samples are reported. Earlier, they may still be
+/// attaching.
 const MAX_STARVED_STATUSES: u32 = 3;
-/// Longer than a search at all rates, so that the rate of the host's port does not change the result.
+/// Time over which the rate of the bytes is measured. It is longer than a search at all baud rates, so that the baud
+/// rate of the host's port does not change the result.
 const RATE_WINDOW: Nanos = 5_000 * MILLIS;
-/// Time before the first rate. A scanner that returns is found within this time, and the rate of a shorter time changes
-/// quickly: each change is a log line.
+/// Time from the first byte to the first rate. A scanner that returns is found within this time. A rate over a shorter
+/// time would change quickly, and each change is a log line.
 const MIN_RATE_TIME: Nanos = 2_000 * MILLIS;
-/// Windows without bytes after which there is no rate any more.
+/// Number of consecutive windows without bytes after which no rate is reported any more.
 const MAX_QUIET_WINDOWS: u32 = 3;
 /// Number of bytes that an adapter may deliver when a cable is plugged in.
 const MAX_NOISE_BYTES: u64 = 64;

@@ -1,7 +1,7 @@
 //! Early warnings from an incomplete scan, while its rest is still on the line or not measured yet. A telegram of 361
 //! values takes 14.6 ms at 500 kBd and a revolution 100 ms, and a near object is often seen long before the end. A
-//! warning is slow or stop, never clear. It is withdrawn if its scan is not published, or if a later part of the scan
-//! refutes it.
+//! warning is slow or stop, never clear. A warning is withdrawn if its scan is not published, or if a later part of the
+//! scan refutes it.
 
 use scanhub_drivers::line::RawScan;
 use scanhub_preprocess::zones::{Warning, ZoneChecker};
@@ -22,7 +22,8 @@ struct PublishedWarning {
     message: EarlyMessage,
 }
 
-/// A warning or its withdrawal, with its sequence number. The number is not greater than that of the zones of its scan.
+/// A warning or its withdrawal, with its sequence number. The sequence number is not greater than that of the zones of
+/// the same scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct EarlyMessage {
     pub(crate) seq: u64,
@@ -36,7 +37,7 @@ impl EarlyWarner {
     }
 
     /// Checks an incomplete scan. Returns the withdrawal of an earlier warning that no longer holds, and a new warning
-    /// if it is worse than the earlier one. `next_seq` is the number of the next telegram.
+    /// if it is worse than the earlier one. `next_seq` is the sequence number of the next telegram.
     pub(crate) fn update(
         &mut self,
         partial: &RawScan<'_>,
@@ -45,8 +46,8 @@ impl EarlyWarner {
     ) -> [Option<EarlyMessage>; 2] {
         let early = self.warning(partial, check);
         let verdict = early.map_or(Verdict::Clear as u8, |early| early.verdict);
-        // A further warning keeps the number of the first: `next_seq` may be greater than the number of the zones by
-        // now.
+        // A further warning keeps the sequence number of the first one, because `next_seq` may already be greater than
+        // the sequence number of the scan's zones.
         let seq = self.warning.map_or(next_seq, |warning| warning.message.seq);
         let withdrawn = if self.verdict() > verdict { self.withdraw(None) } else { None };
         let worse = early.filter(|_| verdict > self.verdict()).map(|early| {
@@ -78,7 +79,7 @@ impl EarlyWarner {
         self.warning = self.warning.filter(|warning| warning.scan != number);
     }
 
-    /// Returns the withdrawal of an unconfirmed warning of any scan but `number`, the one that is arriving.
+    /// Returns the withdrawal of an unconfirmed warning of any scan except `number`, the scan that is arriving.
     pub(crate) fn withdraw(&mut self, number: Option<u64>) -> Option<EarlyMessage> {
         let warning = self.warning.take_if(|warning| Some(warning.scan) != number)?;
         let EarlyMessage { seq, early } = warning.message;
@@ -127,7 +128,7 @@ mod tests {
     }
 
     fn revolution(number: u64, points: &[Point]) -> RawScan<'_> {
-        // Each revolution has another period.
+        // Each revolution has a different period.
         let (period, per_second) = (100_000_000 + 1_000 * number, 900.0);
         RawScan {
             number,
@@ -222,7 +223,7 @@ mod tests {
                     messages.into_iter().flatten().for_each(|message| subscriber.receive(message));
                 }
                 if is_over {
-                    // The packet that ends the revolution has some of its points.
+                    // The packet that ends the revolution also contains its last points.
                     packets += 1;
                     if warner.has_warned() {
                         let partial = revolution(number, &points);
@@ -260,7 +261,8 @@ mod tests {
         let mut check = ZoneChecker::new(Pose::default(), &settings, BEAMS);
         let mut warner = EarlyWarner::new(BEAMS);
         zones(&mut check, &revolution(1, &[at(10.0, 5000)]));
-        // Beam 22 points 88 degrees to the right. Its nearest point counts, and that is on the robot.
+        // Beam 22 points 88 degrees to the right. The nearest point in a beam counts, and in beam 22 this point is on
+        // the robot.
         let mut turned: Vec<Point> = (0..BEAMS).map(|beam| at(4.0 * beam as f32, 5000)).collect();
         turned.splice(22..23, [at(87.5, 500), at(88.5, 200)]);
         turned[60].range = 800;

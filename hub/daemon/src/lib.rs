@@ -1,9 +1,10 @@
 //! The hub: it runs the links to scanners, with one thread for each, and publishes their samples in shared memory.
 //!
-//! - `supervise.rs` starts and ends the hub. `process.rs`, `service.rs` and `system.rs` are its border to the operating
-//!   system; `control.rs` receives requests of users, and `reload.rs` applies a new configuration.
-//! - A live link reads top to bottom in `reconnect.rs`, `session_driver.rs`, `link.rs`, `link_output.rs` and
-//!   `pipeline.rs`. `platform.rs` is the border below which a simulation replaces this machine.
+//! - `supervise.rs` starts and ends the hub. `process.rs`, `service.rs` and `system.rs` contain its calls of the
+//!   operating system. `control.rs` receives requests of users, and `reload.rs` applies a new configuration.
+//! - The code of a link to a scanner is in `reconnect.rs`, `session_driver.rs`, `link.rs`, `link_output.rs` and
+//!   `pipeline.rs`, from top to bottom. `platform.rs` has the interface behind which a simulation can replace this
+//!   machine.
 //! - `replay_hub.rs`, `replay.rs` and `player.rs` play a recording. `reader.rs` computes the same samples without a
 //!   hub.
 

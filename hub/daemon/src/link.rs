@@ -13,7 +13,7 @@ use crate::link_stats::LinkStats;
 use crate::platform::{Platform, SavedState, WakeReason};
 use crate::topics::Topics;
 
-/// The parts of a link.
+/// State of a link that does not depend on the source of its bytes.
 pub(crate) struct LinkState<'a, S: Platform> {
     pub(crate) link: &'a Link,
     pub(crate) platform: &'a S,
@@ -21,7 +21,8 @@ pub(crate) struct LinkState<'a, S: Platform> {
     pub(crate) stats: LinkStats,
     pub(crate) diagnosis: Diagnosis<'a>,
     pub(crate) control: ControlQueue,
-    /// Time at which the hub looks for subscribers of other libraries, and new subscribers get the history.
+    /// Time at which the link next searches for subscribers that use other libraries, and delivers the history to new
+    /// subscribers.
     next_history: Nanos,
     /// Time at which the status is published even if it has not changed.
     next_status: Nanos,
@@ -66,7 +67,7 @@ impl<'a, S: Platform> LinkState<'a, S> {
         self.save_background(true);
     }
 
-    /// Handles the end of `session` on the port.
+    /// Handles that `session` ends because its port was lost or closed.
     pub(crate) fn close(&mut self, session: &PortSession) {
         self.diagnosis.end_flood();
         self.output.update_early_warning(None);
@@ -131,8 +132,8 @@ impl<'a, S: Platform> LinkState<'a, S> {
         self.publish_due_status(session, state, changed, now)
     }
 
-    /// Does the same as [`publish_status`](Self::publish_status) for a `session` that was examined, with the message of
-    /// [`Diagnosis`].
+    /// Publishes the status as [`publish_status`](Self::publish_status) does, with the message of [`Diagnosis`], which
+    /// has examined the `session` before.
     pub(crate) fn publish_session_status(&mut self, session: &PortSession, state: State) -> bool {
         let now = self.platform.now();
         let error = self.diagnosis.message();
@@ -201,8 +202,8 @@ impl<'a, S: Platform> LinkState<'a, S> {
         until.min(history).min(self.output.stale_at()).min(poll)
     }
 
-    /// Returns whether a wait `until` ends now, for the reason `wake_reason`. Otherwise only the history was due, which
-    /// this function delivers.
+    /// Returns whether a wait that was to end at `until` has ended. `wake_reason` is the reason why the thread woke up.
+    /// If only the history was due, delivers it and returns `false`.
     pub(crate) fn is_over(&mut self, wake_reason: WakeReason, until: Nanos) -> bool {
         self.stats.wakeups += 1;
         if wake_reason != WakeReason::Timeout {
@@ -271,8 +272,8 @@ fn log_state(name: &str, state: State, error: &str) {
     }
 }
 
-/// Does the same as [`update`] during a search. Its errors may change often, because of the bytes per second in them,
-/// so they are logged at most once a minute.
+/// Does the same as [`update`] during a search. The errors of a search may change often, because they contain the bytes
+/// per second. They are therefore logged at most once a minute.
 fn update_search(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
     if error.is_empty() || now >= stats.next_search_log {
         let changed = update(stats, link, state, error, now);
@@ -286,7 +287,8 @@ fn update_search(stats: &mut LinkStats, link: &Link, state: State, error: &str, 
 
 /// Minimum time between two log lines about a search.
 const SEARCH_LOG_PERIOD: Nanos = 60_000 * MILLIS;
-/// Interval between checks whether a port that is not read still exists. At the highest rate, no pause is longer.
+/// Interval between checks whether a port still exists while its bytes are left unread. At the highest baud rate, no
+/// pause between two reads is longer than this.
 const POLL_INTERVAL: Nanos = 40 * MILLIS;
 /// Maximum time between two samples of the status.
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;

@@ -1,10 +1,11 @@
 //! The path of a scan, from the session to the subscribers of a link.
 //!
-//! A session returns telegrams with a scan, or packets and then the scan of a revolution. [`LinkOutput::telegram`],
-//! [`packets`](LinkOutput::packets) and [`revolution`](LinkOutput::revolution) publish them. All scans then take the
-//! same path, `LinkOutput::publish_scan`: decode, send, zones, send, the other processors, send. A doorbell rings as
-//! soon as the last of its topics that has a subscriber was sent. Work without a waiting subscriber follows the last
-//! ring, such as a background that only learns. Nothing on this path allocates, locks or logs.
+//! A session returns telegrams with a scan, or packets and then the scan of a revolution.
+//! [`LinkOutput::publish_telegram`], [`publish_packets`](LinkOutput::publish_packets) and
+//! [`publish_revolution`](LinkOutput::publish_revolution) publish them. All scans then take the same path,
+//! `LinkOutput::publish_scan`: decode, send, zones, send, the other processors, send. A doorbell rings as soon as the
+//! last of its topics that has a subscriber was sent. Work without a waiting subscriber follows the last ring, such as
+//! a background that only learns. Nothing on this path allocates, locks or logs.
 
 use scanhub_config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, ReceivedTelegram, TelegramContents};
@@ -18,20 +19,21 @@ use crate::pipeline::{BackgroundReset, Pipeline, ResultBuffers};
 use crate::platform::Platform;
 use crate::topics::{Stage, Topics};
 
-/// Time, period and flags that a recording has for a telegram, in place of those of the session. The default has none.
+/// Time, period and flags that a recording has for a telegram. They replace the values of the session. The default
+/// replaces none of them.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RecordedMetadata {
     /// Wall clock of the first byte.
     pub(crate) wall_ns: Option<u64>,
-    /// Nominal time to the next scan, if it is not that of the link's rate.
+    /// Nominal time to the next scan, if it differs from the period at the link's rate.
     pub(crate) period_us: Option<u32>,
-    /// Time to the next scan if it is longer than nominal, otherwise 0.
+    /// Time to the next scan if this time is longer than nominal, otherwise 0.
     pub(crate) gap_us: u32,
-    /// Factor by which the replay is slower than the recording; 0 or less than 1 if it is not.
+    /// Factor by which the replay is slower than the recording; 1 or less if the replay is not slower.
     pub(crate) stretch: f64,
     /// Stamp of the scan in the time of the recording, which does not depend on the rate of the replay.
     pub(crate) measured_ns: Option<Nanos>,
-    /// [`Flags`] that the recording has for the line, such as that of a simulated scanner.
+    /// [`Flags`] that the recording has for the line, such as the flag of a simulated scanner.
     pub(crate) flags: u8,
 }
 
@@ -45,9 +47,9 @@ impl RecordedMetadata {
 /// Result of publishing a telegram, packets or a revolution.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PublishOutcome {
-    /// Whether it was marked as suspect.
+    /// Whether the telegram, packet or revolution was marked as suspect.
     pub(crate) is_suspect: bool,
-    /// Time for which the verdict on its scan is valid; `None` without a scan.
+    /// Time for which the verdict on the published scan is valid; `None` if no scan was published.
     pub(crate) verdict_lifetime: Option<Nanos>,
 }
 
@@ -68,7 +70,7 @@ pub(crate) struct LinkOutput<'a, S: Platform> {
 }
 
 impl<'a, S: Platform> LinkOutput<'a, S> {
-    /// Creates the output of `link`. It publishes only on later calls.
+    /// Creates the output of `link`, without publishing anything.
     pub(crate) fn new(link: &'a Link, platform: &'a S, topics: Topics<'a, S>) -> Self {
         let beams = link.max_beams();
         LinkOutput {
@@ -83,7 +85,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         }
     }
 
-    /// Takes loans for a telegram that will be complete in a moment, so that it does not have to wait for them.
+    /// Takes loans for the samples of a telegram that will be complete in a moment. Publishing the telegram then does
+    /// not have to wait for memory.
     pub(crate) fn prepare(&mut self) {
         self.topics.prepare();
         if self.pipeline.publishes_every_scan() {
@@ -92,7 +95,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
     }
 
     /// Publishes a telegram and the scan that it contains, if it can be decoded. Then wakes the subscribers. Values in
-    /// `recorded` replace those of the session. A telegram that `is_backlogged` was buffered for an unknown time.
+    /// `recorded` replace those of the session. If it `is_backlogged`, the telegram was buffered for an unknown time.
     pub(crate) fn publish_telegram(
         &mut self,
         received: &ReceivedTelegram<'_>,
@@ -129,8 +132,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         PublishOutcome { is_suspect: received.reasons != 0, verdict_lifetime: None }
     }
 
-    /// Publishes the scan of a revolution, whose packets were published, and wakes the subscribers. One that
-    /// `is_backlogged` was buffered for an unknown time. Returns how long the verdict on it is valid.
+    /// Publishes the scan of a revolution, whose packets were published, and wakes the subscribers. If it
+    /// `is_backlogged`, the revolution was buffered for an unknown time. Returns how long the verdict on it is valid.
     pub(crate) fn publish_revolution(
         &mut self,
         scan: &RawScan<'_>,
@@ -147,10 +150,10 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.publish_scan(scan, recorded.measured_ns, period_us, is_backlogged)
     }
 
-    /// Publishes a scan and the results that are computed from it, and wakes the subscribers. Those of a stage are
-    /// woken before the results of the next stage are computed. A result without a subscriber is computed only if the
-    /// state of a processor depends on it. The processors use `measured_ns` in place of the scan's stamp, if it is
-    /// given. Returns how long the verdict is valid.
+    /// Publishes a scan and the results that are computed from it, and wakes the subscribers. The subscribers of a
+    /// stage are woken before the results of the next stage are computed. A result without a subscriber is computed
+    /// only if the state of a processor depends on it. The processors use `measured_ns` in place of the scan's stamp,
+    /// if it is given. Returns how long the verdict is valid.
     fn publish_scan(
         &mut self,
         raw: &RawScan<'_>,
@@ -179,7 +182,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         pipeline.check_zones(scan, zones.payload_mut());
         topics.publishers.zones.send(zones, &header, &mut topics.due);
         topics.end_stage(Stage::Zones);
-        // A subscriber that attached during this scan may have received the zones.
+        // A subscriber that attached during this scan may have received the zones, and must then be woken.
         topics.ring(DoorbellWord::First);
 
         // Marks, lines and motion.
@@ -196,7 +199,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         // Foreground and background.
         self.update_background(&header);
         self.topics.end_stage(Stage::Background);
-        // A subscriber that attached during this scan may have received a background, which has a history.
+        // Topic `background` has a history, so a subscriber that attached during this scan may have received a sample,
+        // and must then be woken.
         if self.topics.is_ring_due() {
             self.topics.wake(WakeEvent::Telegram);
         }
@@ -242,8 +246,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         }
     }
 
-    /// Updates the background from the scan, and sends the foreground. Returns a reason if the background is learned
-    /// again.
+    /// Updates the background from the scan, and sends the foreground. Returns the reason if the background must be
+    /// learned again.
     #[inline(never)]
     fn publish_foreground(&mut self, header: &Header) -> Option<BackgroundReset> {
         let LinkOutput { topics, pipeline, scan, .. } = self;
@@ -253,14 +257,15 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         reset
     }
 
-    /// Updates what depends on the last scan. Returns how long the verdict on it is valid.
+    /// Updates the state that depends on the last scan. Returns how long the verdict on it is valid.
     fn note_published(&mut self, raw: &RawScan<'_>, period_us: u32) -> Nanos {
         let is_blind = self.pipeline.zones.is_blind();
         if is_blind && !self.is_blind {
             log_blind(&self.link.name);
         }
         self.is_blind = is_blind;
-        // The verdict is valid from now on: telegrams that had to wait for the hub are late, but scans do arrive.
+        // The validity of the verdict begins now and not at the scan's stamp: telegrams that had to wait for the hub
+        // are late, but scans do arrive.
         let lifetime = verdict_lifetime(period_us);
         self.stale_at = self.platform.now().saturating_add(lifetime);
         self.early.confirm(raw.number);
@@ -276,7 +281,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.pipeline.learn(&self.scan, None);
     }
 
-    /// Resets what the processors know of consecutive scans, after a silence that was not published.
+    /// Withdraws an early warning, and resets the state of the zones that depends on consecutive scans, after a silence
+    /// that was not published.
     pub(crate) fn note_silence(&mut self) {
         self.withdraw(None);
         self.pipeline.mark_zones_unknown(&mut Zones::default());
@@ -288,7 +294,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
     }
 
     /// Publishes a warning if the `partial` scan gives one and warnings have a subscriber. Withdraws a warning of
-    /// another scan, and one that no longer holds.
+    /// another scan, and a warning that no longer holds.
     pub(crate) fn update_early_warning(&mut self, partial: Option<&RawScan<'_>>) {
         self.withdraw(partial.map(|partial| partial.number));
         let Some(partial) = partial.filter(|_| self.topics.has_early_subscribers()) else { return };
@@ -401,8 +407,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.pipeline.handle(&self.link.name, verb, model)
     }
 
-    /// Returns the background for the next hub if it is worth saving. At the end of the hub (`is_last`), one new scan
-    /// is enough.
+    /// Returns the background for the next hub if it must be saved. At the end of the hub (`is_last`), one new scan is
+    /// enough.
     pub(crate) fn take_background_to_save(&mut self, is_last: bool) -> Option<(Pose, Box<Background>)> {
         self.pipeline.take_background_to_save(is_last)
     }

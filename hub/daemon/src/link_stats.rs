@@ -12,7 +12,7 @@ use crate::link_output::PublishOutcome;
 /// Statistics of a link, across all sessions on its port.
 pub(crate) struct LinkStats {
     status: Status,
-    /// Configured measuring mode, which is reported while no reply has reported it.
+    /// Configured measuring mode. The status shows it until a reply of the scanner reports the mode.
     mode: Option<u8>,
     /// Counters of the sessions that have ended.
     closed_sessions: Counters,
@@ -41,9 +41,9 @@ pub(crate) struct LineHealth {
     pub(crate) damaged: f64,
     /// Share of the bytes outside telegrams and packets, 0 to 1.
     pub(crate) discarded: f64,
-    /// Telegrams that arrived.
+    /// Number of telegrams that arrived.
     pub(crate) telegrams: u64,
-    /// Restarts of the scanner.
+    /// Number of restarts of the scanner.
     pub(crate) restarts: u64,
 }
 
@@ -115,7 +115,7 @@ impl LinkStats {
         &self.status
     }
 
-    /// Counts what was published.
+    /// Counts a published scan, and a telegram that was marked as suspect.
     pub(crate) fn note(&mut self, published: PublishOutcome) {
         self.suspect += u64::from(published.is_suspect);
         self.scans += u64::from(published.verdict_lifetime.is_some());
@@ -179,7 +179,7 @@ impl LinkStats {
 
 /// Sliding window of the counters in the last ten seconds.
 struct LossWindow {
-    /// Counters with the time of each, a second apart, the newest last.
+    /// Counters with the time at which they were read, one second apart, the newest last.
     samples: VecDeque<(Nanos, Counters)>,
 }
 
@@ -194,7 +194,7 @@ impl LossWindow {
         self.samples.push_back((now, *counters));
     }
 
-    /// Sets the gauges of `counters`, which are those of `now`, and returns the state of the line.
+    /// Sets the gauges among the `counters`, which were read at `now`. Returns the state of the line.
     fn update(&mut self, now: Nanos, counters: &mut Counters) -> LineHealth {
         while self.samples.get(1).is_some_and(|(at, _)| now.saturating_sub(*at) >= LOSS_WINDOW) {
             self.samples.pop_front();
@@ -228,10 +228,10 @@ fn family_number(family: Option<Family>) -> u8 {
 
 /// Time after which the measurement of the scan rate starts again.
 const RATE_WINDOW: Nanos = 5_000_000_000;
-/// Length of the window.
+/// Length of the sliding window.
 const LOSS_WINDOW: Nanos = 10_000 * MILLIS;
 const SAMPLE_INTERVAL: Nanos = 1_000 * MILLIS;
-/// The samples of the window, one before it, and one at its end.
+/// Maximum number of samples in [`LossWindow`]: those within the window, one before it, and one at its end.
 const MAX_SAMPLES: usize = (LOSS_WINDOW / SAMPLE_INTERVAL) as usize + 2;
 
 #[cfg(test)]

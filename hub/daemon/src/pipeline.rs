@@ -12,8 +12,8 @@ use scanhub_preprocess::segments::Segmenter;
 use scanhub_preprocess::zones::ZoneChecker;
 use scanhub_schema::{Background, Failure, Foreground, Kind, Lines, Marks, Motion, Pose, Scan, Verb, Zones};
 
-/// The processors of one link. They process suspect scans like clean ones: a suspected obstacle counts, and a
-/// background needs hundreds of scans in agreement, so a bad one among them has no effect.
+/// The processors of one link. They process suspect scans like clean ones: an obstacle in a suspect scan counts, and a
+/// background needs hundreds of scans that agree, so a damaged scan among them has no effect.
 pub(crate) struct Pipeline {
     pub(crate) zones: ZoneChecker,
     marks: MarkDetector,
@@ -35,9 +35,9 @@ struct BackgroundStage {
     every_scan: bool,
     /// Generation that was published last.
     published: Option<u32>,
-    /// Scans that the model has learned from since then.
+    /// Number of scans that the model has learned from since its last publication.
     scans_since_publish: u32,
-    /// Generation that was saved last, and the scans that the model has learned from since then.
+    /// Generation that was saved last, and the number of scans that the model has learned from since it was saved.
     saved: (u32, u32),
     /// Number of beams and unit in micrometers of the model, if anything was learned or loaded.
     shape: Option<(u16, u32)>,
@@ -100,8 +100,8 @@ impl Pipeline {
         *self = Pipeline::new(&self.processing, self.beams);
     }
 
-    /// Applies other settings, except for the initial model. If circles change, the zones are unknown until enough
-    /// scans were checked. The background is kept.
+    /// Applies other settings, except for the initial model. If the pose or the circles change, the zones are unknown
+    /// until enough scans were checked. The background is kept.
     pub(crate) fn change(&mut self, processing: &Processing) {
         let before = std::mem::replace(&mut self.processing, processing.clone());
         let Processing { pose, zones, marks, lines, motion, background, early: _ } = &self.processing;
@@ -130,7 +130,7 @@ impl Pipeline {
     }
 
     /// Computes marks, lines and motion of `scan`, which was measured at `stamp_ns`, `period_ns` after the scan before.
-    /// Only differences of stamps count, so a replay passes the times of the recording. Call
+    /// The processors use only differences of stamps, so a replay passes the times of the recording. Call
     /// [`learn`](Self::learn) after it.
     pub(crate) fn process(&mut self, scan: &Scan, stamp_ns: u64, period_ns: u64, out: ResultBuffers<'_>) {
         if let Some(marks) = out.marks {
@@ -186,8 +186,8 @@ impl Pipeline {
         self.background.as_ref().is_some_and(|stage| stage.every_scan)
     }
 
-    /// Returns whether the model is worth publishing: its generation was not published yet, or it has learned since
-    /// then from as many scans as it needs for a new object.
+    /// Returns whether the model must be published: its generation was not published yet, or since the last publication
+    /// it has learned from as many scans as it needs for a new object.
     pub(crate) fn is_background_due(&self) -> bool {
         let is_unpublished = |stage: &BackgroundStage| stage.published != Some(stage.model.generation());
         let has_learned =
@@ -211,9 +211,9 @@ impl Pipeline {
         }
     }
 
-    /// Returns the model and the sensor's pose for the next hub if they are worth saving. They are if the generation
-    /// was not saved yet, or if the model has learned from as many scans as it needs. At the end of the hub
-    /// (`is_last`), one scan is enough.
+    /// Returns the model and the sensor's pose for the next hub if they must be saved. They must be if the generation
+    /// was not saved yet. They also must be if, since the last save, the model has learned from as many scans as it
+    /// needs for a new object. At the end of the hub (`is_last`), one scan is enough.
     pub(crate) fn take_background_to_save(&mut self, is_last: bool) -> Option<(Pose, Box<Background>)> {
         let Processing { pose, background, .. } = &self.processing;
         let stage = self.background.as_mut().filter(|stage| background.is_saved && !stage.is_moving())?;

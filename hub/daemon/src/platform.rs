@@ -33,12 +33,12 @@ pub trait Platform {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes under it. The link then publishes
-    /// without waking its subscribers, which poll ten times a second.
+    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes under this name. The link then
+    /// publishes without waking its subscribers, which poll ten times a second.
     fn take_name(&self) -> Result<(), Failure>;
 
-    /// Opens the line at `source` at `baud`. Returns `None` while a connection is being made; call it again once
-    /// [`WaitSource::Opening`] is ready.
+    /// Opens the line at `source` at `baud`. Returns `None` while a connection is being made; call this function again
+    /// once [`WaitSource::Opening`] is ready.
     ///
     /// # Errors
     ///
@@ -48,8 +48,8 @@ pub trait Platform {
     /// Returns the message for `error`, with its circumstances and a remedy.
     fn explain(&self, error: &PortError, source: &PortSpec) -> Failure;
 
-    /// Returns the program that may have changed the settings of the port at `source`, as the end of a message;
-    /// `None` if none is known.
+    /// Returns the program that may have changed the settings of the port at `source`, as the end of a message; `None`
+    /// if no such program is known.
     fn altering_program(&self, source: &PortSpec) -> Option<String>;
 
     /// Returns the line at `source` that was kept open for link `name` when the previous hub was killed.
@@ -68,28 +68,28 @@ pub trait Platform {
     /// Returns the errors of [`SharedMemory::new`](scanhub_shm::SharedMemory::new).
     fn transport<P: Payload + ?Sized>(&self, sensor: &str) -> Result<Self::Transport<P>, Failure>;
 
-    /// Returns a number that changes when a subscriber or listener of the link may have attached. It may miss those of
-    /// other libraries than this project's. `None` if it is unknown.
+    /// Returns a number that changes when a subscriber or listener of the link may have attached. The number may miss
+    /// subscribers that use other libraries than this project's. `None` if the number is unknown.
     fn attach_count(&self) -> Option<u32>;
 
     /// Returns whether the event of the link has a listener.
     fn has_listeners(&self) -> bool;
 
-    /// Rings the doorbell at `word` of the link, which wakes the subscribers that sleep there.
+    /// Rings the doorbell at `word` of the link, which wakes the subscribers that sleep on this word.
     fn ring(&self, word: DoorbellWord);
 
     /// Wakes the subscribers that listen to the event of the link.
     fn notify_event(&self, event: WakeEvent);
 
     /// Reads the last record that this hub or the previous one has [stored](Self::store_record) for link `name` into
-    /// `record`. Returns its length; `None` if there is none. A record outlives a killed hub, but not a restart of
-    /// the machine.
+    /// `record`. Returns the length of the record; `None` if no record exists. A record outlives a killed hub, but not
+    /// a restart of the machine.
     fn load_record(&self, name: &str, record: &mut [u8]) -> Option<usize>;
 
     /// Stores the `record` of link `name` for the next hub, without waiting for a disk.
     fn store_record(&self, name: &str, record: &[u8]);
 
-    /// Returns the state that outlives a restart of the machine; `None` if the link saves none.
+    /// Returns the state that outlives a restart of the machine; `None` if the link saves no such state.
     fn saved_state(&self) -> Option<&dyn SavedState>;
 }
 
@@ -98,8 +98,8 @@ pub trait SavedState {
     /// Saves the background of a sensor at `pose`.
     fn save_background(&self, pose: Pose, model: Box<Background>);
 
-    /// Returns the time at which the background for the next hub was written, in ns since 1970; `None` if there is
-    /// none.
+    /// Returns the time at which the background for the next hub was written, in ns since 1970; `None` if no background
+    /// was written.
     fn saved_wall_ns(&self) -> Option<u64>;
 
     /// Returns the rate at which the last search found the scanner at `port`.
@@ -139,18 +139,19 @@ pub trait PortIo {
     /// Returns an error if the line is lost.
     fn set_baud(&self, baud: u32) -> io::Result<Option<io::Error>>;
 
-    /// Returns the settings that another process has made since the hub's; `None` if they are unchanged.
+    /// Returns the change if another process has changed the settings since the hub set them; `None` if they are
+    /// unchanged.
     ///
     /// # Errors
     ///
     /// Returns an error if the line is lost.
     fn alteration(&self) -> io::Result<Option<SettingsChange>>;
 
-    /// Restores the hub's settings, at `baud`, and discards the bytes that arrived with others.
+    /// Restores the hub's settings, at `baud`, and discards the bytes that arrived with other settings.
     ///
     /// # Errors
     ///
-    /// Returns an error if the line is lost, or if it cannot have these settings any more.
+    /// Returns an error if the line is lost, or if the line does not accept these settings any more.
     fn restore(&self, baud: u32) -> io::Result<()>;
 
     /// Sets DTR of a serial port. Other lines ignore it.
@@ -169,20 +170,20 @@ pub trait PortIo {
     /// Returns the errors that the driver counted since the last call.
     fn line_errors(&self) -> u64;
 
-    /// Returns the device that the port's name resolved to; `None` if it has none, such as a serial server.
+    /// Returns the device that the port's name resolved to; `None` if the port has no device, such as a serial server.
     fn device(&self) -> Option<&Path>;
 
     /// Returns whether another program simulates the scanner.
     fn is_simulated(&self) -> bool;
 }
 
-/// Wait of a link, which ends at the end of the hub, too.
+/// Wait of a link. The end of the hub also ends the wait.
 pub struct Wait<'a, L> {
     /// Requests of users. One of them ends the wait.
     pub requests: &'a ControlQueue,
     /// Source that ends the wait when it is ready.
     pub source: WaitSource<'a, L>,
-    /// Deadline.
+    /// Time at which the wait ends at the latest.
     pub until: Nanos,
 }
 

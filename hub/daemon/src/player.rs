@@ -1,8 +1,9 @@
-//! The player of a recording. The threads of its links query when their next telegram is due, and keys and requests
-//! of users pause, step and speed it up. At maximum rate, links play without a query, and nothing is locked.
+//! The player of a recording. The threads of its links query when their next telegram is due. Keys and requests of
+//! users pause the player, play single telegrams, and change the rate. At maximum rate, links play without a query, and
+//! nothing is locked.
 //!
-//! [`Playback`] is the clock of the player. It keeps the times between telegrams of all links while the recording is
-//! paused, stepped, played faster or slower, and repeated. The current time is an argument.
+//! [`Playback`] is the clock of the player. It preserves the intervals between the telegrams of all links while the
+//! recording is paused, stepped, played faster or slower, and repeated. The current time is an argument.
 //!
 //! Media time is the time since the first telegram of the recording, in nanoseconds.
 
@@ -33,9 +34,9 @@ pub struct PlaybackOptions {
     pub start_ns: Nanos,
     /// Media time, in ns, at which playback ends.
     pub end_ns: Option<Nanos>,
-    /// Whether it restarts at its end.
+    /// Whether playback restarts at its end.
     pub is_looped: bool,
-    /// Whether it pauses before the first telegram.
+    /// Whether playback pauses before the first telegram.
     pub is_paused: bool,
 }
 
@@ -45,9 +46,9 @@ pub struct Player {
     /// Whether every telegram is due at once.
     is_unthrottled: AtomicBool,
     links: Vec<LinkProgress>,
-    /// Readable at the end.
+    /// Event that is readable after playback has ended.
     over: EventFd,
-    /// Whether a user has ended it.
+    /// Whether a user has ended playback.
     is_ended: AtomicBool,
     length_ns: Option<Nanos>,
     /// Mounts whose angles are in the recording.
@@ -56,7 +57,7 @@ pub struct Player {
 
 /// Progress of one link.
 struct LinkProgress {
-    /// Readable when the link must call [`PlayerHandle::next_action`] again.
+    /// Event that is readable when the link must call [`PlayerHandle::next_action`] again.
     event: EventFd,
     /// Media time of the last telegram.
     media: AtomicU64,
@@ -83,7 +84,7 @@ pub struct Progress {
     pub length_ns: Option<u64>,
     /// Speed of playback.
     pub rate: PlaybackRate,
-    /// Whether it is paused.
+    /// Whether playback is paused.
     pub is_paused: bool,
     /// Whether everything was played.
     pub is_over: bool,
@@ -91,9 +92,9 @@ pub struct Progress {
     pub lap: u32,
     /// Number of published telegrams of all links and laps.
     pub telegrams: u64,
-    /// Time that it has played, in ns, without pauses.
+    /// Time that the recording has played, in ns, without pauses.
     pub took_ns: u64,
-    /// Time that it has been paused since everything was ready to play, in ns.
+    /// Time that playback has been paused since all links were ready to play, in ns.
     pub paused_ns: u64,
     /// Time of this report, CLOCK_MONOTONIC in ns.
     pub now_ns: u64,
@@ -106,7 +107,7 @@ impl Default for PlaybackRate {
 }
 
 impl PlaybackRate {
-    /// Returns twice this rate. More than [`MAX_FACTOR`](Self::MAX_FACTOR) is [`Max`](Self::Max).
+    /// Returns twice this rate. A rate above [`MAX_FACTOR`](Self::MAX_FACTOR) becomes [`Max`](Self::Max).
     fn doubled(self) -> PlaybackRate {
         match self {
             PlaybackRate::Times(rate) if rate < PlaybackRate::MAX_FACTOR => {
@@ -126,7 +127,7 @@ impl PlaybackRate {
 
     /// Minimum rate.
     pub const MIN_FACTOR: f64 = 1.0 / 64.0;
-    /// Maximum rate at which playback waits at all.
+    /// Maximum rate at which playback still waits between telegrams.
     pub const MAX_FACTOR: f64 = 64.0;
 }
 
@@ -177,7 +178,8 @@ impl Player {
         self.lock().lap()
     }
 
-    /// Returns when a sample of time `media` is due that belongs to no link. No link waits for it.
+    /// Returns when a sample of time `media` is due that belongs to no link, such as the angle of a mount. No link
+    /// waits for this sample.
     pub(crate) fn due(&self, media: Nanos, now: Nanos) -> PlaybackAction {
         self.lock().due(media, now, self.position())
     }
@@ -253,12 +255,12 @@ impl Player {
         }
     }
 
-    /// Returns the event that is readable when it [`is_over`](Self::is_over), or a user has ended it.
+    /// Returns the event that is readable when playback [`is_over`](Self::is_over), or a user has ended it.
     pub(crate) fn over(&self) -> &EventFd {
         &self.over
     }
 
-    /// Returns whether a user has ended it.
+    /// Returns whether a user has ended playback.
     pub(crate) fn is_ended(&self) -> bool {
         self.is_ended.load(Ordering::Relaxed)
     }
@@ -288,7 +290,7 @@ impl Player {
         }
     }
 
-    /// Returns the minimum media time of the links that still play; if none does, the maximum of all links.
+    /// Returns the minimum media time of the links that still play; if no link still plays, the maximum of all links.
     fn position(&self) -> Nanos {
         let media = |link: &LinkProgress| link.media.load(Ordering::Relaxed);
         let playing = self.links.iter().filter(|link| !link.has_ended.load(Ordering::Relaxed));
@@ -372,7 +374,8 @@ pub(crate) enum PlaybackAction {
     At(Nanos),
     /// Waits until the player changes.
     Wait,
-    /// Skips an angle: the silence that contains its time was skipped. A link never gets this action.
+    /// Skips the angle of a mount, because the silence that contains its time was skipped. A link never gets this
+    /// action.
     Skipped,
     /// Restarts with this lap.
     Restart(u32),
@@ -415,7 +418,7 @@ struct Playback {
     /// Start of the current pause, and total duration of the earlier ones, both within the time since `began_at`.
     paused_at: Option<Nanos>,
     paused: Nanos,
-    /// Whether the next telegram must be played, once all links have reported theirs.
+    /// Whether a step is pending: the next telegram is played as soon as all links have reported theirs.
     is_step_pending: bool,
     /// Whether the next actions of waiting links may have changed.
     has_changed: bool,
@@ -485,8 +488,8 @@ impl Playback {
         self.play_now(link, DueTime { at: due, stretch: (1.0 / rate).max(1.0) })
     }
 
-    /// Returns when a sample of time `media` is due that belongs to no link. `position` is the media time at maximum
-    /// rate.
+    /// Returns when a sample of time `media` is due that belongs to no link, such as the angle of a mount. `position`
+    /// is the media time at maximum rate.
     fn due(&self, media: Nanos, now: Nanos, position: Nanos) -> PlaybackAction {
         if media < self.skipped_until {
             return PlaybackAction::Skipped;
@@ -569,20 +572,20 @@ impl Playback {
         self.links.iter().all(|next| *next == NextTelegram::Ended)
     }
 
-    /// Returns how long it has played, without pauses.
+    /// Returns how long the recording has played, without pauses.
     fn elapsed(&self, now: Nanos) -> Nanos {
         let until = self.over_at.unwrap_or(now);
         let since_start = self.began_at.map_or(0, |began_at| until.saturating_sub(began_at));
         since_start.saturating_sub(self.paused_time(now))
     }
 
-    /// Returns how long it has been paused since everything was ready to play.
+    /// Returns how long playback has been paused since all links were ready to play.
     fn paused_time(&self, now: Nanos) -> Nanos {
         let until = self.over_at.unwrap_or(now);
         self.paused + self.paused_at.map_or(0, |paused_at| until.saturating_sub(paused_at))
     }
 
-    /// Sets whether it is paused. A pause counts from the moment at which playback could have run.
+    /// Sets whether playback is paused. A pause counts from the moment at which playback could have run.
     fn set_paused(&mut self, is_paused: bool, now: Nanos) {
         self.paused = self.paused_time(now);
         self.options.is_paused = is_paused;
@@ -606,14 +609,14 @@ impl Playback {
         }
     }
 
-    /// Lets `link` play. Its next telegram is unknown until it reports it.
+    /// Lets `link` play. Its next telegram is unknown until the link reports it.
     fn play_now(&mut self, link: usize, due: DueTime) -> PlaybackAction {
         self.has_played = true;
         self.links[link] = NextTelegram::Unknown;
         PlaybackAction::Now(due)
     }
 
-    /// Lets the next telegram play in a pause, if a step is pending and all links have reported theirs.
+    /// Plays the next telegram during a pause, if a step is pending and all links have reported their next telegrams.
     fn apply_step(&mut self) {
         if self.is_step_pending
             && !self.links.contains(&NextTelegram::Unknown)
@@ -649,7 +652,8 @@ impl Playback {
         self.has_changed = true;
     }
 
-    /// Shortens a silence of all links, in which the recording was interrupted. Returns whether it has.
+    /// Shortens the current silence of all links if it is so long that the recording must have been interrupted.
+    /// Returns whether it was shortened.
     fn skip_silence(&mut self, now: Nanos) -> bool {
         let media = self.media(now, 0);
         match next_media(&self.links).filter(|_| !self.links.contains(&NextTelegram::Unknown)) {
@@ -664,12 +668,12 @@ impl Playback {
     }
 }
 
-/// Returns when `media` is due at this rate, if the media time was `from` at `since`.
+/// Returns the time at which media time `media` is due at `rate`, if the media time was `from` at `since`.
 fn due_time(since: Nanos, from: Nanos, media: Nanos, rate: f64) -> Nanos {
     since.saturating_add_signed(((media as f64 - from as f64) / rate) as i64)
 }
 
-/// Returns the media time of the next telegram of all links.
+/// Returns the earliest media time of the next telegrams of all links; `None` if no link has one.
 fn next_media(links: &[NextTelegram]) -> Option<Nanos> {
     let next = |next: &NextTelegram| if let NextTelegram::At(media) = next { Some(*media) } else { None };
     links.iter().filter_map(next).min()
@@ -807,7 +811,7 @@ mod tests {
         assert_eq!(playback.next_action(1, 3 * SECOND, 100 * SECOND), PlaybackAction::Wait);
         playback.step(101 * SECOND, 0);
         assert!(is_now(playback.next_action(0, 0, 101 * SECOND), 101 * SECOND));
-        // The user steps again before the link has read on.
+        // The user steps again before the link has reported its next telegram.
         playback.step(101 * SECOND, 0);
         assert_eq!(playback.next_action(1, 3 * SECOND, 101 * SECOND), PlaybackAction::Wait);
         assert!(is_now(playback.next_action(0, 2 * SECOND, 102 * SECOND), 102 * SECOND));
@@ -862,7 +866,7 @@ mod tests {
         );
         assert_eq!(at(&playback, 3589 * SECOND), PlaybackAction::Skipped);
         assert_eq!(at(&playback, 3591 * SECOND), PlaybackAction::At(105 * SECOND));
-        // A step over a silence skips it, too, but not the time just before the next telegram.
+        // A step also skips a long silence, except for the time just before the next telegram.
         let mut playback = begun(1, PlaybackOptions { is_paused: true, ..PlaybackOptions::default() });
         assert_eq!(playback.next_action(0, 0, 100 * SECOND), PlaybackAction::Wait);
         playback.step(101 * SECOND, 0);

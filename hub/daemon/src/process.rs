@@ -1,9 +1,9 @@
 //! Services that the hub needs from the operating system: its signals, its memory and descriptors, and eventfds that
 //! wake a thread.
 //!
-//! A sparse segment that finds /dev/shm full kills the hub by SIGBUS at the first touch of a page. The hub therefore
-//! checks memory and descriptors before it starts a link. If another process takes the memory at the same moment,
-//! [`explain_bus_error`] prints a last message.
+//! If /dev/shm is full, the kernel kills the hub by SIGBUS when the hub first touches a page of a sparse segment. The
+//! hub therefore checks memory and descriptors before it starts a link. If another process takes the memory at the same
+//! moment, [`explain_bus_error`] prints a last message.
 
 use std::io::Read;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -23,11 +23,11 @@ use signal_hook::low_level::pipe::register;
 /// Signals that this process has received. SIGINT and SIGTERM end the hub. SIGHUP reloads the configuration, or ends
 /// the hub if its terminal was closed.
 pub(crate) struct Signals {
-    /// Readable after SIGINT and SIGTERM.
+    /// Stream that is readable after SIGINT and SIGTERM.
     end: UnixStream,
-    /// Readable after SIGHUP.
+    /// Stream that is readable after SIGHUP.
     hangup: UnixStream,
-    /// Whether the hub ends with its terminal.
+    /// Whether SIGHUP ends the hub, because its terminal was closed.
     ends_with_terminal: bool,
 }
 
@@ -96,12 +96,12 @@ impl EventFd {
     }
 
     pub(crate) fn signal(&self) {
-        // Fails only if it is readable already.
+        // The write fails only if the counter would overflow, and the eventfd is then already readable.
         let _ = rustix::io::write(&self.0, &1_u64.to_ne_bytes());
     }
 
     pub(crate) fn clear(&self) {
-        // Fails only if it is not readable.
+        // The read fails only if the eventfd is not readable.
         let _ = rustix::io::read(&self.0, &mut [0; 8]);
     }
 }
@@ -138,8 +138,9 @@ pub(crate) fn raise_descriptor_limit() {
     }
 }
 
-/// Checks that /dev/shm has room for links with these `limits`, one each, and for their first subscribers, and that the
-/// process may map it in addition to its threads.
+/// Checks that /dev/shm has room for the topics of the links, one for each of the `limits`, and for a first subscriber
+/// of each link. Also checks that the address space of the process has room for this memory and for the threads of the
+/// links.
 ///
 /// # Errors
 ///
@@ -164,8 +165,7 @@ pub(crate) fn no_resource(resource: &str, error: &dyn std::fmt::Display) -> Fail
     Failure::new(Kind::ResourceExhausted, format!("cannot get {resource}: {error}"), "try again later")
 }
 
-/// Returns whether the process has a terminal, whose end the kernel would report. A terminal that was closed cannot be
-/// opened any more.
+/// Returns whether the process has an open terminal. If it has, the kernel sends SIGHUP when the terminal is closed.
 fn has_terminal() -> bool {
     open("/dev/tty", OFlags::RDONLY | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty()).is_ok()
 }
@@ -182,7 +182,7 @@ const BUS_ERROR_TEXT: &[u8] =
 const BUS_ERROR_JSON: &[u8] =
     b"{\"class\":\"error\",\"kind\":\"short\",\"message\":\"shared memory is full (bus error)\",\
 \"hint\":\"free some of /dev/shm, then start again\"}\n";
-/// Address space of a link's thread in bytes: its stack, its heap, and what it maps in addition to its segments.
+/// Address space of a link's thread in bytes: its stack, its heap, and other mappings besides its segments.
 const THREAD_ADDRESS_SPACE: u64 = 4 << 20;
 
 #[cfg(test)]

@@ -2,9 +2,9 @@
 //! not have to wait for memory.
 //!
 //! iceoryx2 has the list of subscribers in a page of its own for each topic, and each send visits the slots of all
-//! possible subscribers. After a pause, none of this is in the processor's cache. The publisher therefore stores how
-//! many subscribers its topic had at the last [check](PreparedPublisher::find_subscribers), and uses iceoryx2 only if
-//! it had any.
+//! possible subscribers. After a pause, neither is in the processor's cache. The publisher therefore stores how many
+//! subscribers its topic had at the last [check](PreparedPublisher::find_subscribers), and uses iceoryx2 only if it had
+//! any.
 
 use std::fmt::Debug;
 
@@ -16,14 +16,14 @@ use crate::platform::Platform;
 
 /// Publisher of one topic, which takes a loan before the sample arrives.
 ///
-/// A topic without a history is not sent while it has no subscriber, and its number is skipped.
+/// While a topic without a history has no subscriber, its samples are not sent, and their sequence numbers are skipped.
 pub(crate) struct PreparedPublisher<P: Payload + ?Sized, M: SampleTransport<P>> {
     topic: TopicPublisher<P, M>,
     /// Number of subscribers at the last check.
     subscribers: usize,
     /// Number of subscribers that got the last sample.
     reached: usize,
-    /// Loan for the next sample, with the length of the last one.
+    /// Loan for the next sample. It has the length of the last one, `last_len`.
     prepared: Option<M::Loan>,
     last_len: usize,
 }
@@ -50,8 +50,8 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
         Ok(PreparedPublisher { topic, subscribers: 0, reached: 0, prepared: None, last_len: 0 })
     }
 
-    /// Counts the subscribers of the topic, and connects new ones. Those of a topic with a history are connected
-    /// by [`connect`](Self::connect) or with the next sample.
+    /// Counts the subscribers of the topic, and connects new ones. New subscribers of a topic with a history are
+    /// connected later: by [`connect`](Self::connect), or when the next sample is sent.
     pub(crate) fn find_subscribers(&mut self) {
         self.subscribers = self.topic.subscribers();
         if self.subscribers > 0 && history_len(P::TOPIC) == 0 {
@@ -59,8 +59,8 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
         }
     }
 
-    /// Takes a loan for the sample that is about to arrive, as long as the last one, if the topic has a subscriber.
-    /// This also brings the slots of the subscribers into the cache.
+    /// Takes a loan for the sample that is about to arrive, if samples of the topic are sent. The loan has the length
+    /// of the last sample. Taking the loan also brings the slots of the subscribers into the processor's cache.
     pub(crate) fn prepare(&mut self) {
         if self.prepared.is_none() && self.is_sent() {
             self.prepared = self.topic.loan(self.last_len).ok();
@@ -83,7 +83,7 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
     pub(crate) fn send(&mut self, loan: Loan<P, M>, header: &Header, due: &mut PendingWakeups) {
         match loan {
             Loan::Taken(loan) => {
-                // The topic counts a failure.
+                // If sending fails, the topic counts the failure.
                 if let Ok(reached) = self.topic.send_loan(loan, header) {
                     self.reached = reached;
                     due.note_sample(P::TOPIC, reached);
@@ -97,7 +97,7 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
         }
     }
 
-    /// Skips the number of a sample that is not sent, because the topic has no subscriber.
+    /// Skips the sequence number of a sample that is not sent, because the topic has no subscriber.
     pub(crate) fn skip(&mut self) {
         self.topic.skip_numbers(1);
         self.reached = 0;
@@ -131,12 +131,12 @@ impl<P: Payload + ?Sized, M: SampleTransport<P>> PreparedPublisher<P, M> {
         }
     }
 
-    /// Returns whether samples are sent: the topic has a subscriber, or a history for later ones.
+    /// Returns whether samples are sent: the topic has a subscriber, or a history for later subscribers.
     pub(crate) fn is_sent(&self) -> bool {
         history_len(P::TOPIC) > 0 || self.subscribers > 0
     }
 
-    /// Counts the subscribers again, because one did not get a sample: it has left, or cannot be connected.
+    /// Counts the subscribers again, because a subscriber did not get a sample: it has left, or it cannot be connected.
     #[cold]
     fn note_departure(&mut self) {
         self.subscribers = self.topic.subscribers();

@@ -1,9 +1,10 @@
 //! Reader of a recording that needs no hub. The code of a replay computes the samples, and they stay in the memory of
 //! this process.
 //!
-//! A link plays each sensor, as in [`replay`](fn@crate::replay) at maximum rate, so that payloads are equal bit for
-//! bit. The reader never waits and starts no thread. [`RecordingReader::step`] plays the next telegram of the sensor
-//! whose telegram ends first, and publishes its samples into a queue. Memory is for these samples, not for the file.
+//! A link plays each sensor, as in [`replay`](fn@crate::replay) at maximum rate, so the payloads are equal to those of
+//! a replay, bit for bit. The reader never waits and starts no thread. [`RecordingReader::step`] plays the next
+//! telegram of the sensor whose telegram ends first, and publishes its samples into a queue. The reader needs memory
+//! for these samples, but not for the whole file.
 
 use std::borrow::{Borrow, BorrowMut};
 use std::collections::VecDeque;
@@ -37,11 +38,12 @@ use crate::replay_hub::RecordedSet;
 pub struct ReadOptions<'a> {
     /// The recording.
     pub file: &'a Path,
-    /// Only sensor to read. For a recording that has no sensor names, the name that its sensor gets.
+    /// Name of the only sensor to read; `None` for all sensors. If the recording has no sensor names, its sensor gets
+    /// this name.
     pub sensor: Option<&'a str>,
-    /// Family of the scanners; `None` if it is recognized by the recording.
+    /// Family of the scanners; `None` if the reader recognizes the family from the recording.
     pub family: Option<Family>,
-    /// Configuration of its sensors.
+    /// Configuration of the sensors in the recording.
     pub sources: &'a Sources,
     /// Topics to read.
     pub topics: &'a [Topic],
@@ -49,8 +51,8 @@ pub struct ReadOptions<'a> {
 
 /// Reader of a recording.
 ///
-/// Stamps are by the clock of the hub that made the recording. If it has several runs of the hub, this is the clock of
-/// the first one. A recording without stamps starts at 10 s.
+/// Stamps are by the clock of the hub that made the recording. If the recording contains several runs of the hub, all
+/// stamps are by the clock of the first run. The stamps of a recording without stamps start at 10 s.
 pub struct RecordingReader {
     links: OwnedLinks,
     queue: Arc<SampleQueue>,
@@ -90,7 +92,8 @@ struct Parts {
 type Links<'a> = Vec<ReadLink<'a>>;
 
 impl RecordingReader {
-    /// Returns the topics that a link publishes from whole telegrams. Early warnings need parts of telegrams.
+    /// Returns the topics that a link publishes from whole telegrams: all except early warnings, which need parts of
+    /// telegrams.
     pub fn topics() -> impl Iterator<Item = Topic> {
         Topic::OF_LINKS.into_iter().filter(|topic| *topic != Topic::Early)
     }
@@ -99,9 +102,9 @@ impl RecordingReader {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor or a topic
-    /// is not computed from telegrams, and [`Kind::Configuration`] if it contradicts the configuration. Returns
-    /// [`Kind::ResourceExhausted`] if no descriptors are left.
+    /// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if the recording does not contain the
+    /// sensor or if a topic is not computed from telegrams, and [`Kind::Configuration`] if the recording contradicts
+    /// the configuration. Returns [`Kind::ResourceExhausted`] if no descriptors are left.
     pub fn open(options: &ReadOptions<'_>) -> Result<RecordingReader, Failure> {
         for topic in options.topics {
             check(*topic)?;
@@ -146,8 +149,8 @@ impl RecordingReader {
         damage.into_iter().chain(of_links).collect()
     }
 
-    /// Returns once, at the end of the recording, a failure if the file has become shorter or unreadable since it was
-    /// opened.
+    /// Returns a failure if the reader has reached the end of a file that became shorter or unreadable after it was
+    /// opened. The failure is returned only once.
     pub fn take_shortfall(&mut self) -> Option<Failure> {
         let lacks: Vec<_> = self.links.with_dependent_mut(|parts, links| {
             let of_links = parts.config.links.iter().zip(links);
@@ -261,7 +264,7 @@ impl ReadLink<'_> {
     /// Returns the media time of the next step; `None` at the end.
     fn next_media(&self) -> Option<Nanos> {
         match &self.phase {
-            // At its end, the next step ends the lap.
+            // When the lap has no further telegram, the next step ends it.
             Phase::Playing(lap) => Some(lap.next_media().unwrap_or(0)),
             Phase::Expiring(media) => Some(*media),
             Phase::Over => None,
@@ -291,7 +294,7 @@ impl ReadLink<'_> {
     }
 }
 
-/// Pace at which every telegram is due at once, at its recorded time.
+/// Timing in which every telegram is due at once, and gets its recorded time.
 struct ImmediateTiming;
 
 impl ReplayTiming<MemoryPlatform> for ImmediateTiming {
@@ -325,14 +328,14 @@ struct MemoryPlatform {
     /// Topics that have a subscriber.
     topics: Vec<Topic>,
     queue: Arc<SampleQueue>,
-    /// Both clocks at media time 0.
+    /// CLOCK_MONOTONIC and the wall clock at media time 0, in ns.
     begin: Nanos,
     begin_wall_ns: u64,
     now: AtomicU64,
 }
 
 impl MemoryPlatform {
-    /// Sets the clock to media time `media`, unless it is later already. Returns its time.
+    /// Sets the clock to media time `media`, unless the clock is already later. Returns the time of the clock.
     fn advance(&self, media: Nanos) -> Nanos {
         let now = self.begin.saturating_add(media).min(MAX_STAMP).max(self.now());
         self.now.store(now, Ordering::Relaxed);
@@ -384,7 +387,7 @@ impl Platform for MemoryPlatform {
     }
 
     fn attach_count(&self) -> Option<u32> {
-        // The subscribers are the same from the start.
+        // The subscribers never change.
         Some(0)
     }
 
@@ -523,7 +526,8 @@ mod tests {
         std::fs::write(file, times.iter().map(line).collect::<String>()).unwrap();
     }
 
-    /// Writes a recording of sensors, each with the times of its scans. The first telegram of a sensor has its mode.
+    /// Writes a recording of sensors, each with the times of its scans. The first telegram of each sensor reports its
+    /// measuring mode.
     fn write_mcap(file: &Path, sensors: &[(&str, Vec<Times>)]) {
         let mut writer = Writer::begin(File::create(file).unwrap(), "", BTreeMap::new()).unwrap();
         let mode = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10);
@@ -585,7 +589,7 @@ mod tests {
     fn samples_are_sorted_by_last_byte() {
         let folder = TempDir::new().unwrap();
         let file = folder.path().join("a.mcap");
-        // One of them sends for much longer than the other.
+        // A telegram of `slow` takes 190 ms, and a telegram of `fast` 3 ms.
         let slow = (0..20).map(|at| (1_000 + at * 200, 1_190 + at * 200)).collect();
         let fast = (0..100).map(|at| (1_003 + at * 40, 1_006 + at * 40)).collect();
         write_mcap(&file, &[("slow", slow), ("fast", fast)]);

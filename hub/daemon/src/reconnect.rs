@@ -1,6 +1,6 @@
 //! Connection of a link to its port. The link streams while the port exists, polls for it while it is missing, and
-//! opens it again under the same name, even if that is another device. While another process publishes under the
-//! sensor's name, the link does not open the port and waits for the name. Each reason is logged once.
+//! opens it again under the same name, even if the name then belongs to another device. While another process publishes
+//! under the sensor's name, the link does not open the port and waits for the name. Each reason is logged once.
 
 use std::io;
 
@@ -23,14 +23,14 @@ pub struct LiveLink<'a, S: Platform> {
     /// Consecutive connections that closed without delivering a byte.
     empty_connections: u32,
     has_begun: bool,
-    /// Whether another process has had the sensor's name since the link exists.
+    /// Whether another process has had the sensor's name since the link was created.
     lacks_name: bool,
 }
 
 /// A port that was just opened.
 struct OpenedPort<L> {
     line: L,
-    /// Whether it has the rate with which the session starts.
+    /// Whether the port has the baud rate with which the session starts.
     has_rate: bool,
     /// Whether a service manager kept the line of a killed hub open, with the bytes that it has received.
     is_kept: bool,
@@ -39,7 +39,7 @@ struct OpenedPort<L> {
 /// State of the port.
 enum Phase<L> {
     Open(Box<OpenLine<L>>),
-    /// The link tries to open it at `retry_at`, and the next wait ends at `until`.
+    /// The port is not open. The link tries to open it at `retry_at`, and the next wait ends at `until`.
     Unavailable {
         reason: PortUnavailable,
         retry_at: Nanos,
@@ -61,8 +61,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     ///
     /// Returns an error of kind [`PortNotTty`](scanhub_schema::Kind::PortNotTty) if the port is not a serial line at
     /// all, an error of kind [`ResourceExhausted`](scanhub_schema::Kind::ResourceExhausted) if descriptors or memory
-    /// run out, and those of [`Platform::transport`]. The link waits for a port that is missing, in use or forbidden, or that cannot
-    /// have the rate, and for a name that another process has.
+    /// run out, and the errors of [`Platform::transport`]. It is not an error if the port is missing, in use or
+    /// forbidden, or rejects the baud rate, or if another process has the name: the link then waits.
     pub fn new(
         link: &'a scanhub_config::Link,
         number: u8,
@@ -70,7 +70,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         platform: &'a S,
         control: ControlQueue,
     ) -> Result<Self, Failure> {
-        // Take the name before creating the topics, because a subscriber that finds a topic sleeps at its doorbell.
+        // Take the name before creating the topics, because a subscriber that finds a topic sleeps at its doorbell,
+        // which must exist by then.
         let name_failure = match platform.take_name() {
             Ok(()) => None,
             Err(failure) if failure.kind == Kind::NameHeld => Some(failure),
@@ -89,7 +90,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         }
         match live.open_first() {
             Ok(Some(port)) => {
-                // If the line was closed in between, another scanner may be connected, or the same one in another mode.
+                // If the line was closed since the previous hub, another scanner may be connected, or the same scanner
+                // may be in another mode.
                 let identity = saved_identity.filter(|_| port.is_kept);
                 live.start_session(port, identity);
                 Ok(live)
@@ -99,7 +101,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
                 live.schedule_retry(PortUnavailable { message, ..PortUnavailable::default() });
                 Ok(live)
             }
-            // Only the hub plays recordings, so the hint of the port does not name them.
+            // Other programs that open ports play no recordings, so the hint of [`PortError`] does not mention
+            // recordings.
             Err(error @ PortError::NotTty) => {
                 let failure = platform.explain(&error, &link.port);
                 let hint = format!("{}, or file:PATH for a recording", failure.hint);
@@ -125,7 +128,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         self.lacks_name
     }
 
-    /// Returns whether the link has tried to open its port, with any result, or must not because it lacks its name.
+    /// Returns whether the link has tried to open its port, with any result, or must not open it because it lacks its
+    /// name.
     pub fn has_tried(&self) -> bool {
         match &self.phase {
             Phase::Open(_) => true,
@@ -194,8 +198,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         Some(OpenedPort { line, has_rate: true, is_kept: true })
     }
 
-    /// Opens the port at `baud`. A search skips a rate that the port rejects, so the port is then opened at another
-    /// rate. Returns `None` while a connection is being made.
+    /// Opens the port at `baud`. If the port rejects `baud` during a search, it is opened at another rate, because the
+    /// search skips rejected rates. Returns `None` while a connection is being made.
     fn open(&mut self, baud: u32) -> Option<Result<OpenedPort<S::Port>, PortError>> {
         let LinkState { link, platform, .. } = self.core;
         let (opened, has_rate) = match platform.open(&link.port, baud) {
@@ -233,8 +237,8 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         }
     }
 
-    /// Creates a session on a port that was just opened. With the `identity` of the scanner, it continues with a stream
-    /// at once.
+    /// Creates a session on a port that was just opened. If the `identity` of the scanner is given, the session accepts
+    /// the scanner's running stream at once.
     fn start_session(
         &mut self,
         OpenedPort { line, has_rate, .. }: OpenedPort<S::Port>,
@@ -357,12 +361,13 @@ struct PortUnavailable {
     message: String,
     /// Time at which the message was made.
     since: Nanos,
-    /// Consecutive attempts that found a port that cannot be opened, or one that closed without delivering a byte.
+    /// Number of consecutive attempts at which the port existed, but could not be opened or closed without delivering a
+    /// byte.
     failures: u32,
 }
 
 impl PortUnavailable {
-    /// Creates the reason that the port is missing. The `message` stays while it is.
+    /// Creates the reason that the port is missing. The `message` stays while the port is missing.
     fn missing(message: String) -> PortUnavailable {
         PortUnavailable { error: Some(PortError::Missing), message, ..PortUnavailable::default() }
     }
@@ -377,7 +382,7 @@ impl PortUnavailable {
         let is_missing = *error == PortError::Missing;
         self.failures = if is_missing { 0 } else { self.failures + 1 };
         let has_changed = self.error.as_ref() != Some(error);
-        // By now, another process than the one in the message may hold the port.
+        // Another process than the one that the message names may hold the port by now.
         if has_changed || (!is_missing && now >= self.since + STALE_AFTER) {
             self.message = explain(error);
             self.since = now;
@@ -385,9 +390,9 @@ impl PortUnavailable {
         self.error = Some(error.clone());
     }
 
-    /// Returns the time until the next attempt. A missing port is only searched for by name. The interval grows for a
-    /// port that exists but cannot be opened. The first attempts follow quickly, because udev sets the group of a new
-    /// device a moment after it appears.
+    /// Returns the time until the next attempt. For a missing port, the interval stays short, because an attempt only
+    /// searches for the port's name. For a port that exists but cannot be opened, the interval grows. The first
+    /// attempts follow quickly, because udev sets the group of a new device a moment after it appears.
     fn retry_interval(&self) -> Nanos {
         POLL_INTERVAL << self.failures.saturating_sub(1).min(MAX_DOUBLINGS)
     }
@@ -398,11 +403,11 @@ fn one_line(failure: Failure) -> String {
     format!("{}; {}", failure.message, failure.hint)
 }
 
-/// Rate that every port supports, in bits per second.
+/// Baud rate at which a port is opened that rejects the rate of a search. Every port supports it.
 const SUPPORTED_RATE: u32 = 9_600;
 /// Interval between attempts to open an unavailable port.
 const POLL_INTERVAL: Nanos = 100 * MILLIS;
-/// Maximum number of times that this interval doubles.
+/// Maximum number of times that [`POLL_INTERVAL`] doubles, so the longest interval is 1.6 s.
 const MAX_DOUBLINGS: u32 = 4;
 /// Interval of the statuses while a connection is being made.
 const OPENING_STATUS_PERIOD: Nanos = 1_000 * MILLIS;

@@ -1,5 +1,5 @@
-//! Reload of the configuration while the hub runs. Settings of the processors change with the next scan, and no scan
-//! is lost. Settings of a line wait for the next start of the hub, which the log says. An invalid configuration
+//! Reload of the configuration while the hub runs. Settings of the processors change with the next scan, and no scan is
+//! lost. Settings of a line apply only at the next start of the hub, and the log lists them. An invalid configuration
 //! changes nothing.
 
 use scanhub_config::{Background, Config, Link, Processing};
@@ -11,7 +11,7 @@ use crate::service::Service;
 /// Function that reads the configuration.
 pub type ConfigLoader<'a> = &'a dyn Fn() -> Result<Config, Failure>;
 
-/// Running configuration of the hub, and the loader of the new one.
+/// Running configuration of the hub, and the function that loads the new one.
 pub struct Reload<'a> {
     running: Config,
     loader: ConfigLoader<'a>,
@@ -33,7 +33,7 @@ impl<'a> Reload<'a> {
         Reload { running: running.clone(), loader, service }
     }
 
-    /// Reads the configuration at `now`, sends the links their new settings by `commands`, and logs the result.
+    /// Reads the configuration at `now`, sends the links their new settings through `commands`, and logs the result.
     pub fn reload(&mut self, commands: &CommandSender, now: Nanos) {
         self.service.notify_reloading(now);
         let refused = match (self.loader)() {
@@ -72,7 +72,8 @@ impl<'a> Reload<'a> {
     }
 }
 
-/// Returns the message for changes that a running hub cannot apply: keys, or the link itself.
+/// Returns the message for changes that a running hub cannot apply. `changes` contains the changed keys of a link, or
+/// that the link was added or removed.
 fn postponed(changes: &[&str]) -> String {
     let pronoun = if changes.len() == 1 { "it" } else { "them" };
     let what = match changes {
@@ -223,7 +224,7 @@ mod tests {
             (sections.join(" "), later),
             ("background".to_owned(), vec![("a".to_owned(), vec!["background.start"])])
         );
-        // A background that was off takes the new start.
+        // A background that was off takes over the new value of `background.start`.
         let off = of(&["background.method=off", "background.start=first-scan"]);
         let Differences { now, later } = Differences::between(&off, &of(&[]));
         assert_eq!((now[0].1.background.learning.start, later), (Start::Empty, Vec::new()));

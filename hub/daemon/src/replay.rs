@@ -3,7 +3,7 @@
 //!
 //! `recorded.rs` opens recordings and computes the media time of their telegrams. Recordings with stamps are played by
 //! `frames.rs`, and a stream of bytes by `bytes.rs`. A [`ReplayTiming`] defines when a telegram is due:
-//! [`PlayerTiming`] waits for the player of a hub, and `reader.rs` has one that never waits.
+//! [`PlayerTiming`] waits for the player of a hub, and `reader.rs` has a timing that never waits.
 //!
 //! [`RecordedMount`] plays the angles of a mount. Another program publishes them, because a hub has no topic for them.
 
@@ -89,7 +89,7 @@ pub(crate) fn begin<S: Platform>(link: &mut LinkState<'_, S>) {
 
 /// Times at which the telegrams of a recording are due.
 pub(crate) trait ReplayTiming<S: Platform> {
-    /// Returns the start of the played part, and its end if it is not that of the recording, as media times.
+    /// Returns the start of the played part, and its end if this is not the end of the recording, as media times.
     fn range(&self) -> (Nanos, Option<Nanos>);
 
     /// Waits until a telegram of time `media` is due. Meanwhile, `link` publishes the status that `description`
@@ -134,7 +134,7 @@ impl<'a, S: Platform, P: ReplayTiming<S>> ReplayLink<'a, S, P> {
         ReplayLink { link, timing, problem }
     }
 
-    /// Sets the wall clock to that of the start of `recorded`.
+    /// Sets the wall clock of the next samples to the start of `recorded`.
     pub(crate) fn set_begin(&mut self, recorded: &RecordedSensor) {
         if let Some(wall_ns) = recorded.begin_ns() {
             self.link.output.topics.set_recorded_time(wall_ns, Flags::REPLAYED);
@@ -195,7 +195,7 @@ impl<'f> Lap<'f> {
     }
 
     /// Plays the next telegram, or the next few bytes of a stream. If the last verdict becomes stale before the next
-    /// telegram ends, only publishes that. Returns `None` if the hub must end.
+    /// telegram ends, publishes only this change. Returns `None` if the hub must end.
     pub(crate) fn step<S: Platform>(
         &mut self,
         replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>,
@@ -226,21 +226,21 @@ impl<'f> Lap<'f> {
     }
 }
 
-/// Keeps the last verdict valid for `lifetime` from now on. `None` means that there was none.
+/// Keeps the last verdict valid for `lifetime` from now on. `None` means that there was no verdict.
 fn expire_after<S: Platform>(replay: &mut ReplayLink<'_, S, impl ReplayTiming<S>>, lifetime: Option<Nanos>) {
     let now = replay.link.platform.now();
     replay.link.output.extend_verdict(lifetime.map_or(Nanos::MAX, |lifetime| now.saturating_add(lifetime)));
 }
 
 impl<'a> ReplayLink<'a, System<'a>, PlayerTiming<'_>> {
-    /// Waits for a short time until a subscriber is attached: a user who starts a hub and a subscriber together wants
-    /// the recording from its beginning.
+    /// Waits for a short time until a subscriber is attached, because a user who starts a hub and a subscriber together
+    /// wants to receive the recording from its beginning.
     fn await_subscriber(&mut self) -> WakeReason {
         let (mut until, mut has_subscribers) = (clock::now() + FIRST_SUBSCRIBER_TIMEOUT, false);
         while clock::now() < until {
             if !has_subscribers && self.link.output.topics.has_subscribers() {
                 has_subscribers = true;
-                // A program subscribes to several topics, and others may start with it.
+                // A program may subscribe to several topics, and other programs may start together with it.
                 until = until.min(clock::now() + OTHER_TOPICS_TIME);
             }
             self.link.publish_status(None, State::Starting, "");
@@ -287,7 +287,7 @@ impl<'a> ReplayLink<'a, System<'a>, PlayerTiming<'_>> {
     }
 }
 
-/// Pace of the player of a hub.
+/// Timing of the player of a hub.
 struct PlayerTiming<'p> {
     handle: PlayerHandle<'p>,
     /// Time of the next check for requests while the link plays without a wait.
@@ -376,7 +376,7 @@ pub struct RecordedMount {
 /// An angle that is due.
 #[derive(Clone, Copy, Debug)]
 pub struct RecordedAngle {
-    /// Time at which it is due in the replay, CLOCK_MONOTONIC in ns.
+    /// Time at which the angle is due in the replay, CLOCK_MONOTONIC in ns.
     pub stamp_ns: u64,
     /// Header of the sample in the recording.
     pub header: Header,
@@ -434,7 +434,8 @@ impl RecordedMount {
     }
 }
 
-/// Waits until something of `media` is due or skipped, or until the lap ends: [`PlaybackAction::Over`].
+/// Waits until a sample of time `media` is due or skipped, or until the lap ends. Returns [`PlaybackAction::Over`] at
+/// the end of the lap.
 fn wait(player: &Player, media: Nanos, is_current: &impl Fn() -> bool) -> PlaybackAction {
     while is_current() {
         let now = clock::now();
@@ -451,15 +452,17 @@ fn wait(player: &Player, media: Nanos, is_current: &impl Fn() -> bool) -> Playba
 
 /// Validity of a verdict while a recording plays: until the next verdict, even while the player waits.
 const VALID_UNTIL_NEXT: Nanos = Nanos::MAX - 1;
-/// Latest stamp. A later one in a file counts as this one, so that sums with durations do not overflow.
+/// Latest stamp. A later stamp in a file is replaced by this one, so that sums with durations do not overflow.
 pub(crate) const MAX_STAMP: Nanos = i64::MAX as Nanos - (1 << 56);
-/// Maximum recorded period that is accepted.
+/// Maximum duration of a frame and maximum time to the next scan that are taken over from a recording. Within this
+/// time, an earlier wall clock does not count as set back.
 const MAX_GAP: Nanos = 10_000 * MILLIS;
 /// Interval of the statuses while nothing plays.
 const IDLE_STATUS_INTERVAL: Nanos = 100 * MILLIS;
 /// Time after which the recording of a link begins without a subscriber.
 const FIRST_SUBSCRIBER_TIMEOUT: Nanos = 1_000 * MILLIS;
-/// Time that a subscriber to the first topic has for the others.
+/// Time between the first subscription and the start of the recording, in which programs can subscribe to further
+/// topics.
 const OTHER_TOPICS_TIME: Nanos = 100 * MILLIS;
 /// Interval of the checks for requests and the end of the hub while a link plays without a wait.
 const POLL_INTERVAL: Nanos = 5 * MILLIS;

@@ -1,5 +1,5 @@
-//! A hub that plays a recording: finds the sensors in it and their configuration, and creates one player for all links.
-//! `reader.rs` uses the same sensors and configuration without a hub.
+//! A hub that plays a recording. This module finds the sensors in the recording and their configuration, and creates
+//! one player for all links. `reader.rs` uses the same sensors and configuration without a hub.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -20,11 +20,12 @@ use crate::supervise::{self, ReplaySet, StartReport};
 pub struct Replay<'a> {
     /// The recording.
     pub file: &'a Path,
-    /// Only sensor to play, without mounts. For a recording that has no sensor names, the name that its sensor gets.
+    /// Name of the only sensor to play, without mounts; `None` for all sensors. If the recording has no sensor names,
+    /// its sensor gets this name.
     pub sensor: Option<&'a str>,
-    /// Family of a stream file; `None` if it is recognized by the bytes.
+    /// Family of a stream file; `None` if the hub recognizes the family from the bytes.
     pub family: Option<Family>,
-    /// Configuration of its sensors.
+    /// Configuration of the sensors in the recording.
     pub sources: &'a Sources,
     /// Options of the player.
     pub options: PlaybackOptions,
@@ -38,9 +39,9 @@ pub struct Replay<'a> {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor,
-/// [`Kind::Usage`] if it ends before the requested start, and [`Kind::Configuration`] if it contradicts the
-/// configuration. Also returns the errors of [`run`](crate::run).
+/// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if the recording does not contain the
+/// sensor, [`Kind::Usage`] if the recording ends before the requested start, and [`Kind::Configuration`] if the
+/// recording contradicts the configuration. Also returns the errors of [`run`](crate::run).
 pub fn replay(
     replay: &Replay<'_>,
     domain: &Domain,
@@ -62,7 +63,7 @@ pub fn replay(
     let length = parts.iter().filter_map(RecordedSensor::length).max();
     let start_ns = replay.options.start_ns;
     if length.is_some_and(|length| start_ns > length) {
-        // The length is by wall clocks, and one of them may have been set. Read the recording to be sure.
+        // The length was computed from the wall clock, which may have been set. Read the recording to be sure.
         let mut ends = Vec::with_capacity(links);
         for part in &parts {
             ends.push(part.end()?);
@@ -160,7 +161,7 @@ fn sensors(recording: &Recording, chosen: Option<&str>) -> Result<Vec<Sensor>, F
         return Ok(vec![Sensor::new(None, link, recording)]);
     }
     let chosen = match chosen {
-        // Messages name the link of a remote sensor.
+        // The user may also name a remote sensor by its link, because messages use the name of the link.
         Some(chosen) if !names.iter().any(|name| name == chosen) => {
             let recorded = names.iter().find(|name| link_name(name) == chosen);
             Some(recorded.map_or(chosen, String::as_str))
@@ -219,7 +220,8 @@ fn mounts(
 /// Returns a name for the link of `sensor`. The name of a remote sensor has a dot, which a link cannot have.
 fn link_name(sensor: &str) -> String {
     let name: String = sensor.chars().map(|c| if c == '.' { '-' } else { c }).collect();
-    // Drop the start of a long name: a machine without a name has a long ID there, and the sensor's name is the end.
+    // Drop the start of a long name. It may be the long ID of a machine without a name, and the sensor's own name is at
+    // the end.
     let excess = name.len().saturating_sub(MAX_NAME_LEN);
     name.get(excess..).unwrap_or(&name).to_owned()
 }
@@ -246,11 +248,12 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
     Ok(config)
 }
 
-/// Returns `sources` with a link for each of `sensors`, and the names of the links without a configured family. They
-/// have that of their sensor.
+/// Returns `sources` with a link for each of `sensors`, and the names of the links without a configured family. These
+/// links get the family of their sensor.
 fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<(Sources, Vec<String>), Failure> {
     let mut sources = sources.clone();
-    // Not the path itself, which may contain characters with a meaning in the name of a port.
+    // The port does not name the real path, because a path may contain characters that have a meaning in the name of a
+    // port.
     for sensor in sensors {
         let name = format!("{}=", sensor.link);
         if !sources.links.iter().any(|link| link.starts_with(&name)) {
@@ -279,7 +282,7 @@ fn links_without_sensor(
     Ok(all.filter(|name| config.links.iter().all(|link| link.name != *name)).collect())
 }
 
-/// Name of a sensor that has none in the recording.
+/// Name of the sensor, if the recording has no sensor names.
 const DEFAULT_NAME: &str = "front";
 /// Maximum length of a sensor's name in bytes.
 const MAX_NAME_LEN: usize = 24;

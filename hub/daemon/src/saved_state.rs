@@ -2,10 +2,10 @@
 //! and the scanner that a search found. Without a background, a person who stands in front of a sensor while the hub
 //! starts becomes part of the background, and foreground is unknown for seconds.
 //!
-//! A link hands state over between two scans, by a [`SaveSlot`], and never waits for a disk. [`StateSaver`] decides
-//! when to write it to a [`StateStore`], and a [`StateWriter`] is the thread that runs it. Each record is a text of
-//! its own for each sensor. A record is used only for the same sensor at the same port, or at the same pose. A wrong
-//! one costs only time.
+//! A link hands state over between two scans, through a [`SaveSlot`], and never waits for a disk. [`StateSaver`]
+//! decides when to write the state to a [`StateStore`], and a [`StateWriter`] is the thread that runs the saver. Each
+//! record of a sensor is a separate text. A record is used only if the sensor still has the same port or, for a
+//! background, the same pose. A record that is wrong nevertheless costs only time.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -32,24 +32,24 @@ pub trait StateStore {
     ///
     /// # Errors
     ///
-    /// Returns an error if it cannot be read, or has more than `max_len` bytes.
+    /// Returns an error if the text cannot be read, or has more than `max_len` bytes.
     fn read(&self, name: &str, max_len: u64) -> Result<Option<String>, Failure>;
 
     /// Replaces the text of `name`, as a whole or not at all.
     ///
     /// # Errors
     ///
-    /// Returns an error if it cannot be written; the previous text then stays.
+    /// Returns an error if the text cannot be written; the previous text then stays.
     fn write(&self, name: &str, text: &str) -> Result<(), Failure>;
 
-    /// Removes `name`, if it exists.
+    /// Removes the text of `name`, if it exists.
     ///
     /// # Errors
     ///
-    /// Returns an error if it cannot be removed.
+    /// Returns an error if the text cannot be removed.
     fn remove(&self, name: &str) -> Result<(), Failure>;
 
-    /// Returns the location of `name`, for a message.
+    /// Returns the location of the text of `name`, for a message.
     fn location(&self, name: &str) -> String;
 }
 
@@ -71,7 +71,8 @@ impl StateStore for StateDirectory {
     }
 }
 
-/// Writes the state that links hand over when it is due. It does no waiting of its own: the time is an argument.
+/// Writer of the state that links have handed over. The saver never waits and reads no clock: the time is an argument,
+/// and the deadline of the next write is returned.
 pub struct StateSaver<F> {
     store: F,
     queue: Arc<SaveQueue>,
@@ -82,16 +83,16 @@ pub struct StateSaver<F> {
 /// State that all links have handed over.
 pub struct SaveQueue {
     slots: Vec<LinkSlot>,
-    /// Readable when a link has handed something over.
+    /// Event that is readable when a link has handed something over.
     event: EventFd,
 }
 
 /// State of one link.
 struct LinkSlot {
     sensor: String,
-    /// The newest background that was not taken yet.
+    /// The newest background that the saver has not taken yet.
     background: Mutex<Option<(Pose, Box<Background>)>>,
-    /// Wall clock at which the saved background was written; 0 if none is saved.
+    /// Wall clock at which the saved background was written; 0 if no background is saved.
     saved_wall_ns: AtomicU64,
     /// Rate at which the scanner was found last.
     rate: SavedRecord<KnownRate>,
@@ -114,7 +115,7 @@ struct BackgroundWrites {
     /// Background that is written at `due`.
     pending: Option<(Pose, Box<Background>)>,
     due: Nanos,
-    /// Whether the log has a failure to write.
+    /// Whether the last failed write was logged.
     is_failure_logged: bool,
 }
 
@@ -136,7 +137,7 @@ impl<F: StateStore> StateSaver<F> {
             sensor: link.name.clone(),
             background: Mutex::default(),
             saved_wall_ns: AtomicU64::new(load_background(link, &store, wall_ns)),
-            // Only the rate of a tty can be changed.
+            // Only a tty has a rate that the hub can change.
             rate: SavedRecord::load(&link.name, &store, matches!(link.port, PortSpec::Tty(_))),
             scanner: SavedRecord::load(&link.name, &store, link.family().is_none()),
         };
@@ -155,7 +156,8 @@ impl<F: StateStore> StateSaver<F> {
     }
 
     /// Writes the state that is due at `now`: the first background of a generation at once, later ones once a minute,
-    /// and everything if this call `is_last`. Returns the time of the next write; `Nanos::MAX` if nothing waits.
+    /// and everything at the end of the hub (`is_last`). Returns the time of the next write; `Nanos::MAX` if nothing
+    /// waits.
     pub fn flush_due(&mut self, now: Nanos, wall_ns: u64, is_last: bool) -> Nanos {
         let mut next = Nanos::MAX;
         for (slot, writes) in self.queue.slots.iter().zip(&mut self.backgrounds) {
@@ -219,8 +221,8 @@ impl SavedState for SaveSlot<'_> {
 }
 
 impl LinkSlot {
-    /// Writes `model` into the background file. A model without a known beam removes the file, because the saved one is
-    /// outdated.
+    /// Writes `model` into the background file. A model without a known beam removes the file, because the saved model
+    /// is then outdated.
     fn write_background(
         &self,
         store: &impl StateStore,
@@ -294,7 +296,7 @@ impl Drop for StateWriter {
 /// Scanner that was found at a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct KnownScanner {
-    /// Family and rates.
+    /// Family of the scanner, and its baud rates.
     pub memory: Memory,
     /// Name of the model in lower case, if the scanner has reported it.
     pub model: Option<String>,
@@ -311,21 +313,21 @@ impl KnownScanner {
     }
 }
 
-/// Record about the scanner at a port. Its text is a line of words without spaces, which ends with the name of the
-/// port.
+/// Record about the scanner at a port. The text of the record is a line of words without spaces, which ends with the
+/// name of the port.
 ///
-/// After power-on, a scanner has the same rate each time, so a search that starts there saves the timeouts of the other
-/// rates.
+/// After power-on, a scanner has the same rate each time, so a search that starts at the saved rate avoids the timeouts
+/// of the other rates.
 trait PortRecord: Clone + PartialEq {
     /// Extension of the file's name.
     const EXTENSION: &'static str;
-    /// Number of words.
+    /// Number of words before the name of the port.
     const FIELD_COUNT: usize;
 
-    /// Returns the words, with a space between two of them.
+    /// Returns the words, separated by spaces.
     fn fields(&self) -> String;
 
-    /// Parses the words. Returns `None` if they are damaged.
+    /// Parses the words. Returns `None` if a word is damaged.
     fn parse(fields: &[&str]) -> Option<Self>;
 }
 
@@ -374,7 +376,7 @@ struct SavedRecord<K>(Mutex<RecordState<K>>);
 struct RecordState<K> {
     /// The record and the port that it belongs to.
     record: Option<(K, String)>,
-    /// Whether it must be written.
+    /// Whether the record must be written.
     is_new: bool,
 }
 
@@ -396,7 +398,7 @@ impl<K: PortRecord> SavedRecord<K> {
         known.as_ref().filter(|(_, of)| of == port).map(|(known, _)| known.clone())
     }
 
-    /// Replaces the record. Returns whether it was different.
+    /// Replaces the record. Returns whether the previous record was different.
     fn replace(&self, port: &str, record: K) -> bool {
         let record = Some((record, port.to_owned()));
         let mut state = lock(&self.0);
@@ -407,8 +409,8 @@ impl<K: PortRecord> SavedRecord<K> {
         is_new
     }
 
-    /// Writes the record of `sensor` if it is new. The lock is released first, so that a link need not wait for the
-    /// disk.
+    /// Writes the record of `sensor` if it has changed since it was last written. The lock is released first, so that a
+    /// link need not wait for the disk.
     fn write(&self, sensor: &str, store: &impl StateStore) {
         let text = {
             let mut state = lock(&self.0);
@@ -428,7 +430,7 @@ fn record_text<K: PortRecord>(record: &K, port: &str) -> String {
     format!("{} {port}\n", record.fields())
 }
 
-/// Returns the record and the port in `text`. Returns `None` if it is damaged.
+/// Returns the record and the port in `text`. Returns `None` if `text` is damaged.
 fn parse_record<K: PortRecord>(text: &str) -> Option<(K, String)> {
     let fields: Vec<_> = text.strip_suffix('\n')?.splitn(K::FIELD_COUNT + 1, ' ').collect();
     let (port, known) = fields.split_last().filter(|_| fields.iter().all(|word| !word.is_empty()))?;
@@ -439,8 +441,8 @@ fn record_file<K: PortRecord>(sensor: &str) -> String {
     format!("{sensor}.{}", K::EXTENSION)
 }
 
-/// Text of a saved background: the file that `scanhub background SENSOR save` writes, with the pose of the sensor and
-/// the time.
+/// Text of a saved background: the same as in a file of `scanhub background SENSOR save`, and in addition the pose of
+/// the sensor and the time.
 #[derive(Serialize)]
 struct BackgroundText<M> {
     #[serde(flatten)]
@@ -463,8 +465,9 @@ struct PoseText {
     upside_down: bool,
 }
 
-/// Puts the saved background of `link` into its settings, if it fits and the configuration has no other start. Returns
-/// the time at which it was written, otherwise 0.
+/// Puts the saved background of `link` into its settings, if the background fits the link and the configuration does
+/// not set how the background starts. Returns the time at which the background was written, in ns since 1970; 0 if no
+/// background is used.
 fn load_background(link: &mut Link, store: &impl StateStore, now_wall_ns: u64) -> u64 {
     let name = &link.name;
     let background = &mut link.processing.background;
@@ -554,15 +557,15 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 const THREAD_NAME: &str = "learned";
 /// Interval of the writes of a background. A hub that is killed loses at most the changes of this time.
 const WRITE_INTERVAL: Nanos = 60_000 * MILLIS;
-/// Maximum length of a background's text in bytes; a real one is much shorter.
+/// Maximum length of a background's text in bytes; the text of a real background is much shorter.
 const MAX_BACKGROUND_LEN: u64 = 1 << 20;
 /// Maximum length of a record's text in bytes: words, and a port, which is at most as long as a path.
 const MAX_RECORD_LEN: u64 = 8_192;
-/// Tolerance of a pose in meters and radians: far more than a number loses as text.
+/// Tolerance of a pose in meters and radians: far more than a number loses when it is written as text.
 const POSE_TOLERANCE: f64 = 1e-9;
-/// Stands for a model, or a number of beams, that is not known.
+/// Word in a record for a model, or a number of beams, that is not known.
 const UNKNOWN: &str = "-";
-/// Stands before the number of switches that were followed by silence.
+/// Key in a record, before the number of switches of the rate that were followed by silence.
 const SILENT_SWITCHES_KEY: &str = ",silent=";
 
 #[cfg(test)]
@@ -630,7 +633,7 @@ mod tests {
         assert!(saver.is_none());
     }
 
-    /// Checks that `known` has this `line`, and that no part of it is read.
+    /// Checks that the text of `known` is `line` with the port, and that no incomplete text is accepted.
     fn check<K: PortRecord + std::fmt::Debug>(known: &K, line: &str) {
         let text = record_text(known, PORT);
         assert_eq!(text, format!("{line} {PORT}\n"));

@@ -13,9 +13,9 @@ use sd_notify::NotifyState;
 /// The service manager. Without one, as by default, all functions have no effect.
 #[derive(Default)]
 pub struct Service {
-    /// Ports that the previous hub passed to it, with the name of the link.
+    /// Ports that the previous hub passed to the service manager, each with the name of its link.
     kept_ports: Mutex<Vec<(String, OwnedFd)>>,
-    /// Interval at which it expects a report that the hub works.
+    /// Interval at which the service manager expects a report that the hub works; `None` if it expects no reports.
     watchdog: Option<Nanos>,
 }
 
@@ -35,8 +35,9 @@ impl Service {
         Service { kept_ports: Mutex::new(named.filter_map(own).collect()), watchdog }
     }
 
-    /// Assigns each kept port to the link that has it now, according to `owner`. A port without a link is not kept any
-    /// longer. Must be called before a port is kept again, because forgetting a name forgets all ports with it.
+    /// Assigns each kept port to the link that has it now, according to `owner`. The service manager stops keeping a
+    /// port that has no link. Must be called before a port is kept again, because releasing a name releases all ports
+    /// that are kept under it.
     pub(crate) fn assign(&self, owner: impl Fn(&OwnedFd) -> Option<String>) {
         let mut kept_ports = self.kept_ports.lock().unwrap_or_else(PoisonError::into_inner);
         for (name, line) in std::mem::take(&mut *kept_ports) {
@@ -55,7 +56,7 @@ impl Service {
         Some(kept_ports.swap_remove(at).1)
     }
 
-    /// Keeps `line` under `name` until it is forgotten, hangs up, or the service is stopped.
+    /// Keeps `line` open under `name`, until the name is released, the line hangs up, or the service is stopped.
     pub(crate) fn keep(&self, name: &str, line: impl AsFd) {
         let messages = [NotifyState::FdStore, NotifyState::FdName(name)];
         log_failure(sd_notify::notify_with_fds(&messages, &[line.as_fd()]));
@@ -66,7 +67,8 @@ impl Service {
         log_failure(sd_notify::notify(&[NotifyState::FdStoreRemove, NotifyState::FdName(name)]));
     }
 
-    /// Reports that the hub reads its configuration again, as of `now`. [`ready`](Self::ready) must follow in any case.
+    /// Reports that the hub reads its configuration again, as of `now`. [`notify_ready`](Self::notify_ready) must
+    /// follow, even if the new configuration is refused.
     pub(crate) fn notify_reloading(&self, now: Nanos) {
         let micros = NotifyState::MonotonicUsec(i128::from(now / 1_000));
         log_failure(sd_notify::notify(&[NotifyState::Reloading, micros]));
@@ -86,8 +88,8 @@ impl Service {
     }
 }
 
-/// Reports to the service manager that the hub works, if every link has finished something since the last report. A
-/// timer alone would not prove that.
+/// Watchdog that reports to the service manager that the hub works, if every link has finished something since the last
+/// report. A timer alone would not prove that the links work.
 pub(crate) struct Watchdog<'a> {
     activity: &'a [AtomicBool],
     interval: Nanos,
@@ -95,7 +97,8 @@ pub(crate) struct Watchdog<'a> {
 }
 
 impl<'a> Watchdog<'a> {
-    /// Creates the watchdog of the links that set `worked`; `None` if the service manager expects no reports.
+    /// Creates the watchdog of the links that set their flags in `activity`; `None` if the service manager expects no
+    /// reports.
     pub(crate) fn new(service: &Service, activity: &'a [AtomicBool], now: Nanos) -> Option<Watchdog<'a>> {
         let interval = service.watchdog? / REPORTS_PER_INTERVAL;
         Some(Watchdog { activity, interval, next: now + interval })
@@ -126,7 +129,8 @@ fn log_failure(outcome: std::io::Result<()>) {
     }
 }
 
-/// Reports per expected one. A link that wakes up once a second is then not late.
+/// Number of reports that the hub may send in the time in which the service manager expects one. The margin is for
+/// links that wake up only once a second.
 const REPORTS_PER_INTERVAL: Nanos = 4;
 
 #[cfg(test)]

@@ -3,10 +3,10 @@
 //! The path of a scan, from the line to its subscribers, starts here:
 //!
 //! 1. **Read**: [`SessionDriver::on_wakeup`] reads into the session's buffer when the port is ready.
-//! 2. **Frame**: [`SessionDriver::drain`] asks the session for its next action. A telegram stays in that buffer; a
-//!    revolution is a list of points.
+//! 2. **Frame**: [`SessionDriver::drain`] asks the session for its next action. A telegram stays in the session's
+//!    buffer; a revolution is a list of points.
 //! 3. **Decode, process, send, ring**: [`LinkOutput`](crate::link_output::LinkOutput) publishes the telegram and the
-//!    scan, wakes the subscribers of both and of the zones, and then publishes the other results.
+//!    scan, wakes the subscribers of these two topics and of the zones, and then publishes the other results.
 //!
 //! Nothing on this path allocates, locks or logs. Opening and reopening the port is up to `reconnect.rs`.
 
@@ -40,7 +40,7 @@ pub(crate) struct SessionDriver<'a, S: Platform> {
     found_rate: Option<KnownRate>,
     /// Scanner that the search found last, in this run of the hub or an earlier one.
     scanner: Option<KnownScanner>,
-    /// Whether the log names that scanner.
+    /// Whether `scanner` was logged.
     is_scanner_logged: bool,
     /// Model and number of beams that an earlier run of the hub has saved, until the port is opened.
     saved_beams: Option<(Model, usize)>,
@@ -127,8 +127,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         self.drain(core, open)
     }
 
-    /// Returns the rate to try first when searching for the scanner: the one at which this hub, or a previous one,
-    /// found it last.
+    /// Returns the rate to try first when searching for the scanner: the rate at which this hub, or a previous hub,
+    /// last found the scanner.
     pub(crate) fn known_rate(&self, core: &LinkState<'a, S>) -> Option<KnownRate> {
         let saved_rate = || saved_rates(core)?.rate(&core.link.port.name());
         self.found_rate.or_else(saved_rate).filter(|_| is_tty(core))
@@ -172,7 +172,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         self.drain(core, open)
     }
 
-    /// Sends the session's last requests before the hub exits, such as the one that stops an RPLIDAR's motor.
+    /// Sends the session's last requests before the hub exits, such as the request that stops an RPLIDAR's motor.
     ///
     /// # Errors
     ///
@@ -276,8 +276,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
                     }
                     has_reply |= received.is_reply;
                     if let Some(lifetime) = core.publish(&received, &recorded, is_backlogged) {
-                        // On a tty, the time from a backlogged scan to the next one is unknown, so the next one never
-                        // counts as consecutive. On a network port, its stamp decides.
+                        // On a tty, the time from a backlogged scan to the next one is unknown, so the next scan never
+                        // counts as consecutive. On a network port, the stamp of the next scan decides.
                         let is_tty_backlog = is_backlogged && open.allowance.is_none();
                         self.consecutive_until =
                             if is_tty_backlog { 0 } else { received.last.saturating_add(lifetime) };
@@ -327,8 +327,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
             }
         }
         let is_streaming = session.state() == line::State::Streaming && core.stats.is_streaming();
-        // While scans arrive, only a reply or another process changes what the status reports. The few things that a
-        // scan can change are found as soon as the history is due.
+        // While scans arrive, only a reply or another process changes what the status reports. The few changes of the
+        // status that a scan can cause are detected as soon as the history is due.
         if has_reply || is_altered || !is_streaming || core.is_due(now) || core.diagnosis.is_outdated() {
             self.report(core, open, now);
         }
@@ -369,8 +369,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         self.backlog_read_at.is_some_and(|read_at| at <= read_at)
     }
 
-    /// Handles a scan or reply whose last byte arrived at `last`. A hub that was stopped could not report the silence
-    /// before it, so detect it by the stamps.
+    /// Handles a scan or reply whose last byte arrived at `last`. If the hub itself was stopped, it could not report
+    /// the silence before this scan or reply, so this function detects the silence by the stamps.
     fn note_silence(&self, core: &mut LinkState<'a, S>, last: Nanos, is_backlogged: bool) {
         if !is_backlogged && last > self.consecutive_until {
             core.output.note_silence();
@@ -386,7 +386,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         session: &mut PortSession,
         baud: u32,
     ) -> io::Result<()> {
-        // Setting the rate hides what another process has changed.
+        // Check first whether another process has changed the settings, because setting the rate would hide the change.
         restore(core, line, baud)?;
         if let Some(error) = line.set_baud(baud)? {
             self.log_rejected_rate(core, baud, &error);
@@ -395,7 +395,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         Ok(())
     }
 
-    /// Logs once why the port rejects this rate.
+    /// Logs why the port rejects `baud`, once for each rate.
     pub(crate) fn log_rejected_rate(&mut self, core: &LinkState<'a, S>, baud: u32, error: &dyn fmt::Display) {
         if !self.rejected_rates.contains(&baud) {
             self.rejected_rates.push(baud);
@@ -444,7 +444,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
                 );
             }
         } else if !is_reported && is_exchanged {
-            // The log names both scanners once the model of this one is known.
+            // The exchange is logged later, when the model of this scanner is known and the message can name both
+            // scanners.
             return;
         }
         if self.scanner.as_ref() != Some(&scanner) {
@@ -467,7 +468,8 @@ fn scanner_name(scanner: &KnownScanner) -> String {
     }
 }
 
-/// Restores the hub's settings of `line`, at `baud`, if another process has changed them. Returns whether it has.
+/// Restores the hub's settings of `line`, at `baud`, if another process has changed them. Returns whether the settings
+/// were changed.
 #[cold]
 fn restore<S: Platform>(core: &mut LinkState<'_, S>, line: &S::Port, baud: u32) -> io::Result<bool> {
     let Some(alteration) = line.alteration()? else { return Ok(false) };
@@ -503,8 +505,8 @@ struct Backlog {
 }
 
 impl Backlog {
-    /// Creates the backlog of a port that is opened at `now`, whose driver reports `waiting` bytes. `None` if there are
-    /// none.
+    /// Creates the backlog of a port that is opened at `now`, whose driver reports `waiting` buffered bytes. `None` if
+    /// no byte is buffered.
     fn new(waiting: usize, now: Nanos) -> Option<Backlog> {
         (waiting > 0).then_some(Backlog { read_at: now, idle_since: None, remaining: MAX_BACKLOG })
     }
@@ -522,11 +524,13 @@ impl Backlog {
     }
 }
 
-/// Schedule for reading the settings of an open port back, because another process may have changed them: bytes arrive,
-/// but no telegram. The hub's lock does not keep out a program of root, or one that had opened the port before the hub.
+/// Schedule for reading back the settings of an open port. If bytes arrive but no telegram, another process may have
+/// changed the settings. The hub's lock on the port does not keep out a program of root, or a program that had opened
+/// the port before the hub.
 #[derive(Clone, Copy, Debug, Default)]
 struct SettingsCheck {
-    /// Arrival of the first bytes since the last telegram, change of the rate, or check.
+    /// Time at which the first bytes arrived after the last telegram, the last change of the rate, or the last check;
+    /// the latest of these counts.
     bytes_since: Option<Nanos>,
     was_silent: bool,
 }
@@ -579,7 +583,7 @@ impl<'a, S: Platform> IdentityCache<'a, S> {
 
     /// Returns the identity that the previous hub saved, if it is recent and belongs to this port.
     fn load(&self, now: Nanos) -> Option<Identity> {
-        // One more byte than expected, because a longer record belongs to another port.
+        // Read one byte more than expected, to detect a longer record, which belongs to another port.
         let mut record = vec![0; STAMP_LEN + size_of::<Identity>() + self.port.len() + 1];
         let len = self.platform.load_record(self.link, &mut record)?;
         read_identity(record.get(..len)?, &self.port, now)
@@ -621,13 +625,15 @@ fn read_identity(record: &[u8], port: &str, now: Nanos) -> Option<Identity> {
 const MODEL_TIMEOUT: Nanos = 10_000 * MILLIS;
 /// Maximum length of a backlog in bytes: more than a native port (64 kB) and its line discipline (4 kB) hold.
 const MAX_BACKLOG: usize = 70_000;
-/// Time whose bytes an adapter may deliver at once.
+/// Maximum time for which an adapter may collect bytes before it delivers them at once. A longer burst proves that
+/// bytes were buffered.
 const MAX_BURST_TIME: Nanos = 20 * MILLIS;
 /// Maximum time that a driver takes to move buffered bytes from one of its buffers to the next.
 const IDLE_TIME: Nanos = 10 * MILLIS;
-/// Longer than any scanner takes for a telegram, except an LMS at 9600 and 19200 baud, where a check is wasted.
+/// Time with bytes but without a telegram after which the settings of the port are read back. It is longer than any
+/// scanner takes for a telegram, except for an LMS at 9600 and 19200 baud, at which the check is superfluous.
 const TELEGRAM_TIMEOUT: Nanos = 300 * MILLIS;
-/// Length of a stamp in bytes.
+/// Length of the stamp in a record, in bytes.
 const STAMP_LEN: usize = size_of::<Nanos>();
 /// Maximum age of a saved identity. After this time, a different scanner may be connected. The record is written every
 /// second and read as soon as the next hub starts.
@@ -639,8 +645,8 @@ mod tests {
 
     const BAUD: u32 = 500_000;
 
-    /// Returns the number of bytes that count as backlogged, if `waiting` bytes are, in a stream of one telegram every
-    /// 26 ms that is read in pieces.
+    /// Returns the number of bytes that count as backlogged if `waiting` bytes are buffered when the port is opened.
+    /// The stream has one telegram every 26 ms and is read in pieces.
     fn backlogged(waiting: usize) -> usize {
         let (mut now, mut left, mut backlogged) = (1_000, waiting, 0);
         let Some(mut backlog) = Backlog::new(waiting.min(4_095), now) else { return 0 };

@@ -56,11 +56,11 @@ pub(crate) struct ReplaySet<'a> {
 /// Outcome of the start of a link.
 #[derive(PartialEq)]
 enum LinkStart {
-    /// With an open port, or with a recording.
+    /// The link has started with an open port, or with a recording.
     Open,
-    /// Without its port, which cannot be opened yet, or to which no connection is made yet.
+    /// The link has started without its port, which cannot be opened yet, or to which no connection is made yet.
     Waiting,
-    /// Without its port, because another process publishes under the sensor's name.
+    /// The link has started without its port, because another process publishes under the sensor's name.
     Taken,
 }
 
@@ -87,16 +87,16 @@ impl EndOfPlayback<'_> {
 }
 
 /// Runs the hub in `domain` until SIGINT or SIGTERM. `on_ready` is called once, when all topics exist. `load_config`
-/// returns the configuration, at the start and at each SIGHUP, which applies the changes that are possible while links
-/// stream.
+/// returns the configuration. It is called at the start, and at each SIGHUP to apply the changes that are possible
+/// while links stream.
 ///
 /// # Errors
 ///
 /// Returns the error of `load_config` at the start. Returns [`Kind::DomainHeld`] if another hub has the domain, and
 /// [`Kind::NameHeld`] if another process publishes under the name of a link that plays a recording. Returns
 /// [`Kind::ResourceExhausted`] if memory or descriptors are short, [`Kind::PortNotTty`] if a port is not a serial line,
-/// and [`Kind::Failed`] if shared memory refuses. The hub waits for a port that cannot be opened for another reason,
-/// and for a name that another process has.
+/// and [`Kind::Failed`] if shared memory cannot be used. The hub waits for a port that cannot be opened for another
+/// reason, and for a name that another process has.
 pub fn run(
     load_config: &dyn Fn() -> Result<Config, Failure>,
     domain: &Domain,
@@ -106,7 +106,7 @@ pub fn run(
     serve(load_config, config, None, domain, on_ready)
 }
 
-/// Runs a hub that starts with `config`. If there is a `set`, all links play its recordings, and the hub ends with
+/// Runs a hub that starts with `config`. If there is a `set`, all links play its recordings, and the hub ends after
 /// them.
 pub(crate) fn serve(
     load_config: ConfigLoader<'_>,
@@ -130,7 +130,8 @@ pub(crate) fn serve(
     let writer = saver.map(StateWriter::start).transpose()?;
     let node = scanhub_shm::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
-    // By the port, not by the name: a line that the service manager keeps cannot be opened again.
+    // Assign each kept line to the link that has its port now, whatever the name of the link was. While the service
+    // manager keeps the line, no link can open its port again.
     service.assign(|line| {
         let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
         owner.map(|link| link.name.clone())
@@ -173,7 +174,8 @@ pub(crate) fn serve(
         });
         service.notify_stopping();
         hub.stop.signal();
-        // Joined one by one, a thread that panicked is a failure of this function, not a panic of its own.
+        // Join the threads one by one, so that a panic in a thread becomes a failure of this function and not another
+        // panic.
         let ended = threads.into_iter().map(|thread| thread.join()).collect::<Result<Vec<()>, _>>();
         outcome.and(ended.map(drop).map_err(|_| thread_failure()))
     })
@@ -190,17 +192,17 @@ struct Hub<'a> {
     service: &'a Service,
     /// Player of the recording that the links play.
     player: Option<&'a Player>,
-    /// Ends the threads of the links.
+    /// Event that ends the threads of the links.
     stop: EventFd,
-    /// Set by each link when it has finished something.
+    /// Flags of the links. Each link sets its flag when it has finished something.
     activity: Vec<AtomicBool>,
-    /// Ends after the links, and writes their last state.
+    /// Thread that saves the state of the links. It ends after the links, because it also writes their last state.
     writer: Option<StateWriter>,
 }
 
 impl Hub<'_> {
-    /// Starts a thread for each link, and adds it to `threads`. Each one sends its number and the outcome of its start
-    /// to `report`.
+    /// Starts a thread for each link, and adds it to `threads`. Each thread sends the number of its link and the
+    /// outcome of the start to `report`.
     fn start_links<'s>(
         &'s self,
         scope: &'s Scope<'s, '_>,
@@ -241,7 +243,7 @@ impl Hub<'_> {
         reports: &Receiver<(usize, Result<LinkStart, Failure>)>,
     ) -> Result<StartReport, Failure> {
         let links = &self.config.links;
-        // In the order of the links, although they report in any order.
+        // Sort the reports by the order of the links, because the links report in any order.
         let reports = reports.iter().take(links.len());
         let starts: BTreeMap<_, _> =
             reports.map(|(number, start)| Ok((number, start?))).collect::<Result<_, Failure>>()?;
@@ -268,8 +270,8 @@ fn state_directory(domain: &Domain) -> Option<StateDirectory> {
     Some(state)
 }
 
-/// Runs `link`, number `number` in the run `boot` of the hub, until the hub ends. A recording is played as `part` of
-/// several, or alone. `report` is called once, with the outcome of the start.
+/// Runs `link`, number `number` in the run `boot` of the hub, until the hub ends. A recording is played as `part` of a
+/// replay of several sensors, or alone. `report` is called once, with the outcome of the start.
 fn run_link(
     link: &Link,
     number: u8,
@@ -280,7 +282,8 @@ fn run_link(
     report: impl FnOnce(Result<LinkStart, Failure>),
 ) {
     match &link.port {
-        // A recording does not wait for its name: the other links of the hub may play with it.
+        // A link that plays a recording does not wait for its name, because the other links of the hub may play
+        // together with it.
         PortSpec::File { path, paced } => {
             match system.take_name().and_then(|()| LinkState::new(link, number, boot, system, queue)) {
                 Ok(core) => {
@@ -321,7 +324,7 @@ fn run_supervisor(
     let mut cleanup_at = clock::now() + CLEANUP_INTERVAL;
     loop {
         let ([end, hangup], [requests, outcomes]) = (signals.descriptors(), control.descriptors());
-        // Without a player, its place is taken by another descriptor.
+        // Without a player, the descriptor `end` fills the place of the player's descriptor.
         let over =
             end_of_playback.as_ref().map_or(end, |end_of_playback| end_of_playback.player.over().as_fd());
         let mut fds =
@@ -335,7 +338,8 @@ fn run_supervisor(
             Some(SignalAction::Reload) => reload.reload(&control.commands, clock::now()),
             None => {}
         }
-        // Even without a wake-up: requests after one that could not be received were announced together with it.
+        // Serve requests even without a wake-up. If one request could not be received, the later ones were announced
+        // together with it and cause no further wake-up.
         control.serve();
         if !is_alive() {
             return Err(thread_failure());
@@ -365,7 +369,7 @@ fn random_id() -> u64 {
     RandomState::new().hash_one(std::process::id())
 }
 
-/// Time that subscribers have after the end of a recording.
+/// Time for which the hub continues after the end of a recording, so that subscribers can read the last samples.
 const LINGER_TIME: Nanos = 1_000 * MILLIS;
 /// Interval of the checks whether the links are alive.
 const CHECK_INTERVAL: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };

@@ -24,7 +24,7 @@ use crate::reconnect::LiveLink;
 use crate::saved_state::SaveSlot;
 use crate::service::Service;
 
-/// Platform of one link. It stays in the thread of the link.
+/// Platform of one link. The platform stays in the thread of the link.
 pub(crate) struct System<'a> {
     resources: LinkResources<'a>,
     sensor: &'a str,
@@ -45,7 +45,7 @@ pub(crate) struct System<'a> {
 /// The name of the sensor, which only this hub publishes under.
 struct HeldName {
     waker: WakeSender,
-    // Dropped last: the next process with this name creates its own doorbell.
+    // Dropped after `waker`, because the next process that takes this name creates its own doorbell.
     _lock: NameLock,
 }
 
@@ -55,9 +55,9 @@ pub(crate) struct LinkResources<'a> {
     pub(crate) node: &'a Node,
     /// Limits of the link's topics.
     pub(crate) limits: TopicLimits,
-    /// Readable once the hub must end.
+    /// Event that is readable once the hub must end.
     pub(crate) stop: &'a EventFd,
-    /// Keeps the ports open if the hub is killed.
+    /// Service manager, which keeps the ports open if the hub is killed.
     pub(crate) service: &'a Service,
     /// The domain's directory.
     pub(crate) root: &'a Path,
@@ -115,8 +115,8 @@ impl<'a> System<'a> {
         link.end();
     }
 
-    /// Sleeps from `now` until `until` instead of polling, if that is soon and the last poll was a moment ago. Returns
-    /// whether it has. A poll of several descriptors, one of them a tty, costs more than the sleep.
+    /// Sleeps from `now` until `until` instead of polling, if `until` is soon and the last poll was a moment ago.
+    /// Returns whether it has slept. A poll of several descriptors, one of them a tty, costs more than the sleep.
     fn try_sleep(&self, now: Nanos, until: Nanos) -> bool {
         let is_soon = until <= now + MAX_SLEEP && now < self.polled_at.get() + MAX_POLL_INTERVAL;
         if is_soon {
@@ -126,7 +126,7 @@ impl<'a> System<'a> {
         is_soon
     }
 
-    /// Waits from `now` for one of the events at the descriptor, a request, or the end of the hub, at most until
+    /// Waits from `now` for an event at the descriptor of `port`, a request, or the end of the hub, at most until
     /// `until`.
     fn wait(
         &self,
@@ -138,7 +138,7 @@ impl<'a> System<'a> {
         self.polled_at.set(now);
         let span = clock::poll_timeout(now, until);
         let stop = self.resources.stop.as_fd();
-        // Without a port, a second entry for `stop` that waits for nothing.
+        // Without a port, poll `stop` a second time, without events.
         let (port, events) = port.unwrap_or((stop, PollFlags::empty()));
         let mut fds = [(stop, PollFlags::IN), (requests.as_fd(), PollFlags::IN), (port, events)]
             .map(|(fd, events)| PollFd::from_borrowed_fd(fd, events));
@@ -238,7 +238,8 @@ impl Platform for System<'_> {
         while let Some(line) = self.resources.service.take(name) {
             match Port::adopt(line, source, baud).filter(|_| adopted.is_none()) {
                 Some(port) => adopted = Some(port),
-                // The port is unusable. Otherwise, the service manager would pass it to the next hub again.
+                // The port is unusable. Release it, because the service manager would otherwise pass it to the next hub
+                // again.
                 None => self.resources.service.release(name),
             }
         }
@@ -354,7 +355,7 @@ fn log_unnotified(failure: &Failure) {
     tracing::debug!(%failure, "some subscribers were not woken");
 }
 
-/// Maximum wait that is slept through.
+/// Maximum wait during which the thread sleeps instead of polling.
 const MAX_SLEEP: Nanos = 20 * MILLIS;
 /// Maximum time for which requests, the end of the hub and the loss of a line may go unnoticed.
 const MAX_POLL_INTERVAL: Nanos = 50 * MILLIS;

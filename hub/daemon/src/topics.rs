@@ -1,5 +1,6 @@
 //! The topics of one link: numbers the samples, sets their headers, and wakes the subscribers. Nothing waits for
-//! memory. A sample without memory is counted and its number is skipped, so that subscribers notice the gap.
+//! memory. If there is no memory for a sample, the sample is counted as dropped and its sequence number is skipped, so
+//! that subscribers notice the gap.
 //!
 //! [`Publishers`] has one publisher for each topic of a link, from the table of topics. `link_output.rs` fills and
 //! sends the samples of a scan.
@@ -36,14 +37,14 @@ macro_rules! publishers {
                 $(self.$name.find_subscribers();)*
             }
 
-            /// Gives new subscribers the history of the topics that have one.
+            /// Gives new subscribers the history of the topics that have a history.
             fn deliver_history(&self) {
                 $(if history_len(Topic::$topic) > 0 {
                     self.$name.connect();
                 })*
             }
 
-            /// Returns whether any topic that `counts` had a subscriber at the last check.
+            /// Returns whether any topic for which `counts` returns true had a subscriber at the last check.
             fn has_subscribers(&self, counts: impl Fn(Topic) -> bool) -> bool {
                 $(counts(Topic::$topic) && self.$name.has_subscribers())||*
             }
@@ -53,8 +54,8 @@ macro_rules! publishers {
                 0 $(+ self.$name.failed())*
             }
 
-            /// Returns the maximum number of attached subscribers that did not get the last sample of a topic that
-            /// `counts`.
+            /// Returns the highest number of attached subscribers that did not get the last sample of a topic, among
+            /// the topics for which `counts` returns true.
             fn undelivered(&self, counts: impl Fn(Topic) -> bool) -> usize {
                 0usize$(.max(if counts(Topic::$topic) { self.$name.undelivered() } else { 0 }))*
             }
@@ -78,8 +79,8 @@ impl<S: Platform> Publishers<S> {
         }
     }
 
-    /// Returns the last stage before the doorbell [`DoorbellWord::First`] whose topics had a subscriber at the last
-    /// look; `Telegram` if none had one.
+    /// Returns the last stage up to the zones whose topics had a subscriber at the last check; `Telegram` if none had
+    /// one. The doorbell [`DoorbellWord::First`] rings after this stage.
     fn first_awaited(&self) -> Stage {
         if self.zones.has_subscribers() {
             Stage::Zones
@@ -174,7 +175,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.header.flags = flags;
     }
 
-    /// Sets the family of the scanner. `None`: the hub is searching for it.
+    /// Sets the family of the scanner. `None` means that the hub is searching for the scanner.
     pub(crate) fn set_family(&mut self, family: Option<Family>) {
         self.header.family = family.map_or(Family::UNKNOWN, |family| family as u8);
     }
@@ -185,8 +186,8 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 
     /// Searches for subscribers if any may have attached since the last check. Called when a header is created, before
-    /// its samples are loaned and sent, so that a new subscriber gets the next sample. Without a new one, this reads
-    /// only one word for all topics.
+    /// its samples are loaned and sent, so that a new subscriber gets the next sample. Without a new subscriber, this
+    /// function reads only one word of memory for all topics.
     fn find_new_subscribers(&mut self) {
         let attached = self.platform.attach_count();
         if attached.is_none() || attached != self.attach_count {
@@ -205,8 +206,9 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.last_awaited = self.publishers.last_awaited();
     }
 
-    /// Takes loans for a telegram that is about to arrive, if it is as long as the last one, and for the results of its
-    /// scan. Connects new subscribers now instead of while the telegram waits.
+    /// Takes loans for a telegram that is about to arrive and for the results of its scan. The loan for the telegram
+    /// can be used only if the telegram is as long as the last one. Connects new subscribers now instead of while the
+    /// telegram waits.
     pub(crate) fn prepare(&mut self) {
         self.find_new_subscribers();
         self.publishers.prepare(self.last_awaited);
@@ -217,7 +219,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.last_awaited >= stage
     }
 
-    /// Wakes the subscribers that wait for no later stage than `stage`, whose samples were sent.
+    /// Wakes the subscribers whose samples were all sent when `stage` ends.
     pub(crate) fn end_stage(&mut self, stage: Stage) {
         if stage == self.last_awaited {
             self.wake(WakeEvent::Telegram);
@@ -226,8 +228,8 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Publishes a telegram, or packets, whose period is 0. Later samples have its number and its stamps, until the
-    /// next telegram.
+    /// Publishes a telegram, or packets, for which `period_us` is 0. Later samples have the sequence number and the
+    /// stamps of this telegram, until the next one is published.
     pub(crate) fn publish_telegram(&mut self, received: &ReceivedTelegram<'_>, period_us: u32) {
         self.begin_telegram(received, period_us);
         self.publishers.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
@@ -270,7 +272,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.header
     }
 
-    /// Returns the number of the next telegram.
+    /// Returns the sequence number of the next telegram.
     pub(crate) fn next_seq(&self) -> u64 {
         self.next_seq
     }
@@ -309,7 +311,8 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Sends zones as of `now`, without a scan. `write` writes them, even if there is no memory for the sample.
+    /// Sends zones as of `now`, without a scan. `write` fills in the zones, and is called even if there is no memory
+    /// for the sample.
     pub(crate) fn send_zones(&mut self, now: u64, write: impl FnOnce(&mut Zones)) {
         let header = self.header_at(now);
         let mut zones = self.publishers.zones.loan(0);
@@ -317,7 +320,8 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.publishers.zones.send(zones, &header, &mut self.due);
     }
 
-    /// Sends a background of `len` bytes. `write` writes it, even if there is no memory for the sample.
+    /// Sends a background of `len` bytes. `write` fills in the background, and is called even if there is no memory for
+    /// the sample.
     pub(crate) fn send_background(
         &mut self,
         header: &Header,
@@ -365,7 +369,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Rings the doorbell at `word` if samples were sent since the last time. Otherwise, saves the system call.
+    /// Rings the doorbell at `word` if samples for it were sent since it last rang. Otherwise, makes no system call.
     pub(crate) fn ring(&mut self, word: DoorbellWord) {
         if self.due.take_due(word) {
             self.platform.ring(word);
@@ -409,7 +413,8 @@ impl<'a, S: Platform> Topics<'a, S> {
 
     /// Returns the number of subscribers that were attached at the last check but did not get the last sample, because
     /// their descriptors or those of the hub ran out. (Sending succeeds nevertheless.) The topics of scans count only
-    /// while scans arrive (`streaming`). Topics that are published after a change never count, because that is seldom.
+    /// while scans arrive (`streaming`). Topics that are published only after a change never count: they are seldom
+    /// published, so their last sample may be older than the subscriber.
     pub(crate) fn starved_subscribers(&self, streaming: bool) -> usize {
         self.publishers.undelivered(|topic| match topic.spec().publish_rate {
             PublishRate::Scan => streaming,
@@ -432,7 +437,7 @@ impl<'a, S: Platform> Topics<'a, S> {
 }
 
 /// The stamps of the last telegram or revolution. On a busy machine, several telegrams may be read at once, so that
-/// their computed stamps are equal, but a stamp identifies a scan in ROS.
+/// their computed stamps are equal. They must differ, because in ROS a stamp identifies a scan.
 #[derive(Default)]
 struct LastStamps {
     first_ns: u64,
@@ -440,8 +445,8 @@ struct LastStamps {
 }
 
 impl LastStamps {
-    /// Moves the stamps of `header` if they are not later than the last ones: to the last one plus 1 ns. Stamps of a
-    /// replay are not changed. Returns whether a stamp was moved.
+    /// Moves each stamp of `header` that is not later than the last one, to the last one plus 1 ns. Stamps of a replay
+    /// are not changed. Returns whether a stamp was moved.
     fn make_increasing(&mut self, header: &mut Header) -> bool {
         if header.flags & Flags::REPLAYED != 0 {
             return false;
@@ -469,8 +474,8 @@ fn wall_clock(platform: &impl Platform, stamp: Nanos, now: Nanos) -> u64 {
     platform.wall_ns().saturating_sub(now.saturating_sub(stamp))
 }
 
-/// Returns the header of a sample that is published at `now` without a telegram. It has the number of the last
-/// telegram.
+/// Returns the header of a sample that is published at `now` without a telegram. The header has the sequence number of
+/// the last telegram.
 fn header_without_telegram(last: &Header, now: u64, wall_ns: u64) -> Header {
     Header {
         stamp_first_ns: now,

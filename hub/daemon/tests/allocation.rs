@@ -29,8 +29,8 @@ use scanhub_schema::{Foreground, Marks, Scan};
 use scanhub_shm::Domain;
 use scanhub_shm::{Payload, Subscriber};
 
-/// Scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port has
-/// another rate, and it streams until it gets a request to stop.
+/// Scanner at the other end of a pty. Like a real scanner, it neither sends nor receives anything while the hub's port
+/// has another rate, and it streams until it gets a request to stop.
 struct PtyScanner {
     line: OwnedFd,
     received: Vec<u8>,
@@ -140,7 +140,7 @@ impl PtyScanner {
     }
 }
 
-/// Sends scans until `count` further ones were published.
+/// Sends scans until the hub has published `count` further scans.
 fn stream(sensor: &mut PtyScanner, subscriber: &Subscriber<Scan>, count: u64) {
     for number in 0..count {
         let give_up_at = Instant::now() + Duration::from_secs(60);
@@ -244,7 +244,7 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [AllocationWindow; 4
             Foreground::subscriber(&node, &foreground).expect("a subscriber"),
         )
     });
-    // These scans cover the rate, both requests, and allocations at the start.
+    // During these scans, the hub finds the rate, sends both requests, and makes the allocations of its start.
     stream(&mut sensor, &subscriber, 50);
     WATCHED_THREAD.store(thread_named("heap"), Relaxed);
     stream(&mut sensor, &subscriber, 50);
@@ -283,7 +283,7 @@ fn hub_allocates_only_loans_per_scan() {
     ] {
         for AllocationWindow { scans, seconds, allocations, held_bytes } in windows(letter, follow_all, set) {
             // A scan takes one loan in each topic. A silence, a change of state and the status of each second take
-            // more. If the scanner has sent a scan twice, the hub may have missed the first one.
+            // further loans. If the scanner has sent a scan twice, the hub may have missed the first one.
             let loans =
                 topics * (scans - MAX_MISSED_SCANS)..=topics * scans + MAX_OTHER_ALLOCATIONS + 4 * seconds;
             assert!(

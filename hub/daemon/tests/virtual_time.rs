@@ -161,7 +161,8 @@ fn finds_unannounced_subscriber_within_154_ms() {
         found_after
     });
     let found_after = outcome.expect("it runs").expect("it was found");
-    // The limit is a tenth of a second, the telegram after which the hub checks, and the next telegram.
+    // The limit is the sum of three times: 100 ms, the telegram after which the hub checks for subscribers, and the
+    // next telegram.
     assert!((26_640_001..154_000_000).contains(&found_after), "found after {found_after} ns");
 }
 
@@ -177,7 +178,7 @@ fn rejected_rate_is_logged_once_and_scanner_is_found() {
             let status = Status::open(&node, "a").expect("a topic").expect("is there");
             let status = Status::subscriber(&node, &status).expect("a subscriber");
             links[0].reject(&[500_000, 921_600, 256_000]);
-            // For several rounds of the search, the bytes are not from a scanner.
+            // For several rounds of the search, bytes arrive that no scanner sends.
             for read in 1..=200 {
                 links[0].read(read * 50_000_000, &[0x55; 5]);
             }

@@ -1,5 +1,5 @@
 //! Plays a stream of bytes without stamps at the pace of its scans. The bytes pass through a session like those of a
-//! line. The session also finds out what is damaged in them.
+//! line. The session also detects the damaged bytes.
 
 use std::io::Read;
 

@@ -1,9 +1,9 @@
 //! Plays a recording frame by frame: each telegram, or group of packets, once, in order and bit for bit, with the
-//! header that was recorded. Silences are those of the recording, however fast it is played.
+//! header that was recorded. The link reports the silences of the recording, at any rate of the replay.
 //!
 //! A whole telegram is a scan or a reply by itself. The packets of a rotating scanner pass through a session that runs
-//! in the time of the recording. It builds the same scans as the hub that recorded them, with the same times between
-//! them.
+//! in the time of the recording. The session builds the same scans as the hub that recorded the packets, with the same
+//! intervals between the scans.
 
 use std::iter::Peekable;
 
@@ -25,12 +25,12 @@ pub(crate) struct FramesLap<'f> {
     timeline: Timeline,
     /// The next frame and its media time; `None` at the end.
     next: Option<(Frame, Nanos)>,
-    /// Media times between which frames are published. Those before are only learned from.
+    /// Media times between which frames are published. The processors only learn from earlier frames.
     start_ns: Nanos,
     end_ns: Option<Nanos>,
     /// Number of frames that were read.
     pub(super) read_frames: u64,
-    /// Frames of a scanner of another family.
+    /// Number of frames that a scanner of another family has sent. They are not played.
     foreign_frames: u64,
     /// Run of the hub that recorded the last frame.
     run: Option<u64>,
@@ -54,21 +54,21 @@ struct PendingVerdict {
     media: Nanos,
     /// End of its validity, by the clock of the hub that recorded it.
     until_ns: Nanos,
-    /// That end as media time.
+    /// End of its validity, as media time.
     until: Nanos,
 }
 
 /// Times of a frame.
 #[derive(Clone, Copy)]
 struct FrameTime {
-    /// Stamps by the clock of the hub that recorded it.
+    /// Stamps of its first and last byte, by the clock of the hub that recorded it.
     first: Nanos,
     last: Nanos,
     /// Media time of its first byte.
     begin: Nanos,
     /// Media time of its last byte.
     media: Nanos,
-    /// Whether it is before the start of the played part.
+    /// Whether the frame is before the start of the played part.
     is_skipped: bool,
 }
 
@@ -117,7 +117,7 @@ impl<'f> FramesLap<'f> {
         Some(FrameTime::of(frame, *media, *media < self.start_ns))
     }
 
-    /// Returns the media time at which `verdict` becomes stale, if the frame at `time` ends after it.
+    /// Returns the media time at which `verdict` becomes stale, but at the latest the end of the frame at `time`.
     fn stale_at(&self, verdict: &PendingVerdict, time: FrameTime) -> Nanos {
         verdict.until.clamp(self.start_ns, time.media)
     }
@@ -195,7 +195,7 @@ impl<'f> FramesLap<'f> {
         let at = self.stale_at(&verdict, time);
         let due = replay.wait_until_due(self.shown_session(), at, self.state)?;
         replay.link.output.publish_stale(due.at);
-        // A scan that was lost on the line makes the verdict stale, and the sensor not silent.
+        // If a scan was lost on the line, the verdict becomes stale, but the sensor is not silent.
         if time.media.saturating_sub(verdict.media) >= SILENCE_TIME.max(verdict.until - verdict.media) {
             self.state = State::Silent;
         }
@@ -371,7 +371,7 @@ impl FrameTime {
             frame.header.map_or((start, start), |header| (header.stamp_first_ns, header.stamp_last_ns));
         let (first, last) = (first.min(MAX_STAMP), last.min(MAX_STAMP));
         let duration = last.saturating_sub(first);
-        // A hub has a frame with its last byte.
+        // A hub has received a frame when its last byte has arrived.
         let media = begin.saturating_add(duration.min(MAX_GAP));
         FrameTime { first, last: last.max(first), begin, media, is_skipped }
     }
@@ -385,7 +385,8 @@ fn recorded_metadata(frame: &Frame) -> RecordedMetadata {
     }
 }
 
-/// Returns the time to the next scan of a log, which may leave scans out. Until then, nothing newer can be known.
+/// Returns the time from `frame` to the `next` scan of a log. A log may lack scans, so the time may be longer than the
+/// period of the scanner. `None` for a recording with headers.
 fn time_to_next(frame: &Frame, next: &Frame) -> Option<Nanos> {
     if frame.header.is_some() {
         return None;
@@ -396,5 +397,5 @@ fn time_to_next(frame: &Frame, next: &Frame) -> Option<Nanos> {
 
 /// A scanner is silent after this time without a scan.
 const SILENCE_TIME: Nanos = 1_000 * MILLIS;
-/// Time at which the clock of a frame without stamps starts: that of a machine that has run for a while.
+/// Time at which the clock of a frame without stamps starts, as on a machine that has run for a while.
 pub(crate) const CLOCK_START: Nanos = 10_000_000_000;

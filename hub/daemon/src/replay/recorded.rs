@@ -31,7 +31,7 @@ pub(crate) struct Stream {
 pub(crate) struct Frames {
     recording: Recording,
     pub(super) family: Family,
-    /// Whether they are telegrams that are a scan or a reply by themselves, and no packets.
+    /// Whether each frame is a telegram, which is a scan or a reply by itself, and not a group of packets.
     pub(super) is_whole: bool,
     /// Encoding of the ranges of a log.
     encoding: Encoding,
@@ -43,27 +43,30 @@ pub(crate) struct Frames {
     receives_mode: bool,
 }
 
-/// Media time 0: the first telegram of all sensors in a recording.
+/// Media time 0: the time of the earliest telegram of all sensors in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Origin {
     /// Wall clock, in ns since 1970.
     pub(crate) wall_ns: u64,
-    /// Run of the hub and its monotonic clock, because a wall clock may be set.
+    /// Run of the hub, and its monotonic clock at media time 0. Within the run, this clock is used, because a wall
+    /// clock may be set.
     pub(crate) run: Option<(u64, Nanos)>,
 }
 
 impl RecordedSensor {
-    /// Opens the recording at `path`. If it has several sensors, the link plays the one with its name. A file without a
-    /// telegram counts as a line with noise.
+    /// Opens the recording at `path`. If the recording has several sensors, the link plays the sensor that has the
+    /// link's name. A file without a telegram is played as a line that carries only noise.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Input`] if it cannot be read, and [`Kind::Configuration`] if it has other sensors.
+    /// Returns [`Kind::Input`] if the recording cannot be read, and [`Kind::Configuration`] if it has several sensors
+    /// but none with the link's name.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<RecordedSensor, Failure> {
         let recording = Recording::open_stream(path, link.family())?;
         log_damage(&recording);
         if recording.contents().sensors.len() > 1 {
-            // The configuration names the sensor, not an argument of the user.
+            // The name of the sensor comes from the configuration and not from an argument, so the failure has this
+            // kind.
             let part = recording.of(&link.name);
             let part = part.map_err(|failure| Failure { kind: Kind::Configuration, ..failure })?;
             return RecordedSensor::new(part, link);
@@ -77,7 +80,7 @@ impl RecordedSensor {
     /// # Errors
     ///
     /// Returns [`Kind::Input`] if this version does not have the family of the scanner, and [`Kind::Configuration`] if
-    /// the family is not that of the link.
+    /// the family differs from the family of the link.
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<RecordedSensor, Failure> {
         let family = check_family(&recording, link)?;
         if !features(family).has_whole_telegrams {
@@ -118,8 +121,8 @@ impl RecordedSensor {
         }
     }
 
-    /// Returns the sensor's type, if a status of the recording has it. The recording may also contain a scanner of
-    /// another family, which is not played.
+    /// Returns the sensor's type, if a status of the recording has it. The type of a scanner of another family is
+    /// ignored, because that scanner is not played.
     pub(super) fn sensor_type(&self) -> Option<&str> {
         let (RecordedSensor::Stream(Stream { recording, family, .. })
         | RecordedSensor::Frames(Frames { recording, family, .. })) = self;
@@ -127,7 +130,7 @@ impl RecordedSensor {
         (*number == *family as u8).then_some(name.as_str())
     }
 
-    /// Returns the start of its media time; `None` without stamps.
+    /// Returns the start of the recording's media time; `None` if the recording has no stamps.
     pub(crate) fn origin(&self) -> Option<Origin> {
         match self {
             RecordedSensor::Stream(_) => None,
@@ -135,14 +138,14 @@ impl RecordedSensor {
         }
     }
 
-    /// Sets the start of its media time to `origin`, which it shares with other recordings.
+    /// Sets the start of the recording's media time to `origin`, which all recordings of one replay share.
     pub(crate) fn set_origin(&mut self, origin: Origin) {
         if let RecordedSensor::Frames(frames) = self {
             frames.origin = Some(origin);
         }
     }
 
-    /// Returns the wall clock at its start.
+    /// Returns the wall clock at the start of the recording, in ns since 1970; `None` if the recording has no stamps.
     pub(super) fn begin_ns(&self) -> Option<u64> {
         self.origin().map(|origin| origin.wall_ns)
     }
@@ -160,7 +163,7 @@ impl RecordedSensor {
         format!("the recording does not contain its measuring mode: no scans; set link.{name}.mode")
     }
 
-    /// Returns messages about data that a replay leaves out or changes.
+    /// Returns messages about data that a replay drops or changes.
     pub(crate) fn losses(&self, name: &str) -> Vec<String> {
         let (RecordedSensor::Stream(Stream { recording, .. })
         | RecordedSensor::Frames(Frames { recording, .. })) = self;
@@ -173,7 +176,7 @@ impl RecordedSensor {
         foreign.into_iter().chain(unencodable).collect()
     }
 
-    /// Returns the media time of its end, if it is known.
+    /// Returns the media time of the recording's end, if it is known without reading the recording.
     pub(crate) fn length(&self) -> Option<Nanos> {
         let (RecordedSensor::Stream(Stream { recording, .. })
         | RecordedSensor::Frames(Frames { recording, .. })) = self;
@@ -185,7 +188,7 @@ impl RecordedSensor {
         }
     }
 
-    /// Returns the media time of its last telegram. A recording with stamps is read to its end for this.
+    /// Returns the media time of the recording's last telegram. A recording with stamps is read to its end for this.
     pub(crate) fn end(&self) -> Result<Nanos, Failure> {
         match self {
             RecordedSensor::Frames(frames) if frames.has_stamps() => {
@@ -198,28 +201,28 @@ impl RecordedSensor {
 }
 
 impl Stream {
-    /// Returns whether it has any telegram.
+    /// Returns whether the stream has any telegram.
     pub(super) fn has_telegrams(&self) -> bool {
         self.recording.contents().telegrams > 0
     }
 
-    /// Returns the number of its bytes when it was opened.
+    /// Returns the number of bytes that the stream had when it was opened.
     pub(super) fn len(&self) -> u64 {
         self.recording.contents().bytes
     }
 
-    /// Returns its bytes from the start.
+    /// Returns the bytes of the stream from its start.
     pub(super) fn bytes(&self) -> Result<Box<dyn Read + Send>, Failure> {
         self.recording.bytes()
     }
 
-    /// Returns the time from a scan of `beams` to the next one.
+    /// Returns the time from a scan of `beams` beams to the next scan.
     pub(super) fn period(&self, beams: usize) -> Nanos {
         self.recording.contents().period(beams)
     }
 }
 
-/// Reads into `room`. Returns 0 at the end, and if the file has become unreadable.
+/// Reads into `room`. Returns the number of bytes that were read: 0 at the end, and if the file has become unreadable.
 pub(super) fn read(bytes: &mut dyn Read, room: &mut [u8]) -> usize {
     loop {
         match bytes.read(room) {
@@ -234,18 +237,18 @@ pub(super) fn read(bytes: &mut dyn Read, room: &mut [u8]) -> usize {
 }
 
 impl Frames {
-    /// Returns the number of its telegrams when it was opened.
+    /// Returns the number of telegrams that the recording had when it was opened.
     pub(super) fn count(&self) -> u64 {
         self.recording.contents().telegrams
     }
 
-    /// Returns its telegrams from the start.
+    /// Returns the telegrams of the recording from its start.
     pub(super) fn read(&self) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         self.recording.telegrams(self.encoding)
     }
 
-    /// Returns the settings of a session that reads it for `link`. Settings that are not configured come from the
-    /// recording.
+    /// Returns the settings of a session that reads this recording for `link`. Settings that are not configured come
+    /// from the recording.
     pub(super) fn settings(&self, link: &Link) -> Settings {
         let mode_number = self.mode.filter(|_| !self.receives_mode);
         let mut settings = Settings { mode_number, ..link.settings() };
@@ -269,19 +272,20 @@ impl Frames {
         Timeline::new(self.origin)
     }
 
-    /// Returns the time from a scan of `beams` to the next one, where there are no stamps.
+    /// Returns the time from a scan of `beams` beams to the next scan, for a recording without stamps.
     pub(super) fn period(&self, beams: usize) -> Nanos {
         self.recording.contents().period(beams)
     }
 
-    /// Returns whether it has stamps.
+    /// Returns whether the recording has stamps.
     pub(super) fn has_stamps(&self) -> bool {
         self.origin.is_some()
     }
 }
 
-/// Media time of consecutive telegrams, which never decreases. Within a run of the hub, the monotonic clock counts. If
-/// the wall clock was set back between two runs, the second one continues at the time of the last telegram.
+/// Media time of consecutive telegrams, which never decreases. Within a run of the hub, media time follows the
+/// monotonic clock. If the wall clock was set back between two runs, the media time of the second run continues at the
+/// time of the last telegram.
 pub(super) struct Timeline {
     /// The wall clock at media time 0.
     wall_zero_ns: i128,
@@ -291,7 +295,7 @@ pub(super) struct Timeline {
 }
 
 impl Timeline {
-    /// Creates one for a recording whose media time begins at `origin`.
+    /// Creates the timeline of a recording whose media time begins at `origin`.
     pub(super) fn new(origin: Option<Origin>) -> Timeline {
         let run = origin.and_then(|origin| origin.run);
         Timeline {
@@ -301,9 +305,10 @@ impl Timeline {
         }
     }
 
-    /// Returns the media time of a sample of another program with this `header`. Its stamp and those of the telegrams
-    /// before it in the recording are from the same clock. Returns `None` if it is before the first telegram, or if the
-    /// machine was restarted after the last one: scans follow only when the hub of the new start has sent a telegram.
+    /// Returns the media time of a sample with this `header`, which another program than the hub published. The stamp
+    /// of the sample is by the same clock as the stamps of the preceding telegrams in the recording. Returns `None` if
+    /// the sample is before the first telegram. Also returns `None` if the machine was restarted between the preceding
+    /// telegram and the sample, because the new clock is known only from the next telegram on.
     pub(super) fn media_of_sample(&self, header: &Header) -> Option<Nanos> {
         let by_wall = i128::from(header.wall_ns) - self.wall_zero_ns;
         let by_stamp = self.run.map(|(_, zero_ns)| i128::from(header.stamp_first_ns) - zero_ns);
@@ -352,7 +357,7 @@ impl Origin {
         Some(Origin { wall_ns: frame.wall_ns?, run })
     }
 
-    /// Returns the earlier one of both.
+    /// Returns the earlier of `self` and `other`: within one run by the monotonic clock, otherwise by the wall clock.
     pub(crate) fn earlier(self, other: Origin) -> Origin {
         let is_earlier = match (self.run, other.run) {
             (Some((boot, stamp_ns)), Some((same, other_ns))) if boot == same => stamp_ns <= other_ns,
@@ -362,8 +367,8 @@ impl Origin {
     }
 }
 
-/// Returns the family of the scanner: that of `link`, or that of `recording` if the link has none. They must be the
-/// same.
+/// Returns the family of the scanner: the family of `link`, or the family of `recording` if the link has none. If both
+/// have a family, the two must be the same.
 fn check_family(recording: &Recording, link: &Link) -> Result<Family, Failure> {
     let (set, recorded) = (link.family(), recording.family());
     if let Some(family) = set.or(recorded)
@@ -410,7 +415,7 @@ pub(crate) fn log_damage(recording: &Recording) {
     }
 }
 
-/// Logs how the ranges of a CARMEN log are read, and which of them have no value.
+/// Logs how the ranges of a CARMEN log are read, and which ranges cannot be encoded.
 fn log_encoding(recording: &Recording, name: &str) {
     let contents = recording.contents();
     let Some(encoding) = recording.encoding().filter(|_| contents.form == Form::Carmen) else { return };
@@ -420,7 +425,8 @@ fn log_encoding(recording: &Recording, name: &str) {
     }
 }
 
-/// Returns whether `header` belongs to the first telegram of a hub. A converted stream has no hub.
+/// Returns whether `header` belongs to the first telegram of a hub. A converted stream does not come from a hub, so it
+/// has no such telegram.
 fn is_first(header: &Header) -> bool {
     header.seq == 0 && header.hub_pid != 0
 }
@@ -456,12 +462,12 @@ mod tests {
         let frames = [
             frame(5000, header(1, 100)),
             frame(9000, header(1, 101)),
-            // Another run, and the clock is right again.
+            // In the second run, the wall clock is right again.
             frame(5003, header(2, 7)),
             frame(5004, header(2, 8)),
-            // And is set within it.
+            // Within the second run, the wall clock is set back.
             frame(1000, header(2, 9)),
-            // A third one, before all others.
+            // The third run is before all others by its wall clock.
             frame(10, header(3, 50)),
             frame(11, header(3, 51)),
             frame(1, header(3, 50)),

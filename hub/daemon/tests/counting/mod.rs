@@ -11,9 +11,9 @@ struct CountingAllocator;
 
 /// ID of the thread whose allocations are counted; 0 for none.
 pub(crate) static WATCHED_THREAD: AtomicI32 = AtomicI32::new(0);
-/// Number of allocations.
+/// Number of allocations of the watched thread.
 pub(crate) static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
-/// Number of bytes that were allocated and not freed.
+/// Number of bytes that the watched thread has allocated and not freed.
 pub(crate) static HELD_BYTES: AtomicI64 = AtomicI64::new(0);
 
 fn note(allocations: u64, bytes: i64) {
