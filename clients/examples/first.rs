@@ -1,4 +1,5 @@
-//! The program of docs/first-program.md, which shows all below this: `cargo run --release -p scanhub-client --example first`.
+//! The program of docs/first-program.md, which shows all lines below this comment. To run the program:
+//! `cargo run --release -p scanhub-client --example first`.
 
 use std::time::Duration;
 

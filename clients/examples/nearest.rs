@@ -1,4 +1,4 @@
-//! The nearest beam of every scan: `cargo run --example nearest front`.
+//! Prints the nearest beam of every scan: `cargo run --example nearest front`.
 
 use scanhub_client::{Error, Scan, subscribe};
 

@@ -1,4 +1,4 @@
-//! Whether the robot may go, said when it changes: `cargo run --example stop`.
+//! Prints the combined verdict of the robot's sensors whenever it changes: `cargo run --example stop`.
 
 use scanhub_client::{Error, robot};
 

@@ -1,4 +1,5 @@
-//! Prints the beams of two sensors in tokio, and a line if one is silent for half a second. Ctrl-C ends it.
+//! Receives two sensors in tokio. Prints the number of beams of each scan, and a line if a sensor is silent for half a
+//! second. Ctrl-C ends the program.
 
 use std::time::Duration;
 
@@ -12,7 +13,7 @@ const SILENCE_TIMEOUT: Duration = Duration::from_millis(500);
 async fn print_scans(sensor: &str) -> Result<(), Error> {
     let mut scans = Subscriber::<Scan>::builder(sensor).open_pollable()?;
     loop {
-        // The timeout drops the future; no scan is lost by that.
+        // After a timeout, the future of `next` is dropped. Dropping it loses no scan.
         match timeout(SILENCE_TIMEOUT, scans.next()).await {
             Ok(Some(scan)) => println!("{sensor}: {} beams", scan?.beams()),
             Ok(None) => return Ok(()),

@@ -59,12 +59,13 @@ impl<T: Subscribe + ?Sized> SubscriberBuilder<T> {
         }
     }
 
-    /// Sets the name of the domain. Default: the one that SCANHUB_DOMAIN names, otherwise `scanhub`.
+    /// Sets the name of the domain. Default: the domain that SCANHUB_DOMAIN names, otherwise `scanhub`.
     pub fn domain(self, name: impl Into<String>) -> Self {
         SubscriberBuilder { domain: Some(name.into()), ..self }
     }
 
-    /// Sets the directory of the hub, as its option `--root` does. Default: each directory that a hub may have chosen.
+    /// Sets the directory of the hub, like the hub's option `--root`. Default: all directories that a hub may have
+    /// chosen are searched.
     pub fn root(self, directory: impl Into<PathBuf>) -> Self {
         SubscriberBuilder { root: Some(directory.into()), ..self }
     }
@@ -89,8 +90,8 @@ impl<T: Subscribe + ?Sized> SubscriberBuilder<T> {
         Ok(Subscriber::new(self.session()?, T::source(&self), self.timeout))
     }
 
-    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, even if
-    /// [`wait`](Self::wait) sets another method.
+    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. The subscriber waits by event, even
+    /// if [`wait`](Self::wait) sets another method.
     ///
     /// # Errors
     ///
@@ -109,7 +110,7 @@ impl<T: Subscribe + ?Sized> SubscriberBuilder<T> {
         Ok(Session::new(locations).waiting_by(self.wait))
     }
 
-    /// Returns the first sensor; the builder of a single sensor has one.
+    /// Returns the name of the first sensor. The builder of a subscriber for a single sensor has one name.
     pub(crate) fn sensor(&self) -> &str {
         self.sensors.first().map_or("", String::as_str)
     }
@@ -121,15 +122,15 @@ impl<T: Subscribe + ?Sized> SubscriberBuilder<T> {
 }
 
 impl<T: WithTimeout + ?Sized> SubscriberBuilder<T> {
-    /// Lets [`Subscriber::next`] return `None` after a silence of `timeout`. Default: it waits forever.
+    /// Lets [`Subscriber::next`] return `None` after a silence of `timeout`. Default: `next` waits forever.
     pub fn timeout(self, timeout: Duration) -> Self {
         SubscriberBuilder { timeout: Some(timeout), ..self }
     }
 }
 
 impl SubscriberBuilder<Robot> {
-    /// Takes early warnings too ([`Early`](crate::Early)): the verdict becomes worse before a scan is complete, and the
-    /// hub withdraws the warning if the scan does not confirm it.
+    /// Uses early warnings, too ([`Early`](crate::Early)). A warning makes the verdict worse before its scan is
+    /// complete. The hub withdraws the warning if the complete scan does not confirm it.
     pub fn early(self) -> Self {
         SubscriberBuilder { early: true, ..self }
     }
@@ -144,7 +145,7 @@ impl SubscriberBuilder<Robot> {
 ///
 /// # Errors
 ///
-/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is invalid, or the directory too long.
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is invalid, or the path of the directory is too long.
 pub fn domain_candidates(name: Option<&str>, root: Option<&Path>) -> Result<Vec<Domain>, Error> {
     let name = name.map_or_else(domain_of_process, str::to_owned);
     Ok(Domain::candidates(&name, root, &Environment::of_process())?)

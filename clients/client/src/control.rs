@@ -11,7 +11,7 @@ use scanhub_shm::{Domain, hub_pid};
 use crate::error::Error;
 use crate::hub_finder::{STARTUP_GRACE, find};
 
-/// Sends `request` to the hub at the first of `locations` where one runs, and returns its reply.
+/// Sends `request` to the hub at the first one of `locations` at which a hub runs, and returns the hub's reply.
 ///
 /// # Examples
 ///
@@ -30,9 +30,10 @@ use crate::hub_finder::{STARTUP_GRACE, find};
 ///
 /// # Errors
 ///
-/// - [`ErrorKind::NoHub`](crate::ErrorKind) within a second if no hub runs, or if it ends before it replies.
-/// - [`ErrorKind::NoTopic`](crate::ErrorKind) with the sensors that exist.
-/// - [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there are too many requests at a time.
+/// - [`ErrorKind::NoHub`](crate::ErrorKind) if no hub runs, after at most a second, or if the hub ends before it
+///   replies.
+/// - [`ErrorKind::NoTopic`](crate::ErrorKind) if the hub has no such sensor. The error names the sensors that exist.
+/// - [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the hub has too many requests at the same time.
 /// - [`ErrorKind::Failed`](crate::ErrorKind) if the link cannot execute the request.
 /// - [`ErrorKind::Timeout`](crate::ErrorKind) if the hub does not reply, because it lacks memory or descriptors, or
 ///   because the link is busy.
@@ -47,7 +48,7 @@ pub fn request(
     send_request(&open(&node)?, &domain, request, stop)
 }
 
-/// Opens the control service. Waits for the service of a hub that is just starting.
+/// Opens the control service. If a hub is just starting, waits until the hub has created the service.
 fn open(node: &Node) -> Result<ControlClient, Error> {
     let deadline = Instant::now() + STARTUP_GRACE;
     loop {
@@ -71,7 +72,7 @@ fn send_request(
     let deadline = Instant::now() + RESPONSE_TIMEOUT;
     loop {
         scanhub_shm::take_wakeups(&[client.responses()])?;
-        // Check the hub before its reply, because a hub may exit just after it has replied.
+        // Check whether the hub runs before reading the reply, because a hub may exit just after it has replied.
         let is_hub_running = pending.is_open() && hub_pid(domain.root())?.is_some();
         if let Some(response) = pending.try_receive()? {
             return Ok(response.0?);
@@ -98,7 +99,8 @@ fn send_request(
 
 /// Timeout for the reply. A link handles a request within milliseconds, but needs longer while it opens its port.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Interval of the checks for the hub and for the request to stop.
+/// Interval at which the library checks, during the wait for a reply, whether the hub still runs and the caller wants
+/// to stop.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Interval of the attempts to open a service that does not exist yet.
+/// Interval between attempts to open a service that does not exist yet.
 const RETRY_INTERVAL: Duration = Duration::from_millis(10);

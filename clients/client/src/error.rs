@@ -55,7 +55,7 @@ pub enum ErrorKind {
     TooManyHeld,
     /// The domain, or a file in it, belongs to another user.
     OtherUser,
-    /// The hub has another layout, or another version of the shared memory.
+    /// The hub uses another layout of payloads, or another version of the shared memory.
     Incompatible,
     /// Any other failure, for example of a request that the link cannot execute.
     Failed,
@@ -82,7 +82,8 @@ impl Error {
         self
     }
 
-    /// Returns this error with another class. The exit code of a program that ends with it stays the same.
+    /// Returns this error with another class. The class does not change the exit code of a program that ends with the
+    /// error.
     pub(crate) fn with_kind(mut self, kind: ErrorKind) -> Error {
         if let Error::Failed(cause) = &mut self {
             cause.kind = kind;

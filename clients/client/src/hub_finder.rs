@@ -1,5 +1,5 @@
 //! Detection of a hub or listener in a domain: at which of the domain's locations it runs, and which sensors and topics
-//! exist there. The locks at the locations are queried.
+//! exist there. Each location has locks that show this.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -19,10 +19,10 @@ const MAX_HUBS: usize = 3;
 /// Remedy for a user who needs the data of another user's hub.
 const SHARING_REMEDY: &str = "to have its data under this user: docs/sharing.md";
 
-/// Interval of the queries of the locks while the hub rings doorbells.
+/// Interval of the queries of the locks while the hub rings doorbells, which also shows that it runs.
 const ACTIVE_POLL_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Hub or listener of a domain, as its lock shows.
+/// Finder of the hub or listener of a domain, by its lock.
 pub(crate) struct HubFinder {
     locations: Vec<Domain>,
     hub: Option<HolderProcess>,
@@ -33,7 +33,7 @@ pub(crate) struct HubFinder {
     denied: Option<Failure>,
 }
 
-/// Publisher in a domain. If both run, the hub counts.
+/// Kind of the publisher in a domain. If a hub and a listener run, the kind is [`DomainHolder::Hub`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DomainHolder {
     /// A hub.
@@ -59,8 +59,8 @@ pub struct Change {
 }
 
 impl Change {
-    /// Compares two results. A listener that runs together with a hub does not count as started when the hub ends, or
-    /// as ended when a hub starts.
+    /// Compares the results of two checks. A listener that runs together with a hub does not count as started when the
+    /// hub ends, or as ended when a hub starts.
     fn between(before: Option<&HolderProcess>, now: Option<&HolderProcess>) -> Change {
         let kind = |holder: Option<&HolderProcess>| holder.map(|holder| holder.kind);
         let is_same_domain = before.zip(now).is_some_and(|(a, b)| a.domain == b.domain && a.kind != b.kind);
@@ -73,7 +73,7 @@ impl Change {
 }
 
 impl HubFinder {
-    /// Creates the finder of a hub at `locations`. It uses the first location where one runs.
+    /// Creates a finder for `locations`. It uses the first location at which a hub or listener runs.
     pub(crate) fn new(locations: Vec<Domain>) -> HubFinder {
         HubFinder { locations, hub: None, checked_at: None, queried_at: None, rang_at: None, denied: None }
     }
@@ -83,8 +83,8 @@ impl HubFinder {
         self.rang_at = Some(Instant::now());
     }
 
-    /// Checks for a hub, if the last check is long enough ago. The locks are queried less often while the hub rings
-    /// doorbells.
+    /// Checks for a hub or listener, unless the last check was less than 100 ms ago. Returns what has changed since the
+    /// last check. While the hub rings doorbells, the locks are queried less often.
     pub(crate) fn check(&mut self) -> Change {
         let now = Instant::now();
         let is_within = |at: Option<Instant>, limit| at.is_some_and(|at| now - at < limit);
@@ -135,23 +135,25 @@ impl HubFinder {
         self.hub.as_ref().map(|holder| &holder.domain)
     }
 
-    /// Returns whether it is a hub or a listener.
+    /// Returns the kind of the publisher, if one runs.
     pub(crate) fn holder(&self) -> Option<DomainHolder> {
         self.hub.as_ref().map(|holder| holder.kind)
     }
 
-    /// Returns the failure for callers that cannot wait for a hub.
+    /// Returns the error that no hub runs, for callers that cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Error {
         self.with_access_class(self.no_hub_failure(|| RunningHub::all(Path::new("/"))))
     }
 
-    /// Returns [`HubFinder::no_hub`] without the hubs of other users and domains, for readers on other machines. A
-    /// directory that cannot be opened is named with its owner. It does not read /proc, so it can be called often.
+    /// Returns the same error as [`HubFinder::no_hub`], but without the hubs of other users and domains, because the
+    /// error is shown on other machines. If a directory cannot be opened, the error names it and its owner. This
+    /// function does not read /proc, so it can be called often.
     pub(crate) fn no_hub_here(&self) -> Error {
         self.with_access_class(self.no_hub_failure(Vec::new))
     }
 
-    /// Returns the error for `failure`. Its class is that of another user's directory, if one was found.
+    /// Returns the error for `failure`. If a directory of another user was found, the class is
+    /// [`ErrorKind::OtherUser`].
     fn with_access_class(&self, failure: Failure) -> Error {
         let is_of_other = self.denied.as_ref().is_some_and(|denied| denied.kind == Kind::OtherUser);
         let error = Error::from(failure);
@@ -195,7 +197,7 @@ impl HubFinder {
                 Ok((Some(pid), who)) => {
                     return Some(HolderProcess { domain: location.clone(), pid, kind: who });
                 }
-                // Keep a shortage, because the other locations fail for the same reason.
+                // Do not replace a shortage by a later failure, because the other locations fail for the same reason.
                 Err(failure) if self.shortage().is_none() => self.denied = Some(failure),
                 Err(_) => {}
             }
@@ -204,8 +206,8 @@ impl HubFinder {
     }
 }
 
-/// Returns the failure for a domain without a hub at `locations`. `denied` is the failure to open one of them, `hubs`
-/// are the hubs of this machine, and `caller` is the environment of this process.
+/// Returns the failure for a domain without a hub at `locations`. `denied` is the failure to open one of these
+/// locations, `hubs` are the hubs of this machine, and `caller` is the environment of this process.
 fn no_hub(
     locations: &[Domain],
     denied: Option<&Failure>,
@@ -215,10 +217,11 @@ fn no_hub(
     let name = locations.first().map(Domain::name).unwrap_or_default();
     let is_named = |hub: &RunningHub| hub.uid != caller.uid && hub.domain.as_deref() == Some(name);
     let is_elsewhere = hubs.iter().any(is_named);
-    // A hub of another user whose domain is unknown may be the one.
+    // If another user runs a hub whose domain is unknown, that hub may be in this domain.
     let may_be_elsewhere =
         is_elsewhere || hubs.iter().any(|hub| hub.uid != caller.uid && hub.domain.is_none());
-    // Other hubs count only if no other user has one of this domain; those of this user come first.
+    // Hubs of other domains are named only if no other user has a hub in this domain. Hubs of this user are named
+    // first.
     let mut hubs: Vec<&RunningHub> = hubs.iter().filter(|hub| !is_elsewhere || is_named(hub)).collect();
     hubs.sort_by_key(|hub| (hub.uid != caller.uid, hub.domain.is_some()));
     let mut hints: Vec<String> =
@@ -243,12 +246,13 @@ fn no_hub(
     Failure::new(Kind::NoHub, message, hints.join("; "))
 }
 
-/// Returns the hub at the first live one of `locations`, waiting a moment for one that is just starting.
+/// Returns the first one of `locations` at which a hub or listener runs. Waits for up to half a second for one that is
+/// just starting.
 ///
 /// # Errors
 ///
-/// [`ErrorKind::NoHub`](crate::ErrorKind) after half a second; [`ErrorKind::OtherUser`](crate::ErrorKind) if the domain
-/// belongs to another user.
+/// [`ErrorKind::NoHub`](crate::ErrorKind) if none runs after half a second; [`ErrorKind::OtherUser`](crate::ErrorKind)
+/// if the domain belongs to another user.
 pub fn find(locations: &[Domain]) -> Result<Domain, Error> {
     let deadline = Instant::now() + STARTUP_GRACE;
     let mut finder = HubFinder::new(locations.to_vec());
@@ -264,11 +268,12 @@ pub fn find(locations: &[Domain]) -> Result<Domain, Error> {
     }
 }
 
-/// Time within which a hub that is starting becomes visible. A verb without a hub ends within a second.
+/// Time within which a hub that is starting becomes visible. It is short enough that a verb ends within a second if no
+/// hub runs.
 pub const STARTUP_GRACE: Duration = Duration::from_millis(500);
 
-/// Returns the sensors of the hub at the first live one of `locations`. Returns none in place of an error, and never
-/// waits.
+/// Returns the names of all sensors at the first one of `locations` at which a hub or listener runs. If that fails,
+/// returns no names. Never waits.
 ///
 /// # Examples
 ///

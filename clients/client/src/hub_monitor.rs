@@ -1,7 +1,8 @@
-//! Monitor that makes a descriptor readable when a hub starts or ends, so that a program that polls it needs no timer.
+//! Monitor that makes a descriptor readable when a hub starts or ends, so that a program that polls the descriptor
+//! needs no timer.
 //!
-//! Without a hub, inotify reports changes in the directories in which a hub creates its files. For a directory that
-//! does not exist yet, the nearest one above it that exists is watched. With a hub, a pidfd reports the end of its
+//! Without a hub, inotify reports changes in the directories in which a hub creates its files. If such a directory does
+//! not exist yet, the nearest existing directory above it is watched. With a hub, a pidfd reports the end of its
 //! process.
 
 use std::ffi::{OsStr, OsString};
@@ -19,24 +20,25 @@ use rustix::io::Errno;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use scanhub_shm::Domain;
 
-/// Monitor of the hub of a domain. Its descriptors are part of an epoll.
+/// Monitor of the hub of a domain. Its descriptors are in the epoll of the caller.
 pub(crate) struct HubMonitor {
     epoll: Arc<OwnedFd>,
-    /// Directories, while no hub runs. Each monitor needs an inotify instance, and a user can have only about a
+    /// Watched directories; `None` while a hub runs. They need an inotify instance, and a user can have only about a
     /// hundred.
     directories: Option<Directories>,
     /// The hub's process ID, and its pidfd until it has ended.
     hub: Option<(u32, Option<OwnedFd>)>,
 }
 
-/// Pause after a change that does not concern a hub. In a directory such as /tmp, others can create files all the time.
+/// Time for which changes are not reported after a change that does not concern a hub. In a directory such as /tmp,
+/// other programs may create files all the time.
 const UNRELATED_CHANGE_PAUSE: Duration = Duration::from_secs(2);
 
 /// Interval of the checks for a hub if the directories cannot be watched.
 const UNWATCHED_INTERVAL: Duration = Duration::from_secs(2);
 
-/// Interval of the checks for a hub if all directories are watched. The kernel does not report the removal of a
-/// directory while any process has a file in it open.
+/// Interval of the checks for a hub if all directories are watched. They are necessary because the kernel does not
+/// report the removal of a directory while any process has a file in it open.
 const RECHECK_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Files of a domain's directory that a hub or listener writes when it starts.
@@ -47,11 +49,11 @@ impl HubMonitor {
         HubMonitor { epoll, directories: None, hub: None }
     }
 
-    /// Watches the process `pid` of the hub. Returns whether it has ended since the last call.
+    /// Watches the process `pid` of the hub. Returns whether the process has ended since the last call.
     pub(crate) fn watch_hub(&mut self, pid: u32) -> bool {
         self.directories = None;
         if self.hub.as_ref().is_none_or(|(known, _)| *known != pid) {
-            // Without a pidfd, the caller checks for the hub after the interval.
+            // If no pidfd can be opened, the caller notices the end of the hub when it checks after the interval.
             let process = i32::try_from(pid).ok().and_then(Pid::from_raw);
             let opened = process.and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
             self.hub = Some((pid, opened.filter(|pidfd| add(&self.epoll, pidfd).is_ok())));
@@ -86,7 +88,7 @@ impl HubMonitor {
         directories.watch(locations) || is_new || change == Change::Related
     }
 
-    /// Returns the time after which the caller must check for a hub although nothing has changed.
+    /// Returns the time after which the caller must check for a hub even if nothing has changed.
     pub(crate) fn interval(&self) -> Duration {
         match &self.directories {
             Some(Directories { paused_until: Some(until), .. }) => {
@@ -107,19 +109,19 @@ struct Directories {
     paused_until: Option<Instant>,
 }
 
-/// Directory to watch, with its inotify number if it is watched.
+/// Directory to watch, with the number of its inotify watch if it is watched.
 struct WatchedDirectory {
     target: Target,
     number: Option<i32>,
 }
 
-/// Directory, with the entry in it that leads to a domain; `None` for the domain's directory itself.
+/// Directory to watch. `entry` is the name in it that leads to a domain; `None` for the domain's directory itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Target {
     directory: PathBuf,
     entry: Option<OsString>,
-    /// Device and inode of the directory, which change if a program removes it and creates it again. `None` if it was
-    /// removed before the monitor could watch it.
+    /// Device and inode of the directory, which change if a program removes the directory and creates it again. `None`
+    /// if the directory was removed before the monitor could watch it.
     inode: Option<(u64, u64)>,
 }
 
@@ -151,7 +153,8 @@ impl Directories {
         for mut target in targets {
             let number = match inotify::add_watch(&self.inotify, &target.directory, target.flags()) {
                 Ok(number) => Some(number),
-                // The directory was removed. The next one can have the same inode.
+                // The directory was removed. Forget its inode, because a directory that replaces it can have the same
+                // inode.
                 Err(Errno::NOENT | Errno::NOTDIR) => {
                     target.inode = None;
                     None
@@ -167,7 +170,7 @@ impl Directories {
         }
         for number in old.into_iter().filter_map(|watch| watch.number) {
             if !self.watches.iter().any(|watch| watch.number == Some(number)) {
-                // A directory that was removed is not watched any more.
+                // Ignore an error: a directory that was removed is not watched any more.
                 let _ = inotify::remove_watch(&self.inotify, number);
             }
         }

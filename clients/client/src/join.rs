@@ -1,5 +1,5 @@
-//! Join of the samples of two topics that a hub computes from the same telegram, such as `scan` and `foreground`. They
-//! arrive one after the other, and either one may be missing.
+//! Join of the samples of two topics that a hub computes from the same telegram, such as `scan` and `foreground`. The
+//! two samples arrive one after the other, and either one may be missing.
 
 use std::collections::VecDeque;
 
@@ -38,9 +38,9 @@ struct WaitingSample<T> {
     sample: T,
 }
 
-/// Maximum number of samples of a topic that wait.
+/// Maximum number of samples of a topic that wait for their partners.
 const MAX_WAITING: usize = 64;
-/// Time after which a sample is dropped if the other topic is silent.
+/// Time after which a sample is dropped if the other topic is silent, in ns.
 const PARTNER_TIMEOUT_NS: u64 = 1_000_000_000;
 
 impl<A, B> Default for Join<A, B> {
@@ -50,7 +50,8 @@ impl<A, B> Default for Join<A, B> {
 }
 
 impl<A, B> Join<A, B> {
-    /// Adds a sample of the first topic that was received at `now_ns`. Returns it with its partner if that has arrived.
+    /// Adds a sample of the first topic that was received at `now_ns`. Returns the pair if the sample's partner has
+    /// arrived.
     pub fn first(&mut self, header: &Header, sample: A, now_ns: u64) -> Option<(A, B)> {
         match partner(&mut self.second, header, &mut self.dropped) {
             Some(partner) => Some((sample, partner)),
@@ -61,7 +62,7 @@ impl<A, B> Join<A, B> {
         }
     }
 
-    /// Adds a sample of the second topic that was received at `now_ns`. Returns it with its partner if that has
+    /// Adds a sample of the second topic that was received at `now_ns`. Returns the pair if the sample's partner has
     /// arrived.
     pub fn second(&mut self, header: &Header, sample: B, now_ns: u64) -> Option<(A, B)> {
         match partner(&mut self.first, header, &mut self.dropped) {
@@ -73,8 +74,8 @@ impl<A, B> Join<A, B> {
         }
     }
 
-    /// Drops the samples whose partner's topic is silent. Call it when all samples that have arrived were taken: after
-    /// a pause of the program, a partner may be among them.
+    /// Drops the samples that have waited for longer than 1 s. Call this method only after all samples that have
+    /// arrived were added: after a pause of the program, a partner may be among them.
     pub fn expire(&mut self, now_ns: u64) {
         self.dropped += expire(&mut self.first, now_ns) + expire(&mut self.second, now_ns);
     }
@@ -85,8 +86,8 @@ impl<A, B> Join<A, B> {
     }
 }
 
-/// Removes the partner of the sample with this header from `waiting`, and drops the samples before it. Each topic is in
-/// order, so the partners of those are lost.
+/// Removes the partner of the sample with this header from `waiting`, and drops the samples before it. The samples of
+/// each topic are in order, so the partners of the dropped samples are lost.
 fn partner<T>(waiting: &mut VecDeque<WaitingSample<T>>, header: &Header, dropped: &mut u64) -> Option<T> {
     let is_earlier = |one: &&WaitingSample<T>| one.boot == header.boot && one.seq < header.seq;
     let found = waiting.iter().position(|one| (one.boot, one.seq) == (header.boot, header.seq));

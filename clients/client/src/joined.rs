@@ -1,8 +1,8 @@
-//! Subscriber of two topics that the hub computes from the same telegram, such as `scan` and `foreground`, which
-//! returns their samples in pairs.
+//! Subscriber of two topics, such as `scan` and `foreground`, that the hub computes from the same telegram. It returns
+//! the samples of both topics in pairs.
 //!
-//! Each topic is in order, so the subscriber needs only one sample of each. If their numbers differ, the earlier sample
-//! has no partner.
+//! The samples of each topic arrive in order, so the subscriber keeps only one sample of each topic. If the numbers of
+//! the two samples differ, the earlier sample has no partner.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -19,8 +19,8 @@ use crate::subscribe::sealed::Sealed;
 use crate::subscribe::{ItemSource, Subscribe, Subscriber, WithTimeout};
 use crate::topic_reader::{Received, TopicReader};
 
-/// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. It returns the
-/// samples in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
+/// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. The subscriber
+/// returns the samples in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
 ///
 /// # Examples
 ///
@@ -52,7 +52,7 @@ pub struct Joined<A: Payload + ?Sized, B: Payload + ?Sized> {
     pub first: Received<A>,
     /// The sample of the second topic.
     pub second: Received<B>,
-    /// Number of incomplete pairs between the last one and this one: one or both samples were missed, or one was never
+    /// Number of incomplete pairs between the last pair and this one: one or both samples were missed, or one was never
     /// sent. It is the smallest number that is consistent with the sequence numbers of both topics. 0 for the first
     /// pair.
     pub missed: u64,
@@ -75,25 +75,26 @@ pub struct PairSource<A: Payload + ?Sized, B: Payload + ?Sized> {
 /// State of one of the two topics.
 struct JoinedTopic<P: Payload + ?Sized> {
     reader: TopicReader<P>,
-    /// Sample without a partner, and CLOCK_MONOTONIC in ns until which it waits.
+    /// Sample without a partner, and the time until which it waits, in ns of CLOCK_MONOTONIC.
     waiting: Option<(Received<P>, u64)>,
     /// Number of samples since the last pair that were missed or have no partner.
     missed: u64,
     restarted: bool,
 }
 
-/// Telegrams since the last pair that had a sample without a partner, which was dropped.
+/// Telegrams since the last pair that had only one sample in time. That sample was dropped.
 #[derive(Default)]
 struct DiscardedTelegrams {
     count: u64,
-    /// `boot` and `seq` of the last ones. The partner of a dropped sample may arrive too late, and is then dropped too.
+    /// `boot` and `seq` of the last of these telegrams, so that each is counted once. The partner of a dropped sample
+    /// may arrive too late, and is then dropped, too.
     recent: VecDeque<(u64, u64)>,
 }
 
-/// Number of telegrams after which no sample arrives too late: no topic has a longer queue.
+/// Maximum length of `recent`, in telegrams. No partner arrives later than that, because no topic has a longer queue.
 const MAX_RECENT: usize = 128;
 
-/// Wait for the partner of a sample without a period, in ns.
+/// Time for which a sample without a period waits for its partner, in ns.
 const DEFAULT_WAIT_NS: u64 = 500_000_000;
 
 impl<A: Payload + ?Sized, B: Payload + ?Sized> Sealed for Joined<A, B> {}
@@ -169,7 +170,7 @@ impl<P: Payload + ?Sized> JoinedTopic<P> {
         JoinedTopic { reader: TopicReader::new(sensor), waiting: None, missed: 0, restarted: false }
     }
 
-    /// Receives a sample, if none waits.
+    /// Receives a sample, if none waits for its partner.
     fn fill(&mut self, session: &mut Session) -> Result<(), Error> {
         if self.waiting.is_none()
             && let Some(sample) = self.reader.receive(session)?

@@ -1,15 +1,15 @@
 //! Client library for programs that subscribe to the topics of a hub, and that publish topics next to those of the hub.
 //! A program needs no other crate.
 //!
-//! - [`subscribe`] subscribes to one topic of one sensor in shared memory. It makes no copy, and continues after
-//!   restarts of the hub.
+//! - [`subscribe`] subscribes to one topic of one sensor in shared memory. The subscriber makes no copy, and continues
+//!   after restarts of the hub.
 //! - [`joined`] subscribes to two topics, and returns the samples of one telegram in pairs.
-//! - [`zones`] and [`robot`] subscribe to the verdict of one sensor and of all. After a silence, it is
-//!   [`Verdict::Unknown`].
+//! - [`zones`] and [`robot`] subscribe to the verdict of one sensor, or to the combined verdict. After a silence, the
+//!   verdict is [`Verdict::Unknown`].
 //! - [`SubscriberBuilder::open_pollable`] returns a subscriber with a descriptor for `poll` or an executor. With the
-//!   feature `tokio`, it is a stream.
+//!   feature `tokio`, this subscriber is a stream.
 //! - [`publish`] creates a topic for other programs.
-//! - [`request`] sends a request to the hub, and [`live_sensors`] returns its sensors.
+//! - [`request`] sends a request to the hub, and [`live_sensors`] returns the hub's sensors.
 //! - [`streams`] is for programs that follow many topics in one thread.
 //!
 //! Hub and programs share memory, so they must have the same version. The library prints nothing.
@@ -75,7 +75,7 @@ pub use scanhub_schema::{
 };
 pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
 
-/// Payload of a topic: a type of this crate such as [`Scan`]. Other crates cannot implement it.
+/// Payload of a topic: a type of this crate such as [`Scan`]. Other crates cannot implement this trait.
 ///
 /// ```compile_fail,E0277
 /// #[derive(Debug)]

@@ -11,14 +11,14 @@ use crate::stream::Registration;
 use crate::subscribe::{Subscribe, Subscriber};
 
 /// [`Subscriber`] with a descriptor that is readable while an item may be waiting. Poll the descriptor, but never read
-/// it. While it is readable, `poll` returns at once, until [`try_next`](Self::try_next) returns `None`.
+/// it. It stays readable, so that `poll` returns at once, until [`try_next`](Self::try_next) returns `None`.
 /// [`SubscriberBuilder::open_pollable`](crate::SubscriberBuilder::open_pollable) creates it.
 ///
 /// The descriptor can be readable although nothing has arrived: once a second while a hub runs, when another topic of
-/// the sensor has a sample, and when a hub starts or ends. Without a hub, it is readable only if something changes. For
-/// zones and robots, it also becomes readable when a verdict becomes too old. The descriptor stays the same as long as
-/// the subscriber exists, even if the hub restarts. Programs that the process starts do not inherit it. With the
-/// feature `tokio`, the subscriber is a `Stream`.
+/// the sensor has a sample, and when a hub starts or ends. Without a hub, it is readable only if something changes in
+/// the directories of hubs. For zones and robots, it also becomes readable when a verdict becomes too old. The
+/// descriptor stays the same as long as the subscriber exists, even if the hub restarts. Programs that the process
+/// starts do not inherit it. With the feature `tokio`, the subscriber is a `Stream`.
 ///
 /// # Examples
 ///
@@ -59,7 +59,7 @@ impl<T: Subscribe + ?Sized> PollableSubscriber<T> {
         }
     }
 
-    /// Returns the next item if one has arrived. It never waits.
+    /// Returns the next item if one has arrived. Never waits.
     ///
     /// # Errors
     ///

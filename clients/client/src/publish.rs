@@ -26,9 +26,9 @@ type Waker = scanhub_shm::WakeSender<ThreadSafeService>;
 /// with [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener runs. Publishing needs neither.
 ///
 /// The form of the name depends on the topic. A topic that no hub publishes, such as people or the angles of a mount,
-/// has a name without a dot, such as `mount`. Any number of programs can publish these, each under another name. A
-/// topic that hubs publish has a name of the form `OWNER.NAME`, such as `tracker.near`. Only one process of a domain
-/// can publish these.
+/// has a name without a dot, such as `mount`. Any number of programs can publish such topics, each under another name.
+/// A topic that hubs publish has a name of the form `OWNER.NAME`, such as `tracker.near`. Only one process of a domain
+/// can publish such topics.
 ///
 /// A process that publishes more than one topic, or for more than 32 subscribers, opens a [`PublishSession`].
 ///
@@ -56,7 +56,7 @@ pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Error>
 }
 
 /// Returns the location at which a program publishes in `domain`, or in the domain that SCANHUB_DOMAIN names if
-/// `domain` is `None`: the first location at which a hub runs, otherwise the one that a hub would choose.
+/// `domain` is `None`: the first location at which a hub runs, otherwise the location that a hub would choose.
 ///
 /// # Errors
 ///
@@ -77,7 +77,8 @@ struct Membership {
     /// Wakers by name. A second waker of the same name would disconnect the subscribers of the first one when it ends.
     sensors: Mutex<Vec<Weak<NameWaker>>>,
     node: Node,
-    // This field is after the node, so that the next holder of the lock finds no node of this process.
+    // This field is after the node, so that it is dropped later. The next holder of the lock then finds no node of this
+    // process.
     lock: DomainLock,
 }
 
@@ -94,20 +95,21 @@ fn check_topics(topics: &[Topic], limits: &TopicLimits) -> Result<(), Error> {
     Ok(check_memory(sensor_bytes(topics, limits), longest_segment(topics, limits))?)
 }
 
-/// Descriptors of a service, and of its first subscriber.
+/// Number of descriptors that a service and its first subscriber need.
 const SERVICE_DESCRIPTORS: u64 = 8;
 
 impl PublishSession {
     /// Takes the domain's only lock for a process that publishes in addition to the hub, and removes the shared memory
-    /// of killed processes. There must be memory for one sensor with `topics`. `limits` hold for all topics of the
-    /// session, but a topic that subscribers have kept alive has the slots for subscribers with which it was created.
+    /// of killed processes. There must be memory for one sensor with `topics`. `limits` apply to all topics of the
+    /// session. Only a topic that subscribers have kept alive keeps the number of slots for subscribers with which it
+    /// was created.
     ///
     /// # Errors
     ///
     /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if another process, or another session of this one, holds the lock.
-    /// The message has its process ID. [`ErrorKind::InvalidInput`](crate::ErrorKind) if the limits are invalid;
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
-    /// [`ErrorKind::OtherUser`](crate::ErrorKind) if the directory is another user's.
+    /// The message contains the process ID of the holder. [`ErrorKind::InvalidInput`](crate::ErrorKind) if the limits
+    /// are invalid; [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
+    /// [`ErrorKind::OtherUser`](crate::ErrorKind) if the directory belongs to another user.
     pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Error> {
         limits.check()?;
         let lock = DomainLock::RemoteSensors { _lock: ListenLock::acquire(domain.root())? };
@@ -115,16 +117,17 @@ impl PublishSession {
         Ok(PublishSession::create(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock))
     }
 
-    /// Publishes as `name`. A hub or a listener may run in the same domain. Use it for results that a program computes
-    /// from other topics, for example tracks of people, and for data that no hub has. The name has no dot, and it is
-    /// not that of a sensor of the hub. Locks, limits and cleanup are as in [`open`](Self::open).
+    /// Opens a session for one name, and returns the publisher of `name`. A hub or a listener may run in the same
+    /// domain. Use this function for results that a program computes from other topics, for example tracks of people,
+    /// and for data that no hub has. The name must have no dot, and must not be the name of a sensor of the hub. Locks,
+    /// limits and cleanup are as in [`open`](Self::open).
     ///
     /// # Errors
     ///
-    /// Returns [`ErrorKind::NameHeld`](crate::ErrorKind) if another process publishes as `name`: a program, or the hub
-    /// whose sensor it is. The message names the process. Returns [`ErrorKind::InvalidInput`](crate::ErrorKind) if the
-    /// name is invalid, or if subscribers still wait for a sensor of this name after its hub has ended. Otherwise the
-    /// errors of [`open`](Self::open) and [`sensor`](Self::sensor).
+    /// Returns [`ErrorKind::NameHeld`](crate::ErrorKind) if another process publishes as `name`: a program, or a hub
+    /// with a sensor of this name. The message names the process. Returns [`ErrorKind::InvalidInput`](crate::ErrorKind)
+    /// if the name is invalid, or if subscribers still wait for a sensor of this name after its hub has ended.
+    /// Otherwise returns the errors of [`open`](Self::open) and [`sensor`](Self::sensor).
     pub fn open_named(
         domain: &Domain,
         name: &str,
@@ -140,7 +143,7 @@ impl PublishSession {
             sensor == name && topic.publisher_kind() == PublisherKind::Link
         };
         if scanhub_shm::published_topics(domain)?.iter().any(of_hub) {
-            // A hub that is starting, or that has waited for this name, may take it now.
+            // A hub that is starting, or that has waited for this name, may have taken the name.
             if let Some(pid) = hub_pid(domain.root())? {
                 return Err(name_taken(name, pid).into());
             }
@@ -201,7 +204,7 @@ impl PublishSession {
         Ok(SensorPublisher(sensor))
     }
 
-    /// Removes the shared memory of killed processes. Call it every few seconds.
+    /// Removes the shared memory of killed processes. Call this method every few seconds.
     pub fn clean_up(&self) {
         self.0.node.try_cleanup_dead_nodes();
     }
@@ -213,7 +216,7 @@ pub struct SensorPublisher(Arc<NameWaker>);
 struct NameWaker {
     name: String,
     waker: Waker,
-    /// Doorbells that must ring for samples since the last [`SensorPublisher::wake`].
+    /// Doorbells that must ring for samples that were sent since the last [`SensorPublisher::wake`].
     pending_rings: Mutex<PendingWakeups>,
     membership: Arc<Membership>,
 }
@@ -223,7 +226,7 @@ impl SensorPublisher {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if this process publishes it already;
+    /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if this process publishes the topic already;
     /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if only sensors have the topic, and the name has no dot;
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
     /// [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic exists with another layout.
@@ -231,7 +234,7 @@ impl SensorPublisher {
         self.topic_for(self.limits())
     }
 
-    /// Creates the topic as [`topic`](Self::topic), for samples up to the length in `limits`.
+    /// Creates the topic as [`topic`](Self::topic) does, but for samples up to the length in `limits`.
     ///
     /// # Errors
     ///
@@ -250,7 +253,7 @@ impl SensorPublisher {
         check_topics(&[P::TOPIC], limits)?;
         check_descriptors(SERVICE_DESCRIPTORS)?;
         let topic = TopicPublisher::new(node, &self.0.name, limits)?;
-        // A write to memory that the kernel cannot provide would kill the process.
+        // Allocate the memory now. A later write to memory that the kernel cannot provide would kill the process.
         scanhub_shm::allocate(domain)?;
         Ok(Publication::new(topic, SensorPublisher(self.0.clone())))
     }
@@ -260,12 +263,12 @@ impl SensorPublisher {
         &self.0.membership.limits
     }
 
-    /// Wakes the subscribers that have received samples of any topic of this name since the last call, for `why`. One
-    /// call is enough for samples that are sent together.
+    /// Wakes the subscribers that have received samples of any topic of this name since the last call. `why` is the
+    /// event that they receive. One call is enough for samples that are sent together.
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::Failed`](crate::ErrorKind) if some were not woken. These poll ten times a second.
+    /// [`ErrorKind::Failed`](crate::ErrorKind) if some subscribers were not woken. They poll ten times a second.
     pub fn wake(&self, why: WakeEvent) -> Result<(), Error> {
         let mut due = std::mem::take(&mut *locked(&self.0.pending_rings));
         DoorbellWord::ALL
@@ -350,7 +353,7 @@ impl<P: Payload + ?Sized> Publication<P> {
     }
 
     /// Connects new subscribers, and sends them the samples that the topic stores for late joiners. If samples of the
-    /// topic are rare, call it ten times a second.
+    /// topic are rare, call this method ten times a second, so that new subscribers do not wait for the next sample.
     pub fn connect(&self) {
         // The next sample tries again to connect a subscriber that cannot be connected now.
         let _ = self.topic.connect();
@@ -361,8 +364,8 @@ impl<P: Payload + ?Sized> Publication<P> {
         self.topic.failed()
     }
 
-    /// Sends a sample of `len` bytes, and wakes the subscribers. `fill` writes it in place; all bytes are 0 before. Use
-    /// it for payloads of variable size, such as a scan.
+    /// Sends a sample of `len` bytes, and wakes the subscribers. `fill` writes the sample in place; all bytes are 0
+    /// before. Use this method for payloads of variable size, such as a scan.
     ///
     /// # Errors
     ///
@@ -394,7 +397,7 @@ impl<P: Payload + ?Sized> Publication<P> {
 }
 
 impl<P: Payload> Publication<P> {
-    /// Sends a sample, and wakes the subscribers. `fill` writes it in place, over the payload's default.
+    /// Sends a sample, and wakes the subscribers. `fill` writes the sample in place, over the payload's default.
     ///
     /// # Errors
     ///
@@ -406,8 +409,8 @@ impl<P: Payload> Publication<P> {
         self.sensor.wake(WakeEvent::Telegram)
     }
 
-    /// Sends a sample as [`send`](Self::send) does, which was measured at `stamp_ns` on CLOCK_MONOTONIC, such as the
-    /// angle of a mount.
+    /// Sends a sample that was measured at `stamp_ns` on CLOCK_MONOTONIC, such as the angle of a mount. Otherwise does
+    /// the same as [`send`](Self::send).
     ///
     /// # Errors
     ///
@@ -419,8 +422,8 @@ impl<P: Payload> Publication<P> {
     }
 
     /// Sends a sample as [`send`](Self::send) does, but with `header`, whose sequence number in the topic is replaced,
-    /// and without waking subscribers. Use it for samples of several topics that are sent together. Returns the number
-    /// of subscribers that have received the sample.
+    /// and without waking subscribers. Use this method for samples of several topics that are sent together. Returns
+    /// the number of subscribers that have received the sample.
     ///
     /// # Errors
     ///

@@ -15,8 +15,8 @@ use crate::subscribe::{ItemSource, Subscribe, Subscriber};
 use crate::zones::{StalenessTimer, ZonesSource, ZonesUpdate};
 
 /// Subscribes to the zones of `sensors` in the domain that SCANHUB_DOMAIN names. Without names, it subscribes to all
-/// sensors of the hub. In a domain without a hub, these are the remote sensors that are published there. The hub may
-/// start later.
+/// sensors of the hub. In a domain without a hub, it subscribes to all remote sensors that a listener publishes. The
+/// hub may start later.
 ///
 /// # Examples
 ///
@@ -52,7 +52,7 @@ impl Robot {
         verdicts.reduce(Verdict::worse).unwrap_or(Verdict::Unknown)
     }
 
-    /// Returns the first sensor with the worst verdict.
+    /// Returns the first sensor with the worst verdict; `None` if there are no sensors.
     pub fn worst(&self) -> Option<&str> {
         let verdict = self.verdict();
         self.sensors().find(|(_, of_sensor)| *of_sensor == verdict).map(|(sensor, _)| sensor)
@@ -74,8 +74,8 @@ impl Robot {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
     }
 
-    /// Adds `sensor`, which counts as unknown until its data arrives, and returns its position. It is for programs that
-    /// do not receive samples through [`robot`](robot()).
+    /// Adds `sensor`, which counts as unknown until its data arrives, and returns its position. Use this method in
+    /// programs that do not receive samples through [`robot`](robot()).
     pub fn expect(&mut self, sensor: &str) -> usize {
         self.parts.push((sensor.to_owned(), Zones::unknown()));
         self.parts.len() - 1
@@ -96,17 +96,19 @@ pub type RobotSubscriber = Subscriber<Robot>;
 
 impl Subscriber<Robot> {
     /// Waits until zones of any sensor arrive or become too old, and returns the robot's state. The first call waits
-    /// for this from each sensor. A sensor becomes unknown as with [`ZonesSubscriber`](crate::ZonesSubscriber).
+    /// until that has happened for each sensor. The verdict of a sensor becomes unknown under the same conditions as
+    /// with [`ZonesSubscriber`](crate::ZonesSubscriber).
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). The verdict is unknown then, too.
+    /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). After an error, the verdict is unknown,
+    /// too.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<Robot, Error> {
         self.wait_for_next()
     }
 
-    /// Returns the current state, even if it has not changed. It never waits.
+    /// Returns the current state, even if it has not changed. Never waits.
     ///
     /// # Errors
     ///
@@ -155,32 +157,33 @@ impl ItemSource for RobotSource {
 }
 
 /// Source of the combined zones of a robot's sensors, sample by sample, in the caller's session. If no sensor is named,
-/// it subscribes to all sensors of the hub, or to remote sensors if only they are published. It never waits.
+/// the source subscribes to all sensors of the hub, or to all remote sensors if only a listener runs. It never waits.
 pub struct RobotSource {
     robot: Robot,
     parts: Vec<ZonesSource>,
-    /// Index of the sensor that is next in the round, so that no sensor waits for the samples of another one.
+    /// Index of the sensor that is read next. The sensors are read in turn, so that no sensor waits until all samples
+    /// of another one are handled.
     next_part: usize,
     /// Whether each sensor has sent a sample or missed its deadline once, so that the result includes all of them.
     is_complete: bool,
-    /// Deadline while there are no sensors.
+    /// Timer after which the verdict is unknown if there are no sensors.
     no_sensors: StalenessTimer,
     /// Origin of the sensors.
     origin: SensorOrigin,
     /// Time of the next search for new sensors, while a hub or a listener publishes.
     discover_at: Option<Instant>,
-    /// Whether early warnings count too.
+    /// Whether early warnings are used, too.
     early: bool,
 }
 
 /// Origin of the sensors of a robot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum SensorOrigin {
-    /// The caller named them.
+    /// The caller named the sensors.
     Named,
-    /// All sensors of one publisher. It is the first one that runs, and the hub as soon as a hub runs, because the
-    /// zones of another robot's sensors are around the center of that robot. After the hub has exited, its sensors are
-    /// missing, and no others replace them.
+    /// All sensors of one publisher. It is the first publisher that runs, but the hub as soon as a hub runs, because
+    /// the zones of remote sensors may be around the center of another robot. After the hub has exited, its sensors are
+    /// missing, and no other sensors replace them.
     All(Option<DomainHolder>),
 }
 
@@ -192,12 +195,12 @@ pub struct RobotUpdate {
     pub update: ZonesUpdate,
 }
 
-/// Maximum number of remote sensors of a robot: the number that a listener publishes at a time. No sensor is ever
-/// removed, and a sender in the listener's network can announce any number of new ones.
+/// Maximum number of remote sensors of a robot. A listener publishes no more at a time. A robot needs a limit of its
+/// own: it never removes a sensor, and a sender in the listener's network can announce any number of new sensors.
 const MAX_REMOTE_SENSORS: usize = 16;
 
-/// Name of an entry for the remote sensors beyond the maximum. Its zones are always unknown. No sensor can have this
-/// name.
+/// Name of an entry that stands for all remote sensors beyond the maximum. The zones of this entry are always unknown.
+/// No sensor can have this name.
 const OTHERS_NAME: &str = "others...";
 
 /// Interval at which the source searches for new sensors. A hub that is starting creates its topics one after the
@@ -221,8 +224,8 @@ impl RobotSource {
         source
     }
 
-    /// Takes early warnings too: a warning makes the verdict worse until the zones of its scan arrive, or until the hub
-    /// withdraws it.
+    /// Makes the source use early warnings, too. A warning makes the verdict worse until the zones of its scan arrive,
+    /// or until the hub withdraws it.
     pub fn with_early(self) -> RobotSource {
         let RobotSource { robot, parts, .. } = self;
         let names = robot.sensors().map(|(sensor, _)| sensor);
@@ -240,7 +243,8 @@ impl RobotSource {
         !self.parts.is_empty() && self.parts.iter().all(ZonesSource::subscribed)
     }
 
-    /// Returns the next sample or silence of any sensor, after each has had one.
+    /// Returns the next sample or silence of any sensor. Returns `None` until each sensor has had a sample or a
+    /// silence.
     ///
     /// # Errors
     ///
@@ -273,15 +277,15 @@ impl RobotSource {
 
     /// Handles all waiting samples and silences, and checks for the hub. Returns whether there were any.
     fn drain_and_check(&mut self, session: &mut Session) -> Result<bool, Error> {
-        // Handle samples before the check for the hub, as with one sensor. A program that always has samples must also
-        // notice a new hub.
+        // Handle samples before the check for the hub, because the check takes longer. A program that always has
+        // samples must also notice a new hub.
         let has_update = self.drain(session)?;
         session.check_hub()?;
         Ok(self.drain(session)? || has_update)
     }
 
-    /// Returns the reason of the first sensor whose verdict is unknown and that has a reason. Without sensors, it is
-    /// the reason why no hub runs, or that the hub has none with zones.
+    /// Returns why no hub runs or, if one runs, the reason for the silence of the first sensor with an unknown verdict
+    /// and a known reason. If the robot has no sensors, the reason may be that the hub has none with zones.
     pub fn why_silent(&mut self, session: &mut Session) -> Silence {
         if let Some(reason) = Silence::of_hub(session) {
             return reason;
@@ -317,7 +321,7 @@ impl RobotSource {
     }
 
     /// Drops the remote sensors if a hub has started. The verdict is then unknown until the hub's own sensors send
-    /// zones. Returns whether this has just happened.
+    /// zones. Returns whether this call has dropped them.
     fn switch_to_hub(&mut self, holder: Option<DomainHolder>) -> bool {
         if (self.origin, holder) != (SensorOrigin::All(Some(DomainHolder::Listener)), Some(DomainHolder::Hub))
         {
@@ -349,7 +353,7 @@ impl RobotSource {
         Ok(())
     }
 
-    /// Subscribes to `sensor`, unless that was done before. If there are too many remote sensors, [`OTHERS_NAME`]
+    /// Subscribes to `sensor`, unless the robot already has it. If there are too many remote sensors, [`OTHERS_NAME`]
     /// represents the rest, without data.
     fn add_sensor(&mut self, sensor: &str) {
         let is_known = |name: &str| self.robot.sensors().any(|(known, _)| known == name);

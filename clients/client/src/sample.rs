@@ -15,7 +15,7 @@ use crate::subscribe::Subscribe;
 use crate::topic_reader::Received;
 use crate::zones::{ZonesSource, ZonesUpdate};
 
-/// Selects the source type of a topic. Zones expire, other samples do not.
+/// Selects the type by which a topic is subscribed. Zones become stale, so they have their own type.
 macro_rules! kind {
     (Zones $payload:tt) => {
         ZonesUpdate
@@ -115,22 +115,23 @@ impl Source {
 }
 
 impl Sample {
-    /// Returns numbers, stamps and quality. `None` if the sample stands for a silence.
+    /// Returns the header, with numbers, stamps and quality. `None` if the sample stands for a silence.
     pub fn header(&self) -> Option<&Header> {
         self.any().header()
     }
 
-    /// Returns how many samples were sent before this one and not received.
+    /// Returns how many samples were missed before this one: they were sent, but not received.
     pub fn missed(&self) -> u64 {
         self.any().missed()
     }
 
-    /// Returns the nominal time between two scans, in us; 0 unknown.
+    /// Returns the nominal time between two scans, in us; 0 if it is unknown.
     pub fn period_us(&self) -> u32 {
         self.header().map_or(0, |header| header.period_us)
     }
 
-    /// Returns whether the sample was sent before `since_ns` of CLOCK_MONOTONIC, so that it waited for this subscriber.
+    /// Returns whether the sample was sent before `since_ns` of CLOCK_MONOTONIC. If `since_ns` is the time of the
+    /// subscription, the topic kept such a sample for late joiners.
     pub fn is_older_than(&self, since_ns: u64) -> bool {
         self.header().is_some_and(|header| header.stamp_last_ns < since_ns)
     }

@@ -1,5 +1,5 @@
-//! Membership of a process in a domain, across restarts of its hub. It wakes the process when samples arrive, and
-//! reports that a hub has started or ended.
+//! Membership of a process in a domain, across restarts of the hub. A session wakes the process when samples arrive,
+//! and reports that a hub has started or ended.
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -21,24 +21,24 @@ use crate::hub_monitor::HubMonitor;
 use crate::silence::Silence;
 use crate::wait::{Wait, Wakeups};
 
-/// Maximum wait. Afterwards, the session checks for the hub, and the caller can stop.
+/// Maximum time of one wait. After it, the session can check for the hub, and the caller can stop.
 const MAX_WAIT: Duration = Duration::from_millis(100);
 
-/// Interval at which a program that polls the descriptor checks a running hub. An event reports the start of the next
-/// hub.
+/// Interval at which a program that polls the descriptor checks for the hub while one runs. Without a hub, the
+/// descriptor becomes readable when the next one starts.
 const HUB_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Membership in the first of several domains where a hub runs.
+/// Membership in the domain at the first of several locations at which a hub runs.
 pub struct Session {
     finder: HubFinder,
     joined: Option<JoinedDomain>,
-    /// Whether a hub has started whose shared memory may have other names than the joined one.
+    /// Whether a hub has started whose shared memory may have other names than that of the joined domain.
     is_unsure: bool,
     join_count: u32,
     /// Number of hubs or listeners that have started.
     start_count: u32,
     wait: Wait,
-    /// CLOCK_BOOTTIME at the last sample, or at the creation, in ns.
+    /// Time of the last sample or, before the first one, of the session's creation, in ns of CLOCK_BOOTTIME.
     last_sample_ns: u64,
     /// Descriptor for programs that poll it; `None` if it is not used.
     poll_descriptor: Option<PollDescriptor>,
@@ -69,7 +69,7 @@ impl Session {
         }
     }
 
-    /// Sets the method by which the session waits. Call it before subscribing to any topic.
+    /// Sets the method by which the session waits. Call this method before subscribing to any topic.
     pub fn waiting_by(self, wait: Wait) -> Session {
         Session { wait, ..self }
     }
@@ -127,7 +127,7 @@ impl Session {
         self.finder.domain()
     }
 
-    /// Returns the kind of the publisher there, as of the last check.
+    /// Returns the kind of the publisher in the domain, as of the last check.
     pub fn domain_holder(&self) -> Option<DomainHolder> {
         self.finder.holder()
     }
@@ -153,12 +153,13 @@ impl Session {
         self.domain().is_some_and(|domain| is_starting(domain.root()) == Ok(true))
     }
 
-    /// Returns the failure for callers that cannot wait for a hub.
+    /// Returns the error that no hub runs, for callers that cannot wait for a hub.
     pub fn no_hub(&self) -> Error {
         self.finder.no_hub()
     }
 
-    /// Returns [`Session::no_hub`] without the hubs of other users and domains, for readers on other machines.
+    /// Returns the same error as [`Session::no_hub`], but without the hubs of other users and domains, because the
+    /// error is shown on other machines.
     pub fn no_hub_here(&self) -> Error {
         self.finder.no_hub_here()
     }
@@ -168,13 +169,14 @@ impl Session {
         self.finder.silence_reason()
     }
 
-    /// Returns the number of times that a domain was joined. Ports of an earlier one must be opened again.
+    /// Returns how often the session has joined a domain. Ports that were opened before it joined last must be opened
+    /// again.
     pub fn join_count(&self) -> u32 {
         self.join_count
     }
 
-    /// Returns the number of starts of a hub or listener that the checks have found. A session can stay in the domain
-    /// during a start.
+    /// Returns the number of starts of a hub or listener that the checks have found. A start does not always require
+    /// the session to join again, so this number is not that of [`join_count`](Self::join_count).
     pub(crate) fn start_count(&self) -> u32 {
         self.start_count
     }
@@ -189,7 +191,7 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers are short;
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or slots for subscribers are short;
     /// [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
     pub fn subscribe<P: Payload + ?Sized>(
         &mut self,
@@ -221,8 +223,8 @@ impl Session {
     }
 
     /// Returns a descriptor that is readable while a sample or a check may be due. The session waits by event from now
-    /// on. The descriptor stays the same when the hub is replaced. Only [`rearm_descriptor`](Self::rearm_descriptor)
-    /// makes it unreadable. Call this before subscribing to any topic.
+    /// on. The session keeps this descriptor when the hub is replaced. Only
+    /// [`rearm_descriptor`](Self::rearm_descriptor) makes it unreadable. Call this before subscribing to any topic.
     ///
     /// # Errors
     ///
@@ -235,9 +237,9 @@ impl Session {
         Ok(descriptor)
     }
 
-    /// Notes that the caller has received all samples. The descriptor, if it is used, is not readable until something
-    /// changes or `left` has passed. Returns whether samples were sent, or a hub has started or ended, in the meantime.
-    /// The caller must then first check for the hub and receive samples.
+    /// Notes that the caller has received all samples. The descriptor, if it is used, is then not readable until
+    /// something changes or `left` has passed. Returns whether samples were sent, or a hub has started or ended, in the
+    /// meantime. The caller must then first check for the hub and receive samples.
     ///
     /// # Errors
     ///
@@ -262,8 +264,8 @@ impl Session {
         Ok(self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())?)
     }
 
-    /// Sleeps until a sample was sent, at most until `until` and for 100 ms. Returns at once if a sample may have been
-    /// sent since the caller last received.
+    /// Sleeps until a sample was sent, but at most until `until`, and for at most 100 ms. Returns at once if a sample
+    /// may have been sent since the caller last received samples.
     ///
     /// # Errors
     ///
@@ -279,7 +281,7 @@ impl Session {
     /// Returns the errors of [`wait`](Self::wait).
     pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Error> {
         let left = left.map_or(MAX_WAIT, |left| left.min(MAX_WAIT));
-        // The wait takes events that a polling program has not seen, so keep the descriptor readable until it is
+        // The wait consumes events that a polling program has not seen, so keep the descriptor readable until it is
         // rearmed.
         if let Some(poll_descriptor) = &self.poll_descriptor {
             poll_descriptor.set_timer(Some(Duration::ZERO))?;
@@ -303,8 +305,8 @@ struct PollDescriptor {
 }
 
 impl PollDescriptor {
-    /// Creates a descriptor that is readable at once. Fails with [`ErrorKind::ResourceExhausted`](crate::ErrorKind)
-    /// without free descriptors.
+    /// Creates a descriptor that is readable at once. Returns [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
+    /// descriptors have run out.
     fn new() -> Result<PollDescriptor, Error> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
         let timer = timerfd_create(TimerfdClockId::Monotonic, flags).map_err(shortage)?;
@@ -316,8 +318,8 @@ impl PollDescriptor {
         Ok(poll_descriptor)
     }
 
-    /// Adds `event`, if it is new. The kernel removes it when it is closed. Fails with
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) without free memory.
+    /// Adds `event`, if it is new. The kernel removes it when it is closed. Returns
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory is short.
     fn add(&self, event: BorrowedFd<'_>) -> Result<(), Error> {
         let data = epoll::EventData::new_u64(0);
         match epoll::add(&self.descriptor, event, data, epoll::EventFlags::IN) {
@@ -328,7 +330,7 @@ impl PollDescriptor {
 
     /// Sets the timer: it makes the descriptor readable after `left`, or never.
     fn set_timer(&self, left: Option<Duration>) -> Result<(), Error> {
-        // 0 means never.
+        // For the kernel, 0 means never, so use at least 1 ns for a time that has passed.
         let left = left.map_or(Duration::ZERO, |left| left.max(Duration::from_nanos(1)));
         let it_value = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
         let once = Itimerspec { it_interval: Timespec { tv_sec: 0, tv_nsec: 0 }, it_value };

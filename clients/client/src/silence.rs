@@ -28,7 +28,7 @@ pub enum Silence {
     OtherUser {
         /// The domain, and the reason if its directory cannot be opened.
         message: String,
-        /// The user, and ways to the data.
+        /// The user who runs the hub, and how to get its data.
         remedy: String,
     },
     /// The hub has no such sensor.
@@ -69,7 +69,7 @@ pub enum Silence {
     Full {
         /// Message that names the exhausted resource.
         message: String,
-        /// Ways to get a slot.
+        /// Ways to get a slot, memory or a descriptor.
         remedy: String,
     },
     /// No problem is known: the next sample has not been sent yet, the hub is starting, or its status has not arrived
@@ -103,8 +103,8 @@ impl Silence {
         }
     }
 
-    /// Returns the reason for a topic that does not exist, if `published` is everything that the hub publishes. `None`
-    /// if the topic exists.
+    /// Returns the reason if the topic does not exist; `None` if it does. `published` has all topics that the hub
+    /// publishes, each with its sensor.
     pub(crate) fn of_topics(sensor: &str, topic: Topic, published: &[(String, Topic)]) -> Option<Silence> {
         let sensors = names(published);
         if !sensors.iter().any(|known| known == sensor) {
@@ -120,7 +120,7 @@ impl Silence {
 
     /// Returns the reason for a robot that subscribes to all sensors and has found none.
     pub(crate) fn of_all_sensors(session: &Session) -> Silence {
-        // A listener publishes a sensor as soon as another machine sends it.
+        // Only a hub has a complete list. A listener publishes each sensor as soon as another machine sends it.
         let is_complete = session.domain_holder() == Some(DomainHolder::Hub) && !session.hub_is_starting();
         let Some(domain) = session.domain().filter(|_| is_complete) else { return Silence::Waiting };
         match scanhub_shm::published_topics(domain) {
@@ -175,18 +175,19 @@ impl fmt::Display for Silence {
     }
 }
 
-/// Check why a sensor's topic is silent. From the first call of [`reason`](Self::reason) on, it subscribes to the
-/// sensor's status.
+/// Check for the reason why a sensor's topic is silent. From the first call of [`reason`](Self::reason) on, the check
+/// subscribes to the sensor's status.
 #[derive(Default)]
 pub(crate) struct SilenceCheck {
     status: Option<Box<SensorStatus>>,
 }
 
-/// Status of the sensor.
+/// Subscription to the status of the sensor.
 struct SensorStatus {
     reader: TopicReader<Status>,
     last: Option<Status>,
-    /// The session's count of starts, as of the hub that publishes the status.
+    /// Value of [`Session::start_count`] when the subscription was created. A later start means that another hub
+    /// publishes the status.
     start_count: u32,
 }
 
@@ -208,7 +209,8 @@ impl SilenceCheck {
         let (sensor, topic) = (reader.sensor(), <P as Payload>::TOPIC);
         // Check the start before the topics, because a hub that is no longer starting has all of its topics.
         let is_starting = session.hub_is_starting();
-        // If the next hub lacks the topic, the ports of subscribers still keep it open.
+        // If the next hub lacks the topic, the ports of subscribers still keep the topic open, so check for a
+        // publisher.
         let is_served = match session.node().map(|node| has_publisher(node, sensor, topic)) {
             Some(Ok(is_served)) => is_served,
             Some(Err(failure)) => return Silence::of_shortage(&failure.into()),
@@ -264,8 +266,8 @@ fn names(published: &[(String, Topic)]) -> Vec<String> {
 
 macro_rules! has_publisher {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        /// Returns whether any program publishes the `topic` of `sensor`. A topic of another layout counts. Fails with
-        /// [`Kind::ResourceExhausted`] if memory or descriptors are short.
+        /// Returns whether any program publishes the `topic` of `sensor`. A topic with another layout counts, too.
+        /// Fails with [`Kind::ResourceExhausted`] if memory or descriptors are short.
         fn has_publisher(node: &Node<ThreadSafeService>, sensor: &str, topic: Topic) -> Result<bool, Failure> {
             let publishers = match topic {
                 $(Topic::$topic => <scanhub_schema::payload_type!($payload)>::open(node, sensor)

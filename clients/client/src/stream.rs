@@ -20,7 +20,7 @@ use crate::subscribe::Subscribe;
 pub(crate) struct Registration(Option<AsyncFd<Arc<OwnedFd>>>);
 
 impl Registration {
-    /// Waits until `descriptor` is readable again. It may also end early.
+    /// Waits until `descriptor` is readable again. The wait may also end early.
     fn poll_readable(&mut self, descriptor: &Arc<OwnedFd>, cx: &mut Context<'_>) -> Poll<Result<(), Error>> {
         let is_registered = self.0.is_some();
         let registered = match &self.0 {
@@ -47,7 +47,7 @@ impl Registration {
                 guard.clear_ready();
                 Poll::Ready(Ok(()))
             }
-            // The runtime of the registration has ended, and another one polls the stream.
+            // The runtime of the registration has ended, and another runtime polls the stream.
             Err(_) if is_registered => {
                 self.0 = None;
                 self.poll_readable(descriptor, cx)
@@ -63,7 +63,8 @@ impl Registration {
 /// No field of the subscriber is pinned.
 impl<T: Subscribe + ?Sized> Unpin for PollableSubscriber<T> {}
 
-/// Items as they arrive. The stream never ends. It keeps no item, so a dropped future loses none.
+/// Stream of items as they arrive. It never ends. It keeps no item between polls, so no item is lost if a future is
+/// dropped.
 impl<T: Subscribe + ?Sized> Stream for PollableSubscriber<T> {
     type Item = Result<T::Item, Error>;
 

@@ -1,5 +1,5 @@
-//! Subscribers of any kind, and the subscriber of a topic. It makes no copies, waits for a hub that does not run yet,
-//! and continues when the hub is restarted.
+//! Subscribers of any kind, and the subscriber of a topic. The subscriber of a topic makes no copies, waits for a hub
+//! that does not run yet, and continues when the hub is restarted.
 
 use std::time::{Duration, Instant};
 
@@ -45,7 +45,7 @@ pub struct Subscriber<T: Subscribe + ?Sized> {
 }
 
 /// Kind of a [`Subscriber`]: a payload such as [`Scan`](crate::Scan), [`Joined`](crate::Joined),
-/// [`ZonesUpdate`](crate::ZonesUpdate) or [`Robot`](crate::Robot). Other crates cannot implement it.
+/// [`ZonesUpdate`](crate::ZonesUpdate) or [`Robot`](crate::Robot). Other crates cannot implement this trait.
 pub trait Subscribe: sealed::Sealed {
     /// Names of the sensors: `&str`, or `&[&str]` for a robot.
     type Sensors<'a>: SensorNames;
@@ -82,7 +82,7 @@ impl SensorNames for &[&str] {
     }
 }
 
-/// Source of items in the session of its subscriber. It never waits.
+/// Source of items in the session of its subscriber. The source never waits.
 pub trait ItemSource {
     /// Received item.
     type Item;
@@ -105,7 +105,8 @@ pub trait ItemSource {
         self.receive(session)
     }
 
-    /// Returns the time after which the source has an item even if no sample arrives. `None` if only samples are items.
+    /// Returns the time after which the source has an item even if no sample arrives. `None` if the source has items
+    /// only when samples arrive.
     fn time_left(&self) -> Option<Duration> {
         None
     }
@@ -130,7 +131,7 @@ impl<T: Subscribe + ?Sized> Subscriber<T> {
         Subscriber { session, source, timeout }
     }
 
-    /// Returns the next item if one has arrived. It never waits.
+    /// Returns the next item if one has arrived. Never waits.
     ///
     /// # Errors
     ///
@@ -146,7 +147,8 @@ impl<T: Subscribe + ?Sized> Subscriber<T> {
         }
     }
 
-    /// Returns an iterator that waits for each item. It ends after a silence of the timeout; a later call continues.
+    /// Returns an iterator that waits for each item. The iterator ends after a silence that is as long as the timeout.
+    /// The next call of `iter` continues.
     ///
     /// # Examples
     ///
@@ -192,9 +194,9 @@ impl<T: Subscribe + ?Sized> Subscriber<T> {
         self.session.silent_for()
     }
 
-    /// Returns why no sample arrives. It never waits, and is cheap enough for once a second. The first call after a
-    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor. For a robot,
-    /// it is the reason of the first sensor whose verdict is unknown and that has a reason.
+    /// Returns why no sample arrives. This method never waits, and is cheap enough to be called once a second. The
+    /// first call after a sample can return [`Silence::Waiting`], because the method has just subscribed to the status
+    /// of the sensor. For a robot, returns the reason of the first sensor with an unknown verdict and a known reason.
     ///
     /// # Examples
     ///
@@ -255,8 +257,8 @@ impl<'a, T: Subscribe + ?Sized> IntoIterator for &'a mut Subscriber<T> {
     }
 }
 
-/// Items of a [`Subscriber`]. Up to four samples may be held; with four held, the iterator returns
-/// [`Error::TooManyHeld`] in place of the next one, which stays in the queue.
+/// Items of a [`Subscriber`]. A program may hold up to four samples. While it holds four, the iterator returns
+/// [`Error::TooManyHeld`] in place of the next sample, which stays in the queue.
 pub struct Iter<'a, T: Subscribe + ?Sized>(&'a mut Subscriber<T>);
 
 impl<T: Subscribe + ?Sized> Iterator for Iter<'_, T> {

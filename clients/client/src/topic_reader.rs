@@ -1,5 +1,5 @@
 //! Reader of one topic of one sensor. It receives sample by sample, and counts missed samples by their sequence
-//! numbers. It continues when the hub is replaced. It never waits, because the session does that.
+//! numbers. It continues when the hub is replaced. It never waits. Waiting is up to the session.
 
 use std::mem;
 use std::ops::Deref;
@@ -13,7 +13,7 @@ use crate::session::Session;
 use crate::silence::{Silence, SilenceCheck};
 
 /// Sample in shared memory. `*` returns the payload, read-only and without a copy. Hold at most four samples of a
-/// subscriber at a time. They stay valid while it waits, and after the hub has ended.
+/// subscriber at a time. The samples stay valid while the subscriber waits, and after the hub has ended.
 #[derive(Debug)]
 pub struct Received<P: Payload + ?Sized> {
     sample: Sample<P, ThreadSafeService>,
@@ -24,7 +24,7 @@ pub struct Received<P: Payload + ?Sized> {
 }
 
 impl<P: Payload + ?Sized> Received<P> {
-    /// Returns numbers, stamps and quality of the sample.
+    /// Returns the header, with numbers, stamps and quality of the sample.
     pub fn header(&self) -> &Header {
         self.sample.user_header()
     }
@@ -39,8 +39,8 @@ impl<P: Payload + ?Sized> Deref for Received<P> {
 }
 
 impl Received<Scan> {
-    /// Returns the time at which beam `i` was measured, in ns of CLOCK_MONOTONIC. It is earlier than the sample's
-    /// stamps, which are those of bytes on the line.
+    /// Returns the time at which beam `i` was measured, in ns of CLOCK_MONOTONIC. That time is earlier than the
+    /// sample's stamps, which are the times of bytes on the line.
     pub fn beam_time_ns(&self, i: usize) -> u64 {
         self.header().stamp_first_ns.saturating_add_signed(self.beam_ns(i))
     }
@@ -55,12 +55,12 @@ pub struct TopicReader<P: Payload + ?Sized> {
     refused: Option<Error>,
     sequence: SequenceTracker,
     unconnected_since: Option<Instant>,
-    /// Mark of the session at which no sample had arrived.
+    /// Value of [`Session::sample_mark`] when no sample was waiting. While it stays the same, none has arrived.
     empty_at: Option<(u32, Instant)>,
     silence: SilenceCheck,
 }
 
-/// Interval of the attempts to open a topic that does not exist yet.
+/// Interval between attempts to open a topic that does not exist yet.
 const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Time after which a failure to connect to a publisher is reported. While a hub exits, such failures are normal.
@@ -86,8 +86,9 @@ impl<P: Payload + ?Sized> TopicReader<P> {
         self.port.is_some()
     }
 
-    /// Returns why no sample arrives. It never waits, and is cheap enough for once a second. The first call after a
-    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor.
+    /// Returns why no sample arrives. This method never waits, and is cheap enough to be called once a second. The
+    /// first call after a sample can return [`Silence::Waiting`], because the method has just subscribed to the status
+    /// of the sensor.
     pub fn why_silent(&mut self, session: &mut Session) -> Silence {
         let mut silence = mem::take(&mut self.silence);
         let reason = silence.reason(session, self);
@@ -99,7 +100,7 @@ impl<P: Payload + ?Sized> TopicReader<P> {
         &self.sensor
     }
 
-    /// Returns whether it is subscribed to the topic of the session's current hub.
+    /// Returns whether the reader is subscribed to the topic of the session's current hub.
     pub(crate) fn is_attached(&self, session: &Session) -> bool {
         self.port.as_ref().is_some_and(|(number, _)| *number == session.join_count())
     }
@@ -125,7 +126,7 @@ impl<P: Payload + ?Sized> TopicReader<P> {
         Ok(received)
     }
 
-    /// Returns the next sample that has arrived, without ending a silence of the session.
+    /// Returns the next sample that has arrived, but does not count it as the end of a silence.
     pub(crate) fn receive_quietly(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
         if !self.subscribe(session)? {
             return Ok(None);
@@ -144,8 +145,8 @@ impl<P: Payload + ?Sized> TopicReader<P> {
                 Ok(sample.map(|sample| self.count(sample)))
             }
             Err(ReceiveError::ExceedsMaxBorrows) => Err(Error::TooManyHeld),
-            // This occurs while the memory of a killed hub is being removed. If it persists, descriptors or memory are
-            // short.
+            // This error occurs while the memory of a killed hub is being removed. If it persists, descriptors or
+            // memory are short.
             Err(ReceiveError::ConnectionFailure(error)) => {
                 let since = *self.unconnected_since.get_or_insert_with(Instant::now);
                 if since.elapsed() < CONNECTION_FAILURE_TIMEOUT {
@@ -202,13 +203,13 @@ pub struct SequenceGap {
 }
 
 impl SequenceTracker {
-    /// Continues at the sequence number of the next sample, because the port is new.
+    /// Accepts any sequence number of the next sample without counting missed samples, because the port is new.
     pub fn reset(&mut self) {
         self.expected = None;
     }
 
-    /// Compares the sample with `header`. A port that was open before the hub started receives the hub's samples from
-    /// number 0. A new port starts at any number.
+    /// Compares the sequence number in `header` with that of the previous sample. A port that was open before the hub
+    /// started receives the hub's samples from number 0. A new port starts at any number.
     pub fn note(&mut self, header: &Header) -> SequenceGap {
         let restarted = self.boot.is_some_and(|boot| boot != header.boot);
         // Numbers of remote topics continue when the hub on the other machine restarts.

@@ -15,12 +15,13 @@ type Listener = scanhub_shm::Listener<ThreadSafeService>;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Wait {
     /// Sleep on a word in shared memory. One call of the hub wakes all subscribers. If the system cannot wait for the
-    /// words of several sensors at once, it uses the event.
+    /// words of several sensors at once, the subscriber uses the event.
     #[default]
     Doorbell,
-    /// Sleep on the event, which other languages use. The hub sends one message to each subscriber.
+    /// Sleep on the event, as subscribers in other languages do. The hub sends one message to each subscriber.
     Event,
-    /// Do not sleep, and read the words continuously. It has the shortest latency, and uses one CPU core completely.
+    /// Do not sleep, and read the words continuously. This method has the shortest latency, and uses one CPU core
+    /// completely.
     Spin,
 }
 
@@ -30,7 +31,8 @@ pub(crate) struct Wakeups {
     sensors: Vec<Sensor>,
     /// Whether a doorbell was rung since the last [`Wakeups::take_activity`].
     has_activity: bool,
-    /// Whether wake-ups by event were taken since the last sleep, so that the caller has received samples.
+    /// Whether wake-ups by event were taken since the last sleep. The caller has then received samples, so the next
+    /// wait may sleep.
     taken: bool,
 }
 
@@ -47,7 +49,7 @@ impl Wakeups {
         Wakeups { wait, sensors: Vec::new(), has_activity: false, taken: false }
     }
 
-    /// Adds `topic` of the sensor `name`. Returns whether its doorbell or event already exists. Fails with
+    /// Adds `topic` of the sensor `name`. Returns whether the sensor's doorbell or event already exists. Fails with
     /// [`Kind::ResourceExhausted`](scanhub_schema::Kind) if memory, descriptors or slots for subscribers are short.
     pub(crate) fn add(&mut self, node: &Node, name: &str, topic: Topic) -> Result<bool, Failure> {
         let ring = topic.spec().doorbell_word;
@@ -73,15 +75,15 @@ impl Wakeups {
         self.sensors.iter_mut().for_each(|sensor| sensor.doorbell = None);
     }
 
-    /// Sleeps until a doorbell or event wakes it, a signal arrives or the time `left` has passed. Returns at once if it
-    /// was woken since the caller last received samples. Fails with [`Kind::ResourceExhausted`](scanhub_schema::Kind)
-    /// if the system cannot wait.
+    /// Sleeps until a doorbell or event wakes the subscriber, a signal arrives or the time `left` has passed. Returns
+    /// at once if the subscriber was woken since the caller last received samples. Fails with
+    /// [`Kind::ResourceExhausted`](scanhub_schema::Kind) if the system cannot wait.
     pub(crate) fn wait(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
         if self.wait == Wait::Event {
             return self.wait_for_event(node, left);
         }
         for sensor in &mut self.sensors {
-            // Without a doorbell, the subscriber continues with a short sleep each time, until there is one.
+            // Ignore an error: without any doorbell, each call only sleeps for a short time.
             let _ = sensor.open_doorbell(node);
         }
         if self.has_rung() {
@@ -114,15 +116,16 @@ impl Wakeups {
         std::mem::take(&mut self.has_activity)
     }
 
-    /// Returns how often the doorbell of the sensor `name` was rung for `topic`. `None` if this does not show whether a
-    /// sample was sent.
+    /// Returns how often the doorbell of the sensor `name` was rung for `topic`. `None` if no doorbell is open, so that
+    /// a sample may have been sent without a ring.
     pub(crate) fn ring_count(&self, name: &str, topic: Topic) -> Option<u32> {
         let sensor = self.sensors.iter().find(|sensor| sensor.name == name)?;
         let doorbell = sensor.doorbell.as_ref().filter(|bell| !bell.is_closed())?;
         Some(doorbell.ring_count(topic.spec().doorbell_word))
     }
 
-    /// Returns whether a doorbell was rung since the last call. Samples that were sent before can be received now.
+    /// Returns whether a doorbell was rung since the last call. Samples that were sent before a ring can be received
+    /// now.
     fn has_rung(&mut self) -> bool {
         let mut any = false;
         for Sensor { doorbell, ring_counts, .. } in &mut self.sensors {
@@ -140,7 +143,7 @@ impl Wakeups {
     fn wait_for_event(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
         let mut is_new = false;
         for sensor in self.sensors.iter_mut().filter(|sensor| sensor.listener.is_none()) {
-            // Retry, because the hub was still creating the event, or there was no slot.
+            // Retry, because at the last attempt the hub was still creating the event, or there was no slot.
             is_new |= sensor.listen(node).unwrap_or(false);
         }
         if is_new {
@@ -190,12 +193,13 @@ impl Sensor {
         Ok(true)
     }
 
-    /// Opens the doorbell, unless it is open. Closes the doorbell of a hub that has ended. Returns whether there is
-    /// one.
+    /// Opens the doorbell, unless it is open. Closes the doorbell of a hub that has ended. Returns whether a doorbell
+    /// is open.
     fn open_doorbell(&mut self, node: &Node) -> Result<bool, Failure> {
         if self.doorbell.as_ref().is_none_or(Doorbell::is_closed) {
             self.doorbell = Doorbell::open(node, &self.name)?.filter(|bell| !bell.is_closed());
-            // A new doorbell has its own counts, and samples may have been sent before.
+            // A new doorbell has its own counts. Samples may have been sent before, so let each word appear to have
+            // rung.
             for ring in DoorbellWord::ALL {
                 self.ring_counts[ring as usize] =
                     self.ring_counts[ring as usize].map(|_| self.stale_count(ring));
@@ -204,14 +208,15 @@ impl Sensor {
         Ok(self.doorbell.is_some())
     }
 
-    /// Adds the doorbell word `ring` to the wait. Samples may have been sent before.
+    /// Adds the doorbell word `ring` to the wait. The word appears to have rung, because samples may have been sent
+    /// before.
     fn watch_word(&mut self, ring: DoorbellWord) {
         if self.ring_counts[ring as usize].is_none() {
             self.ring_counts[ring as usize] = Some(self.stale_count(ring));
         }
     }
 
-    /// Returns a count that the doorbell does not have now.
+    /// Returns a count that differs from the doorbell's current one, so that the word appears to have rung.
     fn stale_count(&self, ring: DoorbellWord) -> u32 {
         self.doorbell.as_ref().map_or(0, |bell| bell.ring_count(ring).wrapping_sub(1))
     }
@@ -282,8 +287,8 @@ mod tests {
         started.elapsed() < TEST_TIMEOUT
     }
 
-    /// Starts the publishing side of a hub in a separate thread, because its ports cannot move. It wakes the
-    /// subscribers once for each message.
+    /// Starts the publishing side of a hub in a separate thread, because the ports of a hub cannot move between
+    /// threads. The thread wakes the subscribers once for each message.
     fn hub(domain: &Domain, sensor: &'static str) -> mpsc::Sender<()> {
         let (wake_sender, wake_requests) = mpsc::channel();
         let (ready_sender, ready) = mpsc::channel();
@@ -393,7 +398,7 @@ mod tests {
         let hub = scanhub_shm::hub_node(&domain.1).unwrap();
         let node = scanhub_shm::join(&domain.1, Role::Subscriber).unwrap();
         let mut wakeups = Wakeups::waiting_by(Wait::Doorbell);
-        // A hub that is killed closes nothing.
+        // Do not drop the doorbell, because a hub that is killed closes nothing.
         std::mem::forget(WakeSender::new(&hub, "front").unwrap());
         assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
         for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {

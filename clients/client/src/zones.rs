@@ -1,6 +1,6 @@
 //! Subscriber of the zones of one sensor: its verdict, the deadline after which the verdict is `unknown`, and early
 //! warnings. The verdict expires in this process, whether the sensor, the hub or the machine has stopped. A program
-//! that acts on it needs no timeout.
+//! that acts on the verdict needs no timeout of its own.
 
 use std::time::Duration;
 
@@ -47,11 +47,12 @@ pub struct ZonesUpdate {
     pub zones: Zones,
     /// Header of the sample; `None` in a silence.
     pub header: Option<Header>,
-    /// Number of samples that were sent since the previous update and not returned.
+    /// Number of samples that were sent since the previous update, but not returned.
     pub missed: u64,
     /// Whether the zones are unknown because no recent data arrived, and not because the hub reports it.
     pub stale: bool,
-    /// Zones that the hub sent, even if they were too old on arrival. Store them, but do not act on them.
+    /// Zones that the hub sent, even if they were too old on arrival. A program may store these zones, but must not act
+    /// on them.
     pub as_published: Zones,
 }
 
@@ -72,13 +73,13 @@ impl ZonesUpdate {
 pub type ZonesSubscriber = Subscriber<ZonesUpdate>;
 
 impl Subscriber<ZonesUpdate> {
-    /// Waits for the newest sample, or for one `unknown` per silence. It returns `unknown` two scan periods and 40 ms
-    /// after the last sample; for a remote sensor, after at least half a second. Without any sample, it returns
-    /// `unknown` one second after the start, with or without a hub.
+    /// Waits for the newest sample, or for one `unknown` per silence. Returns `unknown` two scan periods and 40 ms
+    /// after the last sample, but for a remote sensor after at least half a second. If no sample arrives at all,
+    /// returns `unknown` one second after the start, with or without a hub.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). The zones are unknown then, too.
+    /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). After an error, the zones are unknown, too.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<ZonesUpdate, Error> {
         self.wait_for_next()
@@ -137,7 +138,7 @@ impl ZonesSource {
         ZonesSource { reader: TopicReader::new(sensor), state: ZonesState::new(clock::now()), early: None }
     }
 
-    /// Subscribes to early warnings of `sensor` too. A warning makes the verdict worse until the zones of its scan
+    /// Subscribes to early warnings of `sensor`, too. A warning makes the verdict worse until the zones of its scan
     /// arrive, or until the hub withdraws it.
     pub(crate) fn with_early(self, sensor: &str) -> ZonesSource {
         ZonesSource { early: Some(Box::new((TopicReader::new(sensor), EarlyState::new()))), ..self }
@@ -231,7 +232,8 @@ impl ZonesState {
         ZonesState { staleness: StalenessTimer::new(now), has_update: false }
     }
 
-    /// Handles a sample that arrived at `now`, and returns the update. `missed` samples before it were not received.
+    /// Handles a sample that arrived at `now`, and returns the update. `missed` is the number of samples before it that
+    /// were not received.
     pub fn take(&mut self, header: &Header, zones: &Zones, missed: u64, now: Timestamp) -> ZonesUpdate {
         self.has_update = true;
         let fresh = self.staleness.update(header, zones.verdict(), now);
@@ -257,7 +259,7 @@ impl ZonesState {
     }
 }
 
-/// Deadline of one sensor's verdict. Callers pass the time.
+/// Timer with the deadline of one sensor's verdict. Callers pass the time.
 #[derive(Clone, Debug)]
 pub struct StalenessTimer {
     until: Timestamp,
@@ -265,20 +267,21 @@ pub struct StalenessTimer {
     is_reported: bool,
 }
 
-/// Time after the last scan and two periods at which the hub publishes `unknown` (`docs/topics.md`).
+/// Time that passes after the last scan, in addition to two periods, until the hub publishes `unknown`
+/// (`docs/topics.md`), in ns.
 const HUB_STALE_AFTER_NS: u64 = 20_000_000;
 
-/// Additional time that a client waits. A running hub then reports the silence first, so that each silence has only one
-/// `unknown`.
+/// Additional time that a client waits, in ns. A running hub then reports the silence first, so that each silence has
+/// only one `unknown`.
 const CLIENT_MARGIN_NS: u64 = 20_000_000;
 
-/// Time limit of a sample without a period. It is enough for two periods of half degrees at 38400 baud, 0.4 s. It is
-/// also the minimum limit of a sample from another machine, because networks delay data; wireless ones by a tenth of a
-/// second.
+/// Time after which a sample without a period is too old, in ns. It is longer than two periods of scans at half degrees
+/// and 38400 baud, which are 0.4 s. It is also the minimum for samples from another machine, because networks delay
+/// data. Wireless networks do so by a tenth of a second.
 const DEFAULT_STALE_AFTER_NS: u64 = 500_000_000;
 
-/// Time limit of the first sample. A running hub sends the history to new subscribers within a tenth of a second, and a
-/// starting hub needs longer.
+/// Time within which the first sample must arrive, in ns. A running hub sends the history to new subscribers within a
+/// tenth of a second, and a starting hub needs longer.
 const FIRST_SAMPLE_TIMEOUT_NS: u64 = 1_000_000_000;
 
 impl StalenessTimer {
@@ -289,7 +292,7 @@ impl StalenessTimer {
 
     /// Handles a sample with `header` and `verdict` that arrived at `now`. Returns whether its verdict is valid. The
     /// deadline runs from the stamp or from the arrival, whichever is earlier, so a stamp in the future does not extend
-    /// it. `unknown` is valid at any age.
+    /// the deadline. The verdict `unknown` is valid at any age.
     pub fn update(&mut self, header: &Header, verdict: Verdict, now: Timestamp) -> bool {
         let limit_ns = match header.period_us {
             0 => DEFAULT_STALE_AFTER_NS,
@@ -332,7 +335,7 @@ fn add_ns(time: Timestamp, by_ns: u64) -> Timestamp {
 }
 
 /// Zones of one sensor, combined with the early warning of the scan after them. A warning makes the verdict worse until
-/// the zones of the same scan arrive, or until the hub withdraws it. It never makes the verdict better.
+/// the zones of the same scan arrive, or until the hub withdraws it. A warning never makes the verdict better.
 #[derive(Clone, Debug)]
 struct EarlyState {
     zones: Zones,
@@ -360,7 +363,8 @@ impl EarlyState {
         self.warning.map_or(*zones, |(_, early)| self.with_warning(&early))
     }
 
-    /// Returns the zones combined with the warning `early`, or `None` if the zones of its scan have arrived.
+    /// Returns the zones combined with the warning `early`, or `None` if the zones of the warning's scan have already
+    /// arrived.
     fn warn(&mut self, early: &Early, header: &Header) -> Option<Zones> {
         if self.scan.is_some_and(|(boot, seq)| boot == header.boot && header.seq <= seq) {
             return None;
@@ -382,7 +386,7 @@ impl EarlyState {
     }
 }
 
-/// Returns the verdict of a warning. A warning that this program does not know is ignored.
+/// Returns the verdict of a warning. Any verdict except `slow` and `stop` is ignored, such as that of a later version.
 fn warning(early: &Early) -> Verdict {
     match early.verdict() {
         warning @ (Verdict::Slow | Verdict::Stop) => warning,

@@ -1,5 +1,5 @@
-//! Subscriptions in a poll set: readable when there is something to take, not readable after it was taken, over runs
-//! of the hub.
+//! Tests of subscribers with a descriptor. It is readable while a sample waits, and not after the sample was received,
+//! also across restarts of the hub.
 
 mod fake;
 
@@ -13,7 +13,7 @@ use scanhub_client::{PollableSubscriber, RobotSubscriber, Subscriber, ZonesSubsc
 use scanhub_schema::{Scan, Status, Verdict};
 use scanhub_shm::UpdateConnections;
 
-/// Returns whether `descriptor` becomes readable within `longest`.
+/// Returns whether `descriptor` becomes readable within `timeout`.
 fn is_readable(descriptor: &impl AsFd, timeout: Duration) -> bool {
     let mut fds = [PollFd::new(descriptor, PollFlags::IN)];
     let longest = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
@@ -31,7 +31,8 @@ const WAIT_TIMEOUT: Duration = Duration::from_secs(60);
 /// time.
 const LONG_PERIOD_US: u32 = 500_000;
 
-/// Polls until a scan arrives. Returns its number, whether the hub restarted, and its beams.
+/// Polls until a scan arrives. Returns the run of the hub (`boot`), whether the hub was restarted, and the number of
+/// beams.
 fn await_scan(scans: &PollableSubscriber<Scan>) -> (u64, bool, usize) {
     let give_up_at = Instant::now() + WAIT_TIMEOUT;
     loop {
@@ -81,7 +82,7 @@ fn idle_hub_rarely_wakes_the_subscriber() {
             looks += 1;
         }
     }
-    // Ten wake-ups in the first second, in which a late joiner may receive a sample.
+    // There are ten wake-ups in the first second, because a late joiner may receive a sample then.
     assert!((1..=20).contains(&looks), "{looks}");
 }
 
@@ -196,8 +197,8 @@ fn without_a_hub_poll_times_out() {
     let scans = scans(&test_domain);
     assert!(is_readable(&scans, WAIT_TIMEOUT), "it must look for a hub first");
     assert!(scans.try_next().unwrap().is_none());
-    // The monitor checks every 2 s if it cannot watch the directories. This test takes nothing, so the descriptor would
-    // stay readable after one check.
+    // The monitor checks every 2 s if it cannot watch the directories. This test receives nothing, so the descriptor
+    // would stay readable after one check.
     assert!(!is_readable(&scans, Duration::from_secs(5)), "no timer wakes it");
 }
 
@@ -241,7 +242,7 @@ fn unknown_sensor_rarely_wakes_the_subscriber() {
     let test_domain = TestDomain::new();
     let _hub = FakeHub::new(&test_domain.domain, &["front"], 1);
     let scans = Subscriber::<Scan>::builder("frnot").in_domain(&test_domain.domain).open_pollable().unwrap();
-    // In the first seconds, the hub may still create the topic.
+    // In the first seconds, wake-ups are frequent, because the hub may still create the topic.
     let started = Instant::now();
     while started.elapsed() < Duration::from_secs(3) {
         is_readable(&scans, Duration::from_millis(100));

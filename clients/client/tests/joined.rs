@@ -78,7 +78,7 @@ fn pairs_beyond_the_queue_count_as_missed() {
     hub.front_sensor().publish_scan_with_foreground(0, &[1000]);
     let (mut last, mut received) = (next_pair(&mut pairs).0, 1);
     for round in 1..=3 {
-        // The queue of scans has room for 64, that of foregrounds for 16.
+        // The queue of scans has room for 64 samples, that of foregrounds for 16.
         (0..100).for_each(|_| {
             let seq = hub.front_sensor().seq;
             hub.front_sensor().publish_scan_with_foreground(seq, &[1000]);
@@ -105,7 +105,7 @@ fn unpaired_sample_is_kept_for_one_period() {
     assert!(pairs.try_next().unwrap().is_none());
     std::thread::sleep(Duration::from_millis(40));
     assert!(pairs.try_next().unwrap().is_none());
-    // The other sample of the pair would arrive too late now.
+    // The other sample of the pair arrives too late now.
     hub.front_sensor().publish_foreground(2, 1);
     hub.front_sensor().wake();
     assert!(pairs.try_next().unwrap().is_none());

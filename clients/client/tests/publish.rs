@@ -103,7 +103,7 @@ fn reopened_publisher_restarts_its_numbers() {
     assert_eq!(next_sample(&mut subscriber), (0, false, 0, 1));
     drop(near);
     let mut near = open();
-    // Its subscriber has to find it first.
+    // The subscriber has to find the new topic first.
     wait_until("the subscriber", || {
         let _ = subscriber.try_next().unwrap();
         near.subscribers() == 1
@@ -157,7 +157,7 @@ fn single_session_next_to_a_hub_cannot_use_its_names() {
         ErrorKind::DomainHeld
     );
     let topic = |name: &str| session.sensor(name).and_then(|sensor| sensor.topic::<Scan>()).map(drop);
-    // A hub may have a sensor without a dot, now or later.
+    // A hub may have a sensor whose name has no dot, now or later.
     for impossible in ["front", "near", "", "robot", "tracker.Near", "a.b.c"] {
         assert_eq!(topic(impossible).unwrap_err().kind(), ErrorKind::InvalidInput, "{impossible}");
     }

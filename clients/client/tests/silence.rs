@@ -18,13 +18,13 @@ fn scans(test_domain: &TestDomain, sensor: &str) -> Subscriber<Scan> {
     builder.timeout(Duration::from_millis(100)).open().unwrap()
 }
 
-/// Calls `next`, and returns the reason within two seconds.
+/// Calls `next` until the reason is as expected, and returns the reason. Stops trying after 20 s.
 fn await_reason(scans: &mut Subscriber<Scan>, is_expected: impl Fn(&Silence) -> bool) -> Silence {
     let started = Instant::now();
     loop {
         assert!(scans.next().unwrap().is_none(), "nothing was sent");
         let silence = scans.why_silent();
-        // The bound is generous on a busy machine.
+        // The limit is generous, because the machine may be busy.
         if is_expected(&silence) || started.elapsed() > Duration::from_secs(20) {
             return silence;
         }
@@ -200,7 +200,7 @@ fn state_of_the_last_hub_is_not_the_reason() {
         assert!(scans.try_next().unwrap().is_none());
         scans.hub_is_running()
     });
-    // The sensor sends no status.
+    // The sensor of the second hub sends no status.
     assert_eq!(scans.why_silent(), Silence::Waiting);
 }
 

@@ -80,7 +80,7 @@ fn subscriber_and_its_samples_move_between_threads() {
     });
     for beams in 1..=3 * MAX_BORROWED_SAMPLES {
         hub.front_sensor().publish_scan(&vec![1000; beams]);
-        // The sample is dropped in this thread, so its slot is free for the other one.
+        // The sample is dropped in this thread, which frees its slot for the other thread.
         let scan = take.recv_timeout(WAIT_TIMEOUT).expect("a scan");
         assert_eq!((scan.beams(), scan.missed), (beams, 0));
     }

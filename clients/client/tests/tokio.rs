@@ -28,7 +28,7 @@ fn scans(test_domain: &TestDomain) -> PollableSubscriber<Scan> {
     Subscriber::<Scan>::builder("front").in_domain(&test_domain.domain).open_pollable().unwrap()
 }
 
-/// Another thread sends scans while the waits are canceled: before a scan, while it is sent, and after it.
+/// Another thread sends scans. Waits are canceled before a scan is sent, while it is sent, and after it was sent.
 #[test]
 fn thousand_cancelled_waits_lose_no_sample() {
     let test_domain = TestDomain::new();
@@ -40,7 +40,7 @@ fn thousand_cancelled_waits_lose_no_sample() {
             wait_until("the subscriber", || hub.front_sensor().scan.subscribers() == 1);
             let started = Instant::now();
             while !is_done.load(Ordering::Relaxed) && started.elapsed() < WAIT_TIMEOUT {
-                // The queue has room for 64.
+                // The queue has room for 64 samples, so stay well below that.
                 if hub.front_sensor().scan.topic_seq < received.load(Ordering::Relaxed) + 30 {
                     hub.front_sensor().publish_scan(&[1000]);
                 }
@@ -84,7 +84,7 @@ async fn stream_in_another_task_wakes_for_each_sample() {
     let (give, mut take) = tokio::sync::mpsc::channel(1);
     let task = tokio::spawn(async move {
         while let Some(scan) = scans.next().await {
-            // A sample moves between tasks, and is held over the next wait.
+            // A sample moves between tasks, and is held during the next wait.
             if give.send(scan.unwrap()).await.is_err() {
                 break;
             }

@@ -73,8 +73,9 @@ impl<P: Payload + ?Sized> TopicPort<P> {
         wait_until("subscribers", || self.subscribers() == count);
     }
 
-    /// Returns the number of subscribers that the next sample reaches. The service's own number does not count: it
-    /// includes a subscriber that is about to enter the list, which a publisher does not see yet.
+    /// Returns the number of subscribers that the next sample reaches. The number that the service itself returns is
+    /// not used. It includes a subscriber that is about to enter the list, and a publisher does not see that subscriber
+    /// yet.
     pub(crate) fn subscribers(&self) -> usize {
         let mut count = 0;
         self.service.dynamic_config().list_subscribers(|_| {
@@ -99,7 +100,8 @@ pub(crate) struct FakeSensor {
     /// Flags of the headers.
     pub(crate) flags: u8,
     pub(crate) seq: u64,
-    /// Stamp of its first telegram, in ns of CLOCK_MONOTONIC. By default, it is long before any subscriber.
+    /// Stamp of the sensor's first telegram, in ns of CLOCK_MONOTONIC. By default, it is long before any subscriber
+    /// attaches.
     pub(crate) start_ns: u64,
     /// Period of the scans in us.
     pub(crate) period_us: u32,
@@ -135,8 +137,8 @@ impl FakeSensor {
         self.waker.wake(WakeEvent::Telegram).unwrap();
     }
 
-    /// Publishes a scan of these ranges with an empty foreground, and wakes the subscribers. The wall clock of the
-    /// sample is `seq` ns after that of the hub's first one.
+    /// Publishes a scan of these ranges with an empty foreground, and wakes the subscribers. The stamp of the wall
+    /// clock is `seq` ns after that of the hub's first sample.
     pub(crate) fn publish_scan_with_foreground(&mut self, seq: u64, ranges: &[u16]) {
         self.publish_foreground(seq, ranges.len());
         self.publish_scan(ranges);
@@ -239,7 +241,7 @@ impl FakeHub {
         &mut self.sensors[0]
     }
 
-    /// Sends the last status to late joiners until `done` returns true.
+    /// Sends the last status to late joiners until `is_done` returns true.
     pub(crate) fn serve_history(&self, is_done: impl Fn() -> bool) {
         wait_until("history taken", || {
             for sensor in &self.sensors {
@@ -277,7 +279,7 @@ impl RunningVerb {
         self.thread.is_finished()
     }
 
-    /// Waits for the end of the verb.
+    /// Waits for the end of the verb. Returns its result, its standard output and its standard error.
     pub(crate) fn join(self) -> (Result<(), Failure>, String, String) {
         wait_until("the verb's end", || self.thread.is_finished());
         (self.thread.join().unwrap(), self.out.text(), self.notes.text())
@@ -292,7 +294,7 @@ impl OutputFile {
         OutputFile(tempfile::tempfile().unwrap())
     }
 
-    /// Returns the file for the verb. It writes at its end.
+    /// Returns the file for the verb, which writes at the end of the file.
     pub(crate) fn file(&self) -> File {
         self.0.try_clone().unwrap()
     }
@@ -313,7 +315,7 @@ impl OutputFile {
     }
 }
 
-/// Waits until `done` returns true. Only a hang exceeds the limit.
+/// Waits until `is_done` returns true. Only a hang exceeds the limit of 180 s.
 pub(crate) fn wait_until(description: &str, mut is_done: impl FnMut() -> bool) {
     let give_up_at = Instant::now() + Duration::from_secs(180);
     while !is_done() {
