@@ -1,11 +1,11 @@
-//! Protocol that changes the EEPROM settings of a scanner. It checks that the settings are still those of the plan,
-//! enters installation mode, writes, leaves that mode, reads the settings back, and restores the earlier operating
-//! mode. After any failure it tries to leave installation mode. Its outcome states what is known about the scanner's
-//! state.
+//! Protocol that changes the EEPROM settings of a scanner. The protocol checks that the settings are still the same as
+//! in the plan, enters installation mode, writes, leaves that mode, reads the settings back, and restores the earlier
+//! operating mode. After any failure it tries to leave installation mode. Its outcome states what is known about the
+//! scanner's state.
 //!
-//! Only this module sends a request of [`crate::eeprom`], and it needs [`Consent`]. If the scanner does not acknowledge
-//! a write, the protocol first reads the configuration to check whether the write was done. It does not simply repeat
-//! the write.
+//! Only this module sends a request of [`crate::eeprom`], and sending requires a [`Consent`]. If the scanner does not
+//! acknowledge a write, the protocol first reads the configuration to check whether the write was done. It does not
+//! simply repeat the write.
 
 use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::command::{self, Request};
@@ -79,7 +79,7 @@ pub struct Outcome {
 /// Reason why a step failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChangeError {
-    /// The scanner sent no reply, or none that can be decoded.
+    /// The scanner sent no reply, or only a reply that cannot be decoded.
     Unanswered,
     /// The scanner rejected the request. At [`Step::Enter`], the password is wrong.
     Refused,
@@ -134,9 +134,9 @@ impl EncodeRequest for CurrentRequest {
         }
     }
 
-    /// Returns the maximum time for the acknowledgment. A scanner that writes or changes its mode may abort a scan and
-    /// acknowledge then. An acknowledgment after an aborted scan may not be recognized. The maximum time is therefore
-    /// the same as for the reply.
+    /// Returns the maximum time for the acknowledgment. A scanner that writes or changes its mode may first abort a
+    /// scan and acknowledge only then. An acknowledgment after an aborted scan may not be recognized. The maximum time
+    /// is therefore the same as for the reply.
     fn acknowledge_timeout(&self) -> Nanos {
         match self {
             CurrentRequest::Request(request) if request.command() == command::MODE => MODE_TIMEOUT,
@@ -302,7 +302,7 @@ impl Change {
     fn handle_failure(&mut self, error: ChangeError) {
         self.record_failure(error);
         match self.step {
-            // No request so far changes anything.
+            // The requests of this step do not change anything.
             Step::Compare => {
                 self.outcome.operating_mode = Some(self.plan.operating_mode);
                 self.begin(Step::Done);
@@ -369,7 +369,7 @@ impl Protocol for Change {
     }
 }
 
-/// Returns the step after one that succeeded.
+/// Returns the step that follows `step` if it succeeded.
 fn next_step(step: Step) -> Step {
     match step {
         Step::Compare => Step::Enter,

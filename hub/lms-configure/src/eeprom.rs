@@ -14,7 +14,8 @@ pub enum EepromWrite<'a> {
     Teach(&'a [u8]),
     /// 66h: set the baud rate after power-on, or keep the type.
     PowerOn(PowerOn),
-    /// 77h: write the first part of the configuration. Fewer than 34 bytes change only the first bytes of it.
+    /// 77h: write the first part of the configuration. Fewer than 34 bytes change only the first bytes of the
+    /// configuration.
     Configuration(&'a [u8]),
     /// 7Ch: write the second part of the configuration, 84 bytes.
     Configuration2(&'a [u8]),

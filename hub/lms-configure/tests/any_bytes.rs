@@ -17,7 +17,7 @@ fn commands() -> impl Strategy<Value = u8> {
     prop_oneof![proptest::sample::select(known), any::<u8>()]
 }
 
-/// Data with small counts, so that some counts are valid.
+/// Data in which small numbers are frequent, so that some of the counts in it are valid.
 fn data() -> impl Strategy<Value = Vec<u8>> {
     prop_oneof![
         proptest::collection::vec(any::<u8>(), 0..800),

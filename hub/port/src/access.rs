@@ -18,7 +18,7 @@ pub struct PortPermissions {
     pub port: Option<Ownership>,
     /// User ID of this process.
     pub uid: u32,
-    /// Groups of this process.
+    /// Group IDs of this process.
     pub groups: Vec<u32>,
     /// Name of the user, or the ID if there is no name.
     pub user: String,

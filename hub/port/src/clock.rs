@@ -22,7 +22,7 @@ pub fn to_wall_ns(stamp: Nanos, now: Nanos) -> u64 {
     wall_ns().saturating_sub(now.saturating_sub(stamp))
 }
 
-/// Returns the time from `now` to `until` in the format of `poll`. It is 0 if `until` has passed.
+/// Returns the time from `now` to `until` in the format of `poll`. The result is 0 if `until` has passed.
 pub fn poll_timeout(now: Nanos, until: Nanos) -> Timespec {
     let remaining = until.saturating_sub(now);
     Timespec { tv_sec: (remaining / 1_000_000_000) as i64, tv_nsec: (remaining % 1_000_000_000) as i64 }

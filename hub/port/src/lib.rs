@@ -142,7 +142,7 @@ impl Port {
     ///
     /// # Errors
     ///
-    /// Returns only the reason, without looking up details.
+    /// Returns only the reason. [`PortError::explain`] looks up the details.
     pub fn try_open(spec: &PortSpec, baud: u32, stop: &AtomicBool) -> Result<Port, PortError> {
         match spec {
             PortSpec::Tty(path) => Tty::open(path, baud).map(Port::Tty),
@@ -248,7 +248,7 @@ impl Port {
         }
     }
 
-    /// Reads the available bytes into `buffer`, and returns their number. It is 0 if no byte is available.
+    /// Reads the available bytes into `buffer`, and returns their number. The number is 0 if no byte is available.
     ///
     /// # Errors
     ///
@@ -278,7 +278,7 @@ impl Port {
         self.tty().map_or(0, Tty::line_errors)
     }
 
-    /// Returns the driver's counters since the driver was loaded. Returns `None` if it has none.
+    /// Returns the driver's counters since the driver was loaded. Returns `None` if the driver has no counters.
     pub fn uart_counters(&self) -> Option<UartCounters> {
         self.tty()?.uart_counters()
     }
@@ -294,7 +294,8 @@ impl Port {
     }
 
     /// Restores the settings of this process, at `baud`, and discards the input that arrived with other settings. If
-    /// the driver rejects the rate, the line keeps its rate, and a search tries other rates.
+    /// the driver rejects the rate, the line keeps its present rate, which is not an error: a search then tries other
+    /// rates.
     ///
     /// # Errors
     ///

@@ -1,6 +1,6 @@
-//! Reasons why a port cannot be opened, with messages and remedies. An attempt to open the port yields the reason.
-//! Details, such as the process that has the port open or the ports that exist, are looked up only when the failure is
-//! reported.
+//! Reasons why a port cannot be opened, with messages and remedies. An attempt to open the port returns only the
+//! reason. Details, such as the process that has the port open or the ports that exist, are looked up only when the
+//! failure is reported.
 
 use std::fmt;
 use std::io;
@@ -152,7 +152,7 @@ impl From<Errno> for PortError {
             Errno::ACCESS | Errno::PERM => PortError::PermissionDenied,
             Errno::BUSY => PortError::Busy,
             Errno::NOTTY | Errno::ISDIR | Errno::NOTDIR => PortError::NotTty,
-            // For example, a UART that the board does not have, an adapter that was just unplugged, or a pty whose
+            // The device may be a UART that the board does not have, an adapter that was just unplugged, or a pty whose
             // master is closed.
             Errno::IO | Errno::NXIO | Errno::NODEV => PortError::NoDevice,
             Errno::MFILE | Errno::NFILE | Errno::NOMEM => PortError::ResourceExhausted(errno),

@@ -1,5 +1,6 @@
 //! Serial lines of this machine, with the permanent name of each and the properties that the kernel reports without
-//! opening it. Also the USB serial adapters that have no port, because no driver has created a tty for them.
+//! opening it. The module also lists the USB serial adapters that have no port, because no driver has created a tty for
+//! them.
 
 use std::ops::RangeInclusive;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
@@ -28,7 +29,7 @@ pub struct SerialPortInfo {
     pub product: Option<String>,
     /// Process that has the line open, if it is visible to this user.
     pub holder: Option<Holder>,
-    /// Whether this user may open it.
+    /// Whether this user may open the line.
     pub is_permitted: bool,
 }
 
@@ -136,8 +137,8 @@ pub fn is_tty(path: &Path) -> bool {
 /// # Errors
 ///
 /// Returns [`PortError::NoDevice`] if the device of a device file does not exist, for example in a container whose
-/// `/dev` has a file for an unplugged adapter. Returns [`PortError::NotTty`] if it is another device or not a device.
-/// Returns the kernel's error if the name cannot be resolved.
+/// `/dev` has a file for an unplugged adapter. Returns [`PortError::NotTty`] if `path` is another device or not a
+/// device. Returns the kernel's error if the name cannot be resolved.
 pub fn check_tty(path: &Path) -> Result<(), PortError> {
     check_tty_in(path, Path::new("/sys/dev/char"))
 }
@@ -252,9 +253,9 @@ pub struct PortlessAdapter {
     pub id: String,
     /// Name of the chip, such as `CH340`.
     pub chip: &'static str,
-    /// Name of its kernel module, such as `ch341`.
+    /// Name of the kernel module for the chip, such as `ch341`.
     pub module: &'static str,
-    /// Reason why it has no port.
+    /// Reason why the adapter has no port.
     pub reason: NoPortReason,
 }
 
@@ -537,7 +538,7 @@ mod tests {
         let by_id = "dev/serial/by-id/usb-FTDI_USB-RS422-if00-port0";
         machine.link("dev/ttyUSB0", by_id);
         machine.uart("ttyS0", "4\n");
-        // A UART that the board does not have, and a terminal without hardware.
+        // `ttyS1` is a UART that the board does not have, and `tty1` is a terminal without hardware.
         machine.uart("ttyS1", "0\n");
         machine.directory("sys/class/tty/tty1");
         machine.file("dev/tty1", "");
@@ -700,7 +701,7 @@ mod tests {
         let adapter = only(&machine);
         assert_eq!(adapter.reason, NoPortReason::NoDevice { tty: "ttyUSB0".to_owned() });
         assert!(adapter.remedy().contains("--device /dev/ttyUSB0"), "{}", adapter.remedy());
-        // Not a serial adapter.
+        // This USB device is not a serial adapter.
         let other = Machine::new();
         other.usb("1-1", "046d:c52b", "");
         assert_eq!(PortlessAdapter::all(&other.root), []);

@@ -2,9 +2,9 @@
 //! server and cannot be changed from here. Resolving a name and connecting can block for an unknown time, so a separate
 //! thread does both. No caller waits for the end of the thread.
 //!
-//! A connection can deliver bytes faster than any line. The read budget allows twice the rate of the line. It allows up
-//! to one second of bytes at once, because a network delays data and then catches up. Bytes beyond the budget stay in
-//! the connection. When they are read, they are older than they seem.
+//! A connection can deliver bytes faster than any line. The read budget allows twice the rate of the line. The budget
+//! allows up to one second of bytes at once, because a network delays data and then catches up. Bytes beyond the budget
+//! stay in the connection. When they are read, they are older than they seem.
 
 use std::io::{self, ErrorKind, PipeReader, PipeWriter};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
@@ -170,7 +170,7 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
 const MAX_DISCARDED: usize = 1 << 24;
 /// Interval between checks of `stop`.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Maximum number of checks. Name lookup and connection together may take six seconds.
+/// Maximum number of checks, one every 100 ms. Name lookup and connection together may therefore take six seconds.
 const MAX_POLLS: u32 = 60;
 
 /// Read budget of a network port. It grows with time, and reading consumes it. The caller passes the time.
@@ -215,18 +215,19 @@ impl ReadBudget {
         let since =
             self.exhausted.filter(|&(_, last)| now < last + RECOVERY_TIME).map_or(now, |(since, _)| since);
         self.exhausted = Some((since, now));
-        // An overdue deadline takes effect only after all available bytes were read, and there are more bytes to read.
+        // The caller handles an overdue deadline only after it has read all available bytes. More bytes are available,
+        // so such a deadline does not shorten the wait.
         Some(if until > now { until.clamp(byte_at, resume_at) } else { resume_at })
     }
 
-    /// Returns whether the connection has delivered more bytes than the budget allows for a while, at `now`.
+    /// Returns whether, at `now`, the connection has already delivered more bytes than the budget allows for a while.
     pub fn is_flooded(&self, now: Nanos) -> bool {
         self.exhausted
             .is_some_and(|(since, last)| now < last + RECOVERY_TIME && last >= since + FLOOD_THRESHOLD)
     }
 
-    /// Returns whether the bytes read last may have been buffered in the connection, at `now`. Returns true if there
-    /// were more bytes than the caller could read, at the last read or shortly before.
+    /// Returns whether, at `now`, the bytes of the last read may have been buffered in the connection. This is so if,
+    /// at the last read or shortly before, the connection had more bytes than the caller could read.
     pub fn is_backlogged(&self, now: Nanos) -> bool {
         self.has_more || self.exhausted.is_some_and(|(_, last)| now < last + SETTLE_TIME)
     }
@@ -241,7 +242,7 @@ impl ReadBudget {
 const BUDGET_FACTOR: Nanos = 2;
 /// Maximum time for which unspent budget accumulates.
 const MAX_BURST: Nanos = 1_000 * MILLIS;
-/// Amount of budget that the caller waits for after the budget was exhausted.
+/// Time for which the caller lets the budget grow after the budget was exhausted, so that the next read is efficient.
 const MIN_REFILL: Nanos = 20 * MILLIS;
 /// Minimum duration of a flood. Bytes that a network has delayed are usually read within a second.
 const FLOOD_THRESHOLD: Nanos = 1_500 * MILLIS;

@@ -3,7 +3,8 @@
 //! The crate `serialport` sets the baud rate, the character format and the handshake, on a descriptor that this module
 //! has opened and locked. Only settings that differ are set, because each setting reaches the driver separately, and
 //! setting it could disturb a stream. Two parts of that crate are unsuitable. Its `set_parity` makes the driver drop
-//! bytes with errors (IGNPAR), but here every byte counts. The crate also does not keep the numbers of errors.
+//! bytes with errors (IGNPAR), but here every byte counts. The crate also does not keep the errno of an error of the
+//! kernel.
 //!
 //! The kernel provides the error counters of a UART, but no safe crate reads them. Some drivers, such as the driver of
 //! a pty, have no counters. This is not an error. The driver counts errors when bytes reach it, but does not report in
@@ -118,7 +119,8 @@ impl Tty {
     }
 
     /// Restores the settings of this process, at `baud`, and discards the input that arrived with other settings. If
-    /// the driver rejects the rate, the line keeps its rate, and a search tries other rates.
+    /// the driver rejects the rate, the line keeps its present rate, which is not an error: a search then tries other
+    /// rates.
     ///
     /// # Errors
     ///
@@ -126,7 +128,7 @@ impl Tty {
     pub(crate) fn restore(&self, baud: u32) -> io::Result<()> {
         let configured = self.configure(tcgetattr(&self.line)?, baud);
         clear_input(&self.line).map_err(|_| self.lost_line_error())?;
-        // With other settings, the driver counts every byte as an error.
+        // Discard the errors that the driver has counted, because with other settings every byte counts as an error.
         self.line_errors();
         match configured {
             Ok(()) | Err(PortError::Rate { .. }) => Ok(()),
@@ -144,7 +146,7 @@ impl Tty {
         self.device.starts_with("/dev/pts")
     }
 
-    /// Returns the driver's counters since the driver was loaded. Returns `None` if it has none.
+    /// Returns the driver's counters since the driver was loaded. Returns `None` if the driver has no counters.
     pub(crate) fn uart_counters(&self) -> Option<UartCounters> {
         UartCounters::of(&self.line).ok()
     }
@@ -169,7 +171,7 @@ impl Tty {
             self.settings.set(Settings { speed, ..self.settings.get() });
         }
         clear_input(&self.line).map_err(|_| self.lost_line_error())?;
-        // At a wrong baud rate, the driver counts every byte as an error.
+        // Discard the errors that the driver has counted, because at a wrong baud rate every byte counts as an error.
         self.line_errors();
         applied.map_err(|error| match error {
             PortError::Rate { .. } => io::Error::new(ErrorKind::Unsupported, error.to_string()),
@@ -177,7 +179,7 @@ impl Tty {
         })
     }
 
-    /// Asserts or clears DTR. A pty and some adapters do not have it. If DTR is asserted, it stays asserted after the
+    /// Asserts or clears DTR. A pty and some adapters do not have DTR. If DTR is asserted, it stays asserted after the
     /// line is closed.
     pub(crate) fn set_dtr(&self, on: bool) -> io::Result<()> {
         let mut termios = tcgetattr(&self.line)?;
@@ -211,7 +213,7 @@ impl Tty {
 
     /// Checks the result of a change of settings, and the baud rate that the driver has set for `requested`. If the
     /// line is lost, reading its settings fails. Otherwise an error means that the driver rejected a setting, because
-    /// the library does not keep the number of the error.
+    /// the library does not keep the errno.
     fn check(&self, result: serialport::Result<()>, requested: u32) -> Result<(), PortError> {
         let actual = tcgetattr(&self.line)?.output_speed();
         check_rate(result.map_err(|_| Errno::INVAL), actual, requested)
