@@ -1,4 +1,4 @@
-//! Values in effect, as the hub would use them, each with the place where it was set.
+//! Values in effect, which are those that the hub would use. Each value has the place where it is set.
 
 use std::fmt;
 
@@ -20,10 +20,10 @@ pub struct Value {
     class: &'static str,
     /// Key, as `--set` takes it.
     pub key: String,
-    /// Value in the unit of the configuration. Null if it is not set and has no default.
+    /// Value in the unit of the configuration. Null if the key is not set and has no default.
     pub value: Json,
-    /// Place where the value is set: `FILE:LINE:COLUMN` or a flag. It is `default` if the value is not set, possibly
-    /// with the setting that determines the default.
+    /// Place where the value is set: `FILE:LINE:COLUMN` or a flag. If the value is not set, the origin is `default`,
+    /// possibly with the setting that determines the default.
     pub origin: String,
 }
 

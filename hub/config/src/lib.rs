@@ -1,5 +1,5 @@
 //! Configuration of the hub: its links with their ports, and the settings of their scanners. A value from a later
-//! source takes precedence over one from an earlier source.
+//! source takes precedence over a value from an earlier source.
 
 mod effective;
 mod gateway;

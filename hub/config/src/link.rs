@@ -51,7 +51,7 @@ pub struct Link {
     pub name: String,
     /// Port of the link.
     pub port: PortSpec,
-    /// Family and settings of its scanner.
+    /// Family and settings of the link's scanner.
     pub scanner: Scanner,
     /// Settings for processing the scans.
     pub processing: Processing,
@@ -79,19 +79,19 @@ impl Link {
         TopicLimits { beams: self.max_beams(), contents, telegram: max_telegram, ..*all }
     }
 
-    /// Returns the family of the scanner. Returns `None` if the hub searches for it.
+    /// Returns the family of the scanner. Returns `None` if the hub searches for the family.
     pub fn family(&self) -> Option<Family> {
         self.scanner.family
     }
 
-    /// Returns the names of the keys whose values differ in `other`, apart from those for processing.
+    /// Returns the names of the keys whose values differ in `other`, apart from the keys for processing.
     pub fn differences(&self, other: &Link) -> Vec<&'static str> {
         let port = (self.port != other.port).then_some("port");
         port.into_iter().chain(self.scanner.differences(&other.scanner)).collect()
     }
 
-    /// Returns all scan heads that the scanner may have, as far as they are known. Those with the most beams come
-    /// first.
+    /// Returns all scan heads that the scanner may have, as far as they are known. The scan heads with the most beams
+    /// come first.
     pub fn scan_heads(&self) -> Vec<ScanHead> {
         let families = self.family().map_or(Family::ALL.to_vec(), |family| vec![family]);
         let settings = self.settings();
@@ -110,7 +110,8 @@ impl Link {
     ///
     /// # Errors
     ///
-    /// Returns the expected number of beams and the expected unit as text if the model has another number or unit.
+    /// Returns the expected number of beams and the expected unit as text if the model has another number of beams or
+    /// another unit.
     pub fn check_background(&self, model: &Background) -> Result<(), String> {
         let heads = self.scan_heads();
         let count = heads[0].count;
@@ -118,7 +119,7 @@ impl Link {
             true => (model.count <= count, format!("at most {count}")),
             false => (model.count == count, count.to_string()),
         };
-        // An unknown family may have any unit.
+        // The scanner of an unknown family may have any unit.
         let unit_um = if heads.len() > 1 { model.unit_um } else { heads[0].unit_um };
         if fits && model.unit_um == unit_um {
             return Ok(());
@@ -246,8 +247,8 @@ pub mod resource_estimate {
             .unwrap_or_default()
     }
 
-    /// Returns the number of descriptors for `links` links and one subscriber of each. Descriptors that are open from
-    /// the start are not included.
+    /// Returns the number of descriptors for `links` links and one subscriber of each. Descriptors that are already
+    /// open when the hub starts are not included.
     pub fn descriptors(links: usize) -> u64 {
         BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS
     }
@@ -255,8 +256,8 @@ pub mod resource_estimate {
     /// Number of descriptors that do not belong to a link. 16 of them stay open, and the others are open only while
     /// topics are created.
     const BASE_DESCRIPTORS: u64 = 24;
-    /// Number of descriptors that a link needs. Each of its services needs four. The services are the topics and the
-    /// event service. The other descriptors are for the port, the lock of the name, and one subscriber.
+    /// Number of descriptors that a link needs: four for each of its services, which are the topics and the event
+    /// service, and seven more. The seven descriptors are for the port, the lock of the name, and one subscriber.
     const LINK_DESCRIPTORS: u64 = 4 * (Topic::OF_LINKS.len() as u64 + 1) + 7;
     /// Bytes of shared memory for the control service, for everything else that does not belong to a link, and for the
     /// first subscribers.

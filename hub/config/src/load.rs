@@ -22,7 +22,7 @@ use crate::scanner::ScannerRequest;
 use crate::section::{Section, find};
 use crate::sources::{SourceKind, SourceMap, Sources};
 
-/// Keys of a source. Its sections apply to all links.
+/// Keys of a source. The sections of a source apply to all links.
 #[derive(Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct Document {
@@ -75,7 +75,7 @@ pub(crate) struct MergedConfig<'a> {
     pub(crate) general: DeTable<'a>,
     /// Links in the order in which they were added.
     pub(crate) links: Vec<MergedLink<'a>>,
-    /// Failure of the first source whose value for the gateway is not valid. The hub ignores it.
+    /// Failure of the first source whose value for the gateway is not valid. The hub ignores this failure.
     gateway: Result<(), Failure>,
 }
 
@@ -85,8 +85,8 @@ pub(crate) struct MergedLink<'a> {
     location: String,
     /// Values for this link only.
     own: DeTable<'a>,
-    /// Values for this link and for all links. A value for this link takes precedence over one for all links,
-    /// regardless of the order of their sources.
+    /// Values for this link and for all links. A value for this link takes precedence over a value for all links,
+    /// regardless of the order of the sources.
     pub(crate) table: DeTable<'a>,
     /// Keys with the values of `table`.
     pub(crate) keys: LinkKeys,
@@ -122,8 +122,8 @@ impl<'a> MergedConfig<'a> {
         Ok(merged)
     }
 
-    /// Adds one source. Its values take precedence over the values of earlier sources. `flags` has the names of the
-    /// links from earlier flags `--link`.
+    /// Adds one source. The values of this source take precedence over the values of earlier sources. `flags` has the
+    /// names of the links from earlier flags `--link`.
     fn add_source(
         &mut self,
         kind: SourceKind,
@@ -212,7 +212,7 @@ impl<'a> MergedConfig<'a> {
         Ok(Config { links, limits })
     }
 
-    /// Merges only the section of the gateway.
+    /// Merges only the section `gateway`.
     fn of_gateway(sources: &'a SourceMap) -> Result<MergedConfig<'a>, Failure> {
         let mut merged =
             MergedConfig { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
@@ -223,7 +223,7 @@ impl<'a> MergedConfig<'a> {
         Ok(merged)
     }
 
-    /// Returns the section of the gateway.
+    /// Returns the section `gateway`.
     pub(crate) fn gateway(&self) -> Result<Gateway, Failure> {
         self.gateway.clone()?;
         self.section("gateway")
@@ -331,13 +331,13 @@ impl Gateway {
     }
 }
 
-/// Returns a failure if two links have the same port. Two names that resolve to one port at this moment count as the
-/// same port.
+/// Returns a failure if two links have the same port. Two names of ttys are the same port if they lead to the same
+/// device at this moment.
 fn check_ports(links: &[Link]) -> Result<(), Failure> {
     let is_same = |a: &PortSpec, b: &PortSpec| match (a, b) {
         (PortSpec::File { .. }, _) => false,
         (PortSpec::Tty(a), PortSpec::Tty(b)) => is_same_line(a, b),
-        // Reading a configuration must not resolve names of servers.
+        // Names of serial servers are compared as text, because reading a configuration must not resolve them.
         _ => a == b,
     };
     for (at, link) in links.iter().enumerate() {

@@ -1,6 +1,6 @@
-//! Sections for processing the scans of a link: pose, zones, marks, lines, motion, background and early. They are
-//! available as keys of the sources and as values in effect. Keys in meters, radians and degrees are converted to the
-//! units of the processors.
+//! Sections for processing the scans of a link: pose, zones, marks, lines, motion, background and early. Each section
+//! exists in two forms: the keys of the sources, and the values in effect. Keys in meters, radians and degrees are
+//! converted to the units of the processors.
 
 use std::path::PathBuf;
 
@@ -31,7 +31,7 @@ pub struct Processing {
     pub marks: marks::Settings,
     /// Detection of straight lines.
     pub lines: lines::Settings,
-    /// Limits for the steps of the robot. The motion estimate rejects larger ones.
+    /// Limits for the steps of the robot. The motion estimate rejects larger steps.
     pub motion: motion::Settings,
     /// Learning of the background.
     pub background: Background,
@@ -49,7 +49,7 @@ pub struct Early {
 /// Values of section `[background]`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Background {
-    /// Whether the hub learns a background. If not, it publishes neither foreground nor background.
+    /// Whether the hub learns a background. If not, the hub publishes neither foreground nor background.
     pub is_enabled: bool,
     /// Settings for learning.
     pub learning: Learning,
@@ -61,8 +61,8 @@ pub struct Background {
     pub is_saved: bool,
     /// Background to start with, from the file or from an earlier hub.
     pub model: Option<Box<scanhub_schema::Background>>,
-    /// Whether the background is published with every scan. If not, it is published only for a new generation and after
-    /// each period of learning.
+    /// Whether the background is published with every scan. If not, the background is published only for a new
+    /// generation and after each period of learning.
     pub every_scan: bool,
 }
 
@@ -175,8 +175,8 @@ pub(crate) struct SectorKeys {
     from_deg: Option<f64>,
     to_deg: Option<f64>,
     range: f64,
-    /// Key of earlier versions, like `to`. Its angle 0 was to the right. Many values are valid in both frames, so
-    /// neither key is accepted.
+    /// Keys of earlier versions are `from` and `to`, whose angle 0 was to the right. Many angles would also be valid
+    /// with the current meaning, so neither key is accepted.
     #[serde(skip_serializing)]
     from: Option<f64>,
     #[serde(skip_serializing)]
@@ -426,8 +426,8 @@ impl BackgroundKeys {
 
 /// Checks the keys that a link sets itself. `own` has the values of the link, without the values for all links.
 ///
-/// Returns [`Kind::Configuration`] if the link sets a key that a scanner of `family` does not have. A key for all links
-/// applies only to families that have the key.
+/// Returns [`Kind::Configuration`] if the link sets a key that a scanner of `family` does not have. A key that is set
+/// for all links is ignored for families that do not have the key.
 pub(crate) fn check_family(own: &DeTable<'_>, sources: &SourceMap, family: Family) -> Result<(), Failure> {
     let name = family.name();
     for key in FAMILY_KEYS.into_iter().filter(|key| !has_key(Some(family), key)) {
@@ -538,7 +538,7 @@ fn start(key: &str, start: &str) -> CheckResult {
 }
 
 const OFFSET_REMEDY: &str = "meters from the robot's center, at most 100";
-/// Maximum radius in meters. In millimeters, it must fit into 16 bits.
+/// Maximum radius in meters. In millimeters, a radius must fit into 16 bits.
 const MAX_RADIUS_M: f64 = 65.0;
 /// Maximum yaw in radians, in either direction. A larger value was probably written in degrees.
 const FULL_CIRCLE: f64 = 2.0 * std::f64::consts::PI;
@@ -547,8 +547,8 @@ const FULL_CIRCLE: f64 = 2.0 * std::f64::consts::PI;
 /// violated is an error in the configuration. The real scanner is unknown here, so the hub repeats the check with its
 /// scans.
 ///
-/// Returns [`Kind::Configuration`] with the place of the cause in `table`, which has the values of the link. If the
-/// cause is not set there, the place is `location`, where the link is defined.
+/// Returns [`Kind::Configuration`] with the place of the cause in `table`, which has the values of the link. If `table`
+/// does not set the cause, the place is `location`, where the link is defined.
 pub(crate) fn check_coverage(
     link: &Link,
     table: &DeTable<'_>,
@@ -560,7 +560,7 @@ pub(crate) fn check_coverage(
     let (beams, min_beams) = (link.scan_heads()[0].count.into(), settings.min_beams);
     let refuse = |keys: &[&str], what: String, remedy: &str| {
         let spans = keys.iter().filter_map(|key| find(table, key).map(Spanned::span));
-        // Report the first of the keys that the last source sets.
+        // If the last source sets several of the keys, report the first of them.
         let last = spans.rev().max_by_key(|span| sources.index(span));
         let location = last.map_or(location.to_owned(), |span| sources.location(span));
         let message = format!("{location}: link {}: {what}", link.name);

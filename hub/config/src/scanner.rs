@@ -1,5 +1,5 @@
 //! Scanner of a link: its family and settings, as values in effect and as keys of the sources. The family checks the
-//! settings, and this module adds the place where each one is set.
+//! settings, and this module adds the place where each setting is set.
 
 use scanhub_drivers::{
     ANY_FAMILY, AUTO, Features, Key, Model, Refusal, Settings, SettingsRequest, Value, auto_or, family_of,
@@ -18,7 +18,7 @@ use crate::sources::SourceMap;
 /// Family and settings of a scanner.
 #[derive(Clone, Debug)]
 pub struct Scanner {
-    /// Family of the scanner. `None` if the hub searches for it.
+    /// Family of the scanner. `None` if the hub searches for the family.
     pub family: Option<Family>,
     /// Settings of the session, except those that follow from the port of the link.
     pub settings: Settings,
@@ -55,13 +55,14 @@ impl Scanner {
         has_models && model.is_none() && beams.is_none()
     }
 
-    /// Returns the number of beams of a scan, or its maximum if the number is unknown.
+    /// Returns the number of beams of a scan, or the maximum number if the number is unknown.
     pub fn max_beams(&self) -> usize {
         let Some(beams) = self.settings.beams else { return self.model().beams };
         if self.family.is_some() {
             return beams;
         }
-        // A family that reports its model has its own number of beams, which may be greater.
+        // The scanner may belong to a family without a list of models, such as LMS. This family has its own number of
+        // beams, which may be greater.
         let own = Family::ALL.into_iter().map(features).filter(|features| features.models.is_empty());
         own.map(|features| features.defaults.beams).max().unwrap_or(beams).max(beams)
     }
@@ -86,7 +87,7 @@ impl Scanner {
         if matches!(port, PortSpec::Tty(_)) { self.rate() } else { self.max_rate() }
     }
 
-    /// Returns the settings of a session at `port`. `listen_only` is whether the session cannot send.
+    /// Returns the settings of a session at `port`. With `listen_only`, the session sends nothing to the scanner.
     pub fn settings_at(&self, port: &PortSpec, listen_only: bool) -> Settings {
         let fixed_rate = !matches!(port, PortSpec::Tty(_));
         let is_found = self.family.is_none() || self.settings.is_found;
@@ -109,7 +110,7 @@ impl Scanner {
     pub(crate) fn differences(&self, other: &Scanner) -> Vec<&'static str> {
         let is_other_family = self.family != other.family;
         let differs = |key: &Key| {
-            // The defaults of these keys depend on the family.
+            // The defaults of these keys depend on the family, so a different value follows from the different family.
             let follows = is_other_family && matches!(key, Key::Angle | Key::Resolution);
             !follows && self.settings.value(*key) != other.settings.value(*key)
         };
@@ -172,7 +173,7 @@ impl<'a> ScannerRequest<'a> {
                 },
                 _ => Value::Other(&mode),
             };
-            // The key `mode` is a name or a number, depending on its type.
+            // Two settings have the key `mode`: a name for text, and a number for all other types.
             if (key == Key::ModeName) != matches!(value, Value::Text(_)) && key.name() == "mode" {
                 continue;
             }
@@ -183,14 +184,14 @@ impl<'a> ScannerRequest<'a> {
         Ok(ScannerRequest { family: family.transpose()?, request, table, sources })
     }
 
-    /// Returns the place where the number of a measurement mode is set. Returns `None` if none is set.
+    /// Returns the place where the number of a measurement mode is set. Returns `None` if no number is set.
     pub(crate) fn mode_number_location(&self) -> Option<String> {
         self.request.mode_number?;
         self.location("mode")
     }
 
-    /// Returns the scanner. `refuse` creates a failure from a place, a problem and a remedy. Without a place, it uses
-    /// the place of the link.
+    /// Returns the scanner. `refuse` creates a failure from a place, a problem and a remedy. Without a place, `refuse`
+    /// uses the place of the link.
     pub(crate) fn finish(
         &self,
         refuse: impl Fn(Option<String>, String, &str) -> Failure,

@@ -1,8 +1,9 @@
-//! Sections of the configuration. Each is a struct that the macro [`section!`] declares. A field is a key, with its
-//! description, its default and its check.
+//! Sections of the configuration. Each section is a struct that the macro [`section!`] declares. Each field is a key,
+//! with its description, its default and its check.
 //!
-//! To add a key, add a field and the code that uses it. Then generate the default configuration and the page again
-//! (`hub/config/tests/reference.rs`). A key of a scanner also needs an entry in `hub/drivers/src/settings.rs`.
+//! To add a key, add a field and the code that uses it. Then let the generator write the default configuration and the
+//! page again (`hub/config/tests/reference.rs`). A key of a scanner also needs an entry in
+//! `hub/drivers/src/settings.rs`.
 
 use std::borrow::Borrow;
 use std::ops::RangeInclusive;
@@ -74,7 +75,7 @@ pub(crate) use section;
 pub struct Key {
     /// Name of the key.
     pub name: &'static str,
-    /// Description of the key, as lines of a doc comment. Its first paragraph is short.
+    /// Description of the key, as lines of a doc comment. The first paragraph is short.
     pub text: &'static str,
     /// Example for a key without a default, as TOML. Empty if the key has a default.
     pub example: &'static str,

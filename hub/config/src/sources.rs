@@ -13,7 +13,7 @@ use toml::de::{DeArray, DeTable, DeValue, ValueDeserializer};
 /// Sources of values that take precedence over the defaults.
 #[derive(Clone, Debug, Default)]
 pub struct Sources {
-    /// Files, in order of increasing precedence. Each one must exist.
+    /// Files, in order of increasing precedence. Each file must exist.
     pub files: Vec<PathBuf>,
     /// Values of the flags `--set KEY=VALUE`.
     pub set: Vec<String>,
@@ -85,7 +85,7 @@ pub(crate) enum SourceKind {
 }
 
 /// Text of all sources, one after the other. A position in this text determines the source, and the line and column in
-/// it.
+/// that source.
 pub struct SourceMap {
     text: String,
     /// Positions at which the lines start.
@@ -268,7 +268,7 @@ fn link_as_toml(flag: &str) -> Option<String> {
         part.split_once('=')
             .is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c == '.'))
     };
-    // The port may contain a comma.
+    // The port may contain a comma, so only the parts at the end that have the form `KEY=VALUE` are keys.
     let parts: Vec<&str> = rest.split(',').collect();
     let set = parts.iter().rev().take_while(|part| is_set(part)).count().min(parts.len() - 1);
     let (port, set) = parts.split_at(parts.len() - set);
@@ -279,7 +279,7 @@ fn link_as_toml(flag: &str) -> Option<String> {
     Some(text)
 }
 
-/// Converts `value` to TOML. It becomes text if it is not valid TOML.
+/// Converts `value` to TOML. A value that is not valid TOML becomes text.
 fn to_toml(value: &str) -> String {
     match toml::from_str::<toml::Table>(&format!("v = {value}")) {
         Ok(table) if table.len() == 1 => value.to_owned(),

@@ -21,7 +21,7 @@ impl TempConfig {
     }
 }
 
-/// Links for tests whose files have none.
+/// Links for tests whose configuration files have no links.
 const LINKS: [&str; 2] = ["front=/dev/ttyUSB0,family=lms", "rear=/dev/ttyUSB1,family=lms"];
 
 fn load(files: &[&TempConfig], set: &[&str]) -> Result<Config, String> {
@@ -78,7 +78,7 @@ fn default_has_a_section_for_each_family() {
     let file = TempConfig::new("default.toml", all.join("\n"));
     let config = load(&[&file], &[]).unwrap_or_else(|refusal| panic!("{refusal}"));
     let families: Vec<Family> = config.links.iter().filter_map(scanhub_config::Link::family).collect();
-    // The last one is a recording.
+    // The last link is a recording.
     assert_eq!(families.split_last().map(|(_, live)| live), Some(&Family::ALL[..]));
     for features in Family::ALL.into_iter().map(features) {
         let names = features.models.iter().map(|model| model.name).chain(features.modes.iter().copied());
@@ -260,8 +260,8 @@ fn zone_that_no_beam_can_see_is_refused() {
         &["zones.min_beams=300", "link.rear.resolution=1"],
         "link rear: min_beams = 300, but a scan has 181",
     );
-    // The sensor is two meters ahead of the center and faces away from the circle. If it is turned by 180 degrees, it
-    // sees 30 degrees of the circle, which is 61 beams.
+    // The sensor is two meters ahead of the center and faces away from the circle. If the sensor is turned by 180
+    // degrees, it sees 30 degrees of the circle, which is 61 beams.
     let facing_away = "link.front.pose.x=2";
     refused(
         &[facing_away, "link.front.pose.y=0"],
@@ -310,7 +310,7 @@ fn start_background_must_belong_to_the_sensor() {
     let started = processing(&[], &[&start], 0).background;
     assert_eq!((started.model.as_deref(), started.learning.start), (Some(&*model), Start::Empty));
     assert_eq!(processing(&[], &[&start, "link.front.background.start=empty"], 0).background.model, None);
-    // The file is ignored if there is no background.
+    // The file is ignored if the hub learns no background.
     assert!(load(&[], &[&start, "background.method=off"]).is_ok());
 
     let name = file.0.display().to_string();
@@ -403,7 +403,7 @@ fn gateway_has_a_section_that_needs_no_links() {
         )
     );
     assert_eq!(gateway(&[], &[]).unwrap(), (Gateway::default(), None));
-    // A hub reads the same files.
+    // A hub can read the same file, together with a file that has links.
     let links = TempConfig::new("gateway-links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
     assert_eq!(load(&[&first, &links], &[]).unwrap().links.len(), 1);
     for (set, message) in [

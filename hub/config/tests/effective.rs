@@ -63,7 +63,7 @@ fn reports_the_deciding_source_of_each_value() {
         ("link.a.pose.x", json!(-0.25), "--set link.a.pose.x=-0.25".to_owned()),
         ("link.a.pose.yaw", json!(1.5), first.location("4:25")),
         ("link.b.pose.x", json!(0.0), "default".to_owned()),
-        // A value for one link takes precedence over a value for all links, in any order of the two.
+        // A value for one link takes precedence over a value for all links, whichever source comes first.
         ("link.a.zones.margin", json!(0.05), first.location("6:10")),
         ("link.b.zones.margin", json!(0.01), second.location("2:10")),
         ("link.b.zones.radii", json!([1.2, 0.7]), "--set zones.radii=[1.2,0.7]".to_owned()),

@@ -1,5 +1,5 @@
-//! Tests of the scanner of a link. They cover the keys that determine the scanner. If the family does not support a key
-//! or value, it is rejected with its position, the value and a remedy.
+//! Tests of the scanner of a link, and of the keys that determine the scanner. A key or value that the family does not
+//! support is rejected with its position, the value and a remedy.
 
 use scanhub_config::{Config, Link, Sources};
 use scanhub_drivers::{Settings, features};
