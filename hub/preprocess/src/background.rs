@@ -1,8 +1,8 @@
-//! Models of the background. They decide which beams of a scan hit the permanent surroundings, and which beams hit
+//! Models of the background. A model decides which beams of a scan hit the permanent surroundings, and which beams hit
 //! something in front of the surroundings.
 //!
-//! A [`BackgroundModel`] learns the surroundings from the scans: beam by beam with one of two methods (`fixed`), or as
-//! a map around a sensor that moves (`moving`).
+//! A [`BackgroundModel`] learns the surroundings from the scans. For a sensor that does not move, it learns them beam
+//! by beam, with one of two methods (`fixed`). For a sensor that moves, it learns a map (`moving`).
 
 mod fixed;
 mod moving;
@@ -25,45 +25,47 @@ use crate::velocity::Velocity;
 pub struct Settings {
     /// Method of learning.
     pub method: Method,
-    /// Maximum difference in mm between two readings of one surface, at least one unit of the sensor. `None`: 30, in cm
-    /// mode 60, in dm mode 100.
+    /// Maximum difference in mm between two readings of one surface. A value below one unit of the sensor counts as one
+    /// unit. `None` selects 30, in cm mode 60, and in dm mode 100.
     pub threshold_mm: Option<u16>,
-    /// Maximum difference in mm between a reading and its candidate (`paper`).
+    /// Maximum difference in mm between a reading and the candidate with which it is compared (only method `paper`).
+    /// `None` selects the same values as for `threshold_mm`.
     pub candidate_mm: Option<u16>,
-    /// Number of scans until a surface is background. `None`: the scans of 10 s at the full rate, which are 750 at
-    /// steps of 1 degree, 375 at half degrees, and 188 at a quarter. `multi` knows a surface well enough after 5/8 of
-    /// this number. At most 8191, which is 3.6 minutes at half degrees; a greater number counts as 8191.
+    /// Number of scans until a surface is background. `None` selects the number of scans in 10 s at the full rate: for
+    /// an LMS 750 at steps of 1 degree, 375 at half degrees, and 188 at a quarter. With method `multi`, a surface is
+    /// background after 5/8 of this number. The maximum is 8191, which is 3.6 minutes at half degrees. A greater number
+    /// counts as 8191.
     pub scans: Option<u32>,
-    /// Reading that a candidate is compared with (`paper`).
+    /// Which reading of a run is the candidate (only method `paper`).
     pub candidate: Candidate,
     /// Contents of the model at the start and after each reset.
     pub start: Start,
-    /// Whether no return counts as a background far away. Otherwise, it counts as no reading. `None`: true for `multi`,
-    /// which then also detects people in front of glass, at no cost elsewhere. False for `paper`, because each beam
-    /// without a return would end a run.
+    /// Whether no return counts as a background far away. Otherwise, a beam without a return counts as a beam without a
+    /// reading. `None` selects true for method `multi`, which then also detects people in front of glass, at no cost
+    /// elsewhere. `None` selects false for the other methods: with `paper`, each beam without a return would end a run.
     pub no_return_is_far: Option<bool>,
 }
 
 /// Method of learning a background.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Method {
-    /// One background per beam, which is replaced by a range that was read in enough consecutive scans.
+    /// One background per beam. A range that was read in enough consecutive scans (a run) replaces it.
     Paper,
-    /// Several surfaces per beam, and neighbors that must agree before something is in the foreground.
+    /// Several surfaces per beam. Something is in the foreground only if neighboring beams or scans agree.
     #[default]
     Multi,
-    /// A map of the surroundings of a robot that moves. Beams that end in space that was seen free are in the
-    /// foreground. Each scan needs the robot's position, see [`BackgroundModel::set_motion`].
+    /// A map of the surroundings of a robot that moves. A beam is in the foreground if it ends in space that earlier
+    /// scans saw free. Each scan needs the robot's position, see [`BackgroundModel::set_motion`].
     Moving,
 }
 
-/// Reading that the readings of a run are compared with.
+/// Candidate for the background: the reading with which each reading of a run is compared.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Candidate {
-    /// The first reading of the run. A person who walks straight at the sensor never becomes background.
+    /// The first reading of the run. A person who walks straight toward the sensor never becomes background.
     #[default]
     First,
-    /// The previous reading. It drifts along with anything that moves slowly.
+    /// The previous reading of the run. Anything that moves slowly can become background.
     Latest,
 }
 
@@ -80,10 +82,10 @@ pub enum Start {
 /// The settings in the units of the scans.
 #[derive(Clone, Copy, Debug)]
 struct Limits {
-    /// Maximum difference between two readings of one surface, in device units. It is so low that no range is near
-    /// [`scanhub_schema::Background::FAR`].
+    /// Maximum difference between two readings of one surface, in device units. It is so low that no range belongs to
+    /// the same surface as [`scanhub_schema::Background::FAR`].
     threshold: u16,
-    /// In device units.
+    /// Maximum difference between a reading and its candidate, in device units.
     candidate: u16,
     /// Number of scans until a surface is background, from 1 to [`MAX_SCANS`].
     scans: u16,
@@ -95,20 +97,23 @@ struct Limits {
     unit_um: u32,
 }
 
-/// Default of both thresholds in mm: six standard deviations of a range (the paper names no value).
+/// Default of `threshold_mm` and `candidate_mm`: six standard deviations of a range (the paper names no value).
 const THRESHOLD_MM: u16 = 30;
-/// Default of both thresholds in cm mode, where quantization adds to the noise, in mm.
+/// Default of `threshold_mm` and `candidate_mm` in cm mode, where rounding to the unit adds to the noise.
 const THRESHOLD_CM_MODE_MM: u16 = 60;
-/// Default of both thresholds in dm mode, in mm. Readings of two surfaces 30 mm apart differ by at most one unit there.
+/// Default of `threshold_mm` and `candidate_mm` in dm mode: one unit. Readings of two surfaces that are 30 mm apart
+/// differ by at most one unit in this mode.
 const THRESHOLD_DM_MODE_MM: u16 = 100;
-/// Default time until a surface is background, in ns: 750 revolutions of an LMS's mirror. They are 750 scans at steps
-/// of 1 degree, and half of this number at half degrees.
+/// Default time until a surface is background, in ns. It is the time of 750 revolutions of an LMS's mirror. In this
+/// time, the LMS sends 750 scans at steps of 1 degree, and half of this number at half degrees.
 const LEARNING_TIME_NS: f64 = 9.99e9;
-/// Maximum number of scans. The weights of `multi` grow by 8 per scan and have 16 bits.
+/// Maximum number of scans until a surface is background. It is limited because the weights of `multi` grow by 8 per
+/// scan and have 16 bits.
 const MAX_SCANS: u32 = 8191;
-/// Maximum difference between two ranges. [`scanhub_schema::Background::FAR`] differs by more from every range.
+/// Maximum of `threshold` and `candidate` in device units. [`scanhub_schema::Background::FAR`] differs by more from
+/// every range.
 const MAX_DIFFERENCE: u32 = 0x7FFF;
-/// Maximum rounding error of a quotient, so that rounding up keeps a whole number.
+/// Maximum rounding error of a quotient. It is subtracted before rounding up, so that a whole number stays the same.
 const ROUNDING_ERROR: f64 = 1e-6;
 
 impl Limits {
@@ -119,12 +124,12 @@ impl Limits {
             10_000..100_000 => THRESHOLD_CM_MODE_MM,
             100_000.. => THRESHOLD_DM_MODE_MM,
         };
-        // With a difference of less than a unit, a reading between two units would belong to no surface.
+        // The minimum is one unit. With less, readings that differ only by rounding would belong to different surfaces.
         let units = |mm: Option<u16>| {
             (1000 * u32::from(mm.unwrap_or(default_mm)) / unit_um).clamp(1, MAX_DIFFERENCE) as u16
         };
         let turn_ns = f64::from(scan.beam_time_ns) * TAU / scan.step.abs();
-        // Without revolutions, there is no number of scans for 10 s.
+        // Without a time per beam, the quotient is not a number or infinite, and the clamp below limits it.
         let ten_seconds =
             (LEARNING_TIME_NS / (turn_ns * f64::from(scan.turns.max(1))) - ROUNDING_ERROR).ceil() as u32;
         Limits {
@@ -139,13 +144,14 @@ impl Limits {
     }
 }
 
-/// Class of a beam, compared with its background.
+/// Class of a beam. It is the result of comparing the beam's reading with its background.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Class {
     /// The beam has no reading.
     Invalid,
-    /// The beam's background is unknown; or (`multi`) something is nearer, but on too few beams.
+    /// The beam's background is unknown. With the methods `multi` and `moving`, the beam may also end nearer than its
+    /// background, but too few neighboring beams do so, too.
     Unknown,
     /// The beam ends at its background.
     Background,
@@ -158,27 +164,29 @@ pub enum Class {
 /// The background of one sensor.
 ///
 /// A scan resets the background if its shape (number of beams, unit, angles) differs from the shape of the previous
-/// scan. A reading of 0 is treated like any other, but as a background it cannot be distinguished from an unknown one.
+/// scan. A reading of 0 is treated like any other reading. But a background of 0 cannot be distinguished from an
+/// unknown background.
 #[derive(Clone)]
 pub struct BackgroundModel {
     settings: Settings,
     limits: Limits,
     method_state: MethodState,
-    /// Maximum number of beams of a scan. More are ignored.
+    /// Maximum number of beams of a scan. Further beams are ignored.
     max_beams: usize,
-    /// Number of beams and unit in micrometers of the last scan or of the loaded model; (0, 0) before both.
+    /// Number of beams and unit in micrometers of the last scan, or of the model that was loaded before the first scan.
+    /// (0, 0) before that.
     shape: (u16, u32),
-    /// First angle and step of the last scan or of the loaded model; 0 before both.
+    /// First angle and step of the last scan, or of the model that was loaded before the first scan. 0 before that.
     angles: (f64, f64),
-    /// Whether a scan has arrived, so that the limits are in its units.
+    /// Whether `limits` were computed for the scans. If not, the next scan defines their units.
     is_fitted: bool,
     generation: u32,
     is_frozen: bool,
     /// Whether nothing has been learned or loaded since the last reset.
     is_empty: bool,
-    /// Classes of the beams of the last scan, in whole blocks.
+    /// Classes of the beams of the last scan, padded to whole blocks.
     classes: Box<[Class]>,
-    /// Readings of the beams in whole blocks, while a scan is processed.
+    /// Buffer for the readings of the beams while a scan is processed, padded to whole blocks.
     readings: Box<[u16]>,
 }
 
@@ -190,7 +198,7 @@ enum MethodState {
     Moving(OccupancyMap),
 }
 
-/// Value of a beam without a reading. It lies between the ranges and [`Background::FAR`].
+/// Value of a beam without a reading. It is above all ranges, and below [`Background::FAR`].
 const INVALID: u16 = Background::FAR - 1;
 
 impl BackgroundModel {
@@ -217,7 +225,7 @@ impl BackgroundModel {
     ///
     /// # Panics
     ///
-    /// Panics if `out` has no memory for as many beams.
+    /// Panics if `out` has not enough memory for the beams of `scan`.
     pub fn update(&mut self, scan: &Scan, out: &mut Foreground) {
         self.fit(scan);
         let count = scan.beams().min(self.max_beams);
@@ -244,8 +252,8 @@ impl BackgroundModel {
     }
 
     /// Sets the robot's position at the next scan, which `motion` contains, and the robot's `velocity` during that
-    /// scan. The sensor is at `pose`. Only [`Method::Moving`] uses these values. If the motion restarts or is refused,
-    /// the model is reset.
+    /// scan. The sensor is at `pose` on the robot. Only [`Method::Moving`] uses these values. Resets the model if the
+    /// estimation of the motion restarts or refuses a step.
     pub fn set_motion(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) {
         if let MethodState::Moving(moving) = &mut self.method_state
             && !moving.set_motion(pose, motion, velocity)
@@ -255,7 +263,7 @@ impl BackgroundModel {
         }
     }
 
-    /// Returns the classes of the beams of the last scan; empty before the first one.
+    /// Returns the classes of the beams of the last scan. The result is empty before the first scan.
     pub fn classes(&self) -> &[Class] {
         if self.is_fitted { &self.classes[..usize::from(self.shape.0)] } else { &[] }
     }
@@ -265,11 +273,11 @@ impl BackgroundModel {
         self.shape.0.into()
     }
 
-    /// Writes the model to `out`, every byte of it.
+    /// Writes the model to `out`. Writes every byte of `out`.
     ///
     /// # Panics
     ///
-    /// Panics if `out` has no memory for as many beams.
+    /// Panics if `out` has not enough memory for the beams of the model.
     pub fn write(&self, out: &mut Background) {
         let ranges = out.begin(BackgroundHead {
             first_angle: self.angles.0,
@@ -293,12 +301,14 @@ impl BackgroundModel {
         self.settings.method
     }
 
-    /// Returns the generation of the model. It increases by 1 with a reset, a load, and a change of the scan's shape.
+    /// Returns the generation of the model. It increases by 1 at each reset, each load, each change of settings, and
+    /// each change of the scans' shape.
     pub fn generation(&self) -> u32 {
         self.generation
     }
 
-    /// Returns the number of scans until a surface is background, as set or as computed from the last scan.
+    /// Returns the number of scans until a surface is background. It is the value of the settings, or the default that
+    /// was computed from the last scan.
     pub fn scans(&self) -> u16 {
         self.limits.scans
     }
@@ -308,7 +318,7 @@ impl BackgroundModel {
         self.is_frozen
     }
 
-    /// Empties the model. A frozen model stays frozen, and is empty until it is thawed.
+    /// Empties the model. A frozen model stays frozen, so it stays empty until it is thawed.
     pub fn reset(&mut self) {
         match &mut self.method_state {
             MethodState::Paper(paper) if self.settings.method == Method::Paper => paper.reset(),
@@ -320,7 +330,7 @@ impl BackgroundModel {
         self.is_empty = true;
     }
 
-    /// Stops learning. Scans are still compared.
+    /// Stops learning. Scans are still compared with the model.
     pub fn freeze(&mut self) {
         self.is_frozen = true;
     }
@@ -333,12 +343,12 @@ impl BackgroundModel {
     /// Uses the ranges of `model` as the background, and drops all candidates. Ignores the generation and the flags of
     /// `model`.
     ///
-    /// Before the first scan, its shape is unknown, so any model is accepted. If the first scan has another number of
-    /// beams or another unit, it resets the model, like any other change of the shape.
+    /// Before the first scan, the shape of the scans is unknown, so any model is accepted. If the first scan then has
+    /// another number of beams or another unit than `model`, the background is reset.
     ///
     /// # Errors
     ///
-    /// Returns [`Mismatch`] if the number of beams or the unit differs from the last scan, or if there are too many
+    /// Returns [`Mismatch`] if number of beams or unit of `model` differ from the last scan, or if `model` has too many
     /// beams.
     pub fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
         let ranges = model.ranges();
@@ -356,10 +366,10 @@ impl BackgroundModel {
         Ok(())
     }
 
-    /// Applies `settings` from the next scan on. Keeps the background, fully known, and drops all candidates. The
-    /// generation increases, as after [`load`](Self::load).
+    /// Applies `settings` from the next scan on. Keeps the background as a fully known background, and drops all
+    /// candidates. The generation increases, as after [`load`](Self::load).
     pub fn change(&mut self, settings: Settings) {
-        // The buffer of readings is free between two scans.
+        // Between two scans, the buffer of readings is unused, so it can hold the background.
         let beams = self.beams();
         for (i, range) in self.readings[..beams].iter_mut().enumerate() {
             *range = self.method_state.background(i, &self.limits);
@@ -399,14 +409,14 @@ impl MethodState {
         }
     }
 
-    /// Uses `ranges` as the background, except those without a reading.
+    /// Uses `ranges` as the background. Values without a reading are skipped.
     fn adopt(&mut self, ranges: &[u16]) {
         for (i, &range) in ranges.iter().enumerate() {
             if range != INVALID && range != Background::UNKNOWN {
                 match self {
                     MethodState::Paper(paper) => paper.adopt(i, range),
                     MethodState::Multi(multi) => multi.adopt(i, range),
-                    // The ranges of a model were measured from one position. They are not a map.
+                    // The ranges of a model were measured from one position, so they do not define a map.
                     MethodState::Moving(_) => {}
                 }
             }
@@ -423,8 +433,8 @@ impl MethodState {
     }
 }
 
-/// Writes the readings of `scan` in device units, [`Background::FAR`] or [`INVALID`]. Compares the values without
-/// [`Reading`], because there are many.
+/// Writes the reading of each beam of `scan`: a range in device units, [`Background::FAR`] or [`INVALID`]. The function
+/// compares plain numbers, because this is faster for many beams. `Reading` in the tests defines the same readings.
 fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16]) {
     let ScanHead { valid_to, no_return, beyond, .. } = **scan;
     let valid_to = valid_to.min(INVALID - 1);
@@ -436,7 +446,7 @@ fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16]) {
     }
 }
 
-/// Writes everything except the segments.
+/// Writes the foreground of `scan` into `out`, except the segments.
 fn write_foreground(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) {
     let head = ForegroundHead {
         generation,
@@ -485,15 +495,15 @@ impl fmt::Display for Mismatch {
 
 impl std::error::Error for Mismatch {}
 
-/// Filter that decides how many neighboring foreground beams, in how many scans, count as an object. Noise and mixed
-/// readings at edges affect single beams. People cover several beams, unless they are far away.
+/// Filter that decides which runs of neighboring foreground beams count as objects. Noise, and readings between two
+/// surfaces at edges, affect only single beams. People cover several beams, unless they are far away.
 #[derive(Clone)]
 struct RunFilter {
-    /// Readings of beams of the last scan that were nearer than their background; [`INVALID`] for the others.
+    /// Readings of the beams of the last scan that were nearer than their background; [`INVALID`] for other beams.
     foreground: Box<[u16]>,
-    /// Readings of `foreground` that counted as an object; [`INVALID`] for the others.
+    /// Readings in `foreground` that counted as an object; [`INVALID`] for other beams.
     objects: Box<[u16]>,
-    /// Foreground and objects of the current scan.
+    /// Buffers for `foreground` and `objects` of the current scan.
     next: [Box<[u16]>; 2],
 }
 
@@ -513,9 +523,10 @@ impl RunFilter {
     /// Keeps the runs of foreground beams in `classes` that count as objects. Beams of other runs become unknown. A
     /// beam without a reading does not end a run, and does not count as one of its beams.
     ///
-    /// A run of three beams counts at once. A shorter run counts if the last scan had a foreground beam of an object
-    /// there. A shorter run also counts if it is as wide as a leg at its range, and the last scan had any foreground
-    /// beam there. *There* means among or next to the run's own beams, within 200 mm of the run's nearest range.
+    /// A run of three beams or more is an object. For a shorter run, the last scan decides: beams of the last scan that
+    /// are among or next to the beams of the run, and within 200 mm of the run's nearest range. If one of them belonged
+    /// to an object, the run is an object. If one of them was in the foreground, the run is an object if it is as wide
+    /// as a leg at this range.
     fn retain_objects(&mut self, readings: &[u16], limits: &Limits, classes: &mut [Class]) {
         let beam_count = self.foreground.len();
         let [foreground, objects] = &mut self.next;
@@ -565,15 +576,15 @@ fn leg_beams(range: u16, limits: &Limits) -> u64 {
         .map_or(MIN_OBJECT_BEAMS, |beams| beams.clamp(1, MIN_OBJECT_BEAMS))
 }
 
-/// Number of neighboring foreground beams that are never noise. A run never needs more beams, however near the object
-/// is.
+/// Number of neighboring foreground beams that are never noise. A run of at least this length is an object, at any
+/// range.
 const MIN_OBJECT_BEAMS: u64 = 3;
-/// Width of a leg with trousers plus width of a beam, in mm. Of 120, 135 and 150 mm, this value has the best recall
-/// without a loss of precision in the room of Fig. 8.
+/// Width of a leg with trousers plus width of a beam, in mm. The values 120, 135 and 150 mm were compared in the room
+/// of the paper's Fig. 8. This value has the best recall without a loss of precision.
 const LEG_WIDTH_MM: u64 = 135;
 const MDEG_PER_RADIAN: u64 = 57_296;
-/// Maximum movement of an object between two scans plus the depth of the object, in mm. At 37.5 Hz, an object at 5 m/s
-/// moves by 133 mm.
+/// Maximum movement of an object between two scans plus the depth of the object, in mm. An object at 5 m/s moves by
+/// 133 mm between two scans at 37.5 Hz.
 const MAX_MOVEMENT_MM: u32 = 200;
 
 #[cfg(test)]
@@ -582,7 +593,7 @@ mod tests {
 
     use super::*;
 
-    /// Reading of one beam. [`measure`] has the same result for whole scans, but is faster.
+    /// Reading of one beam. [`measure`] must have the same result for whole scans, but is faster.
     #[derive(Clone, Copy, Debug, PartialEq, Eq)]
     enum Reading {
         /// A range in mm.
@@ -594,8 +605,8 @@ mod tests {
     }
 
     impl Reading {
-        /// Returns the reading of beam `i` of `scan`. No return is the most frequent code in real rooms. Each processor
-        /// decides whether it means [`Reading::Far`] or [`Reading::Invalid`].
+        /// Returns the reading of beam `i` of `scan`. `no_return_is_far` decides whether no return, the most frequent
+        /// code in real rooms, means [`Reading::Far`] or [`Reading::Invalid`].
         fn of(scan: &Scan, i: usize, no_return_is_far: bool) -> Reading {
             match (scan.distance_mm(i), scan.code(i)) {
                 (Some(range_mm), _) => Reading::Valid(range_mm),

@@ -1,4 +1,4 @@
-//! Processors of scans. Each one is a small struct that reads a scan and fills a payload, without heap allocation,
+//! Processors of scans. Each processor is a struct that reads a scan and fills a payload, without heap allocation,
 //! clock or I/O. The result of a processor does not depend on which other processors run.
 
 #![forbid(unsafe_code)]

@@ -1,9 +1,10 @@
-//! Straight lines of one scan. The lines are chosen so that the measured ranges are likeliest, if each range has normal
-//! noise along its beam. A beam belongs to one line or to none. No state is kept from one scan to the next.
+//! Straight lines of one scan. They are the lines for which the measured ranges are most likely, if each range has
+//! normal noise along its beam. A beam belongs to one line or to none. The lines do not depend on earlier scans.
 //!
 //! The method is maximum likelihood as in Schaefer, Buescher, Luft, Burgard: "A Maximum Likelihood Approach to Extract
-//! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected. Pairs of beams are joined
-//! to lines, the likeliest lines first. Then the cuts between lines are moved (`pieces`).
+//! Polylines from 2-D Laser Range Scans" (IROS 2018), called PLE in comments. Here, the lines need not be connected.
+//! Neighboring pairs of beams are joined to lines, the likeliest lines first. Then the cuts between lines are moved
+//! (`pieces`).
 //!
 //! No parameter is set by hand: the noise is estimated from the scan, and a Bayesian information criterion decides
 //! whether a line explains more than noise.
@@ -27,8 +28,8 @@ pub struct Settings {
     pub max: u8,
     /// Minimum number of beams of a line, at least 3.
     pub min_points: u16,
-    /// Whether to use the slower, better method: it moves cuts to where they help most, and drops the beams at the ends
-    /// of lines that fit their line worst.
+    /// Whether to refine the lines, which is slower: cuts between lines are moved to where they help most, and beams at
+    /// the ends of lines that fit their line worst are dropped.
     pub refine: bool,
     /// Condition that ends the joining of lines.
     pub stop: StopCriterion,
@@ -37,11 +38,11 @@ pub struct Settings {
 /// Condition that ends the joining of lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum StopCriterion {
-    /// Joining ends when the next join would increase the error by more than noise explains. Points more than one meter
-    /// apart are never joined; the paper uses this distance for real scans.
+    /// Joining ends when the next join would increase the error by more than noise explains. Neighboring points more
+    /// than one meter apart are never joined. The IROS paper uses this distance for real scans.
     Likelihood,
-    /// Joining ends when at most `max` lines are left. Points farther apart than this number of meters are never
-    /// joined. For comparisons at equal numbers of lines.
+    /// Joining ends when at most `max` lines are left. Neighboring points farther apart than this number of meters are
+    /// never joined. This criterion is for comparisons with other methods at equal numbers of lines.
     Number(f64),
 }
 
@@ -56,13 +57,14 @@ pub struct LineFinder {
     pose: Pose,
     settings: Settings,
     directions: Directions,
-    /// Beams that have a range. `beams` has their indices.
+    /// Beams that have a range.
     rays: Box<[Ray]>,
+    /// Index in the scan of each beam in `rays`.
     beams: Box<[u16]>,
-    /// Index after the last ray of each group. Neighboring rays of a group are so near to each other that they may be
-    /// on one line.
+    /// Index after the last ray of each group. In a group, the points of neighboring rays are near enough to each other
+    /// to be on one line.
     ends: Box<[u16]>,
-    /// Memory for estimating the noise.
+    /// Buffer for estimating the noise.
     steps: Box<[[f64; 2]]>,
     partitioner: ScanPartitioner,
 }
@@ -83,12 +85,12 @@ impl LineFinder {
         }
     }
 
-    /// Continues with these `settings` for a sensor at `pose`.
+    /// Changes the pose of the sensor and the settings for the next scans.
     pub fn change(&mut self, pose: Pose, settings: Settings) {
         (self.pose, self.settings) = (pose, settings);
     }
 
-    /// Writes the lines of `scan` into `out`, every byte of it.
+    /// Writes the lines of `scan` into `out`. Writes every byte of `out`.
     pub fn update(&mut self, scan: &Scan, out: &mut Lines) {
         *out = Lines::default();
         let rays = self.read(scan);
@@ -127,7 +129,7 @@ impl LineFinder {
         count
     }
 
-    /// Groups the rays where points are too far apart for one line, and returns the number of groups.
+    /// Cuts the rays into groups where neighboring points are too far apart for one line. Returns the number of groups.
     fn group(&mut self, rays: usize) -> usize {
         let max_gap_m = match self.settings.stop {
             StopCriterion::Likelihood => MAX_GAP_M,
@@ -143,10 +145,10 @@ impl LineFinder {
         groups
     }
 
-    /// Returns the standard deviation of a range in meters, at least the standard deviation that rounding to the unit
-    /// of `scan` causes. It is computed from the distance of each beam from the line through its two neighbors, and
-    /// from the line through the beams next to those neighbors. Edges and corners hardly change the median of these
-    /// distances.
+    /// Returns the standard deviation of a range in meters. It is at least the standard deviation that rounding to the
+    /// unit of `scan` causes. It is computed from the median of many distances: of each point from the line through its
+    /// two neighbors, and from the line through the two points after those neighbors. Edges and corners hardly change
+    /// the median.
     fn noise(&mut self, groups: usize, scan: &Scan) -> f64 {
         let (mut count, mut first) = (0, 0);
         let steps = self.steps.as_flattened_mut();
@@ -169,14 +171,14 @@ impl LineFinder {
         let Some(steps) = steps.get_mut(..count).filter(|steps| !steps.is_empty()) else { return minimum };
         let (_, median, _) = steps.select_nth_unstable_by(count / 2, f64::total_cmp);
         // The median of the absolute value is .6745 standard deviations. The difference between one range and the mean
-        // of two others has the variance 1 + 1/2.
+        // of two other ranges has 1 + 1/2 times the variance of a range.
         (*median / (0.6745 * 1.5_f64.sqrt())).max(minimum)
     }
 
     fn bounds(&self, rays: usize, noise: f64) -> Bounds {
         let Settings { max, min_points, refine, stop } = self.settings;
         let penalty = PARAMETERS_PER_LINE * (rays.max(2) as f64).ln() * noise * noise;
-        // Without a maximum distance, all points are on a line.
+        // If the maximum distance is infinite, every point must be on a line, so no beam can be dropped.
         let (penalty, variance, loss) = match stop {
             StopCriterion::Likelihood => (penalty, noise * noise, BEAM_LOSS_M * BEAM_LOSS_M),
             StopCriterion::Number(gap_m) if gap_m.is_finite() => {
@@ -192,28 +194,28 @@ impl LineFinder {
             min_points: usize::from(min_points),
             rounds: if refine { 3 } else { 1 },
             exchange: refine,
-            // After that, 19 of 20 beams still end on a line. In rooms drawn like the rooms of PLE, 97.8 % of the beams
-            // do.
+            // If this number of beams is dropped, 19 of 20 beams are still on a line. In simulated rooms like those of
+            // PLE, 97.8 % of the beams are on a line.
             trimmed: if refine { rays / 20 } else { 0 },
         }
     }
 }
 
-/// Number of parameters of a line. They are its two numbers and the cut to the next line. The cut counts twice, as in
-/// the criterion of Zhang and Siegmund (2007) for change points.
+/// Number of parameters of a line: its two numbers, and the cut to the next line. The cut counts twice, as in the
+/// criterion of Zhang and Siegmund (2007) for change points.
 const PARAMETERS_PER_LINE: f64 = 4.0;
-/// Maximum distance between neighboring points of one line, in meters. PLE uses it for real scans.
+/// Maximum distance between neighboring points of one line, in meters. PLE uses the same distance for real scans.
 const MAX_GAP_M: f64 = 1.0;
-/// Cost of dropping a beam if there are more lines than allowed, as an error in meters. On logs of four sensors (aces,
-/// Freiburg, Intel, Orebro: `cargo bench --bench perception`), ten vertices then cover more beams than ten vertices of
-/// RANSAC, and fit better.
+/// Cost of dropping a beam if there are more lines than allowed, as an error in meters. With this cost, on logs of four
+/// sensors (aces, Freiburg, Intel, Orebro: `cargo bench --bench perception`), ten vertices cover more beams than ten
+/// vertices of RANSAC, and fit better.
 const BEAM_LOSS_M: f64 = 0.2;
-/// Maximum number of beams between neighboring lines.
+/// Maximum angle between the facing ends of two neighboring lines that may have a corner, in steps between beams.
 const MAX_NEIGHBOR_GAP: f32 = 4.5;
-/// Number of steps of Newton's method to the likeliest line.
+/// Maximum number of steps of Newton's method toward the likeliest line.
 const NEWTON_STEPS: usize = 3;
 
-/// Returns the likeliest line of `piece`; `None` if its rays do not define one.
+/// Returns the likeliest line for the rays of `piece`, or `None` if they do not define a line.
 fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> Option<Line> {
     let inside = &rays[piece.first..piece.end];
     let (fit, error) = piece.line().refined(inside, NEWTON_STEPS);
@@ -226,7 +228,7 @@ fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> 
     let along =
         |by_a: f64, by_b: f64| (by_a * by_a * aa + 2.0 * by_a * by_b * ab + by_b * by_b * bb).max(0.0).sqrt();
     let alpha_by = (-fit.b / square, fit.a / square);
-    // The sensor is not at the robot's center.
+    // Transform from the sensor, which need not be at the robot's center, to the robot's frame.
     let lever = pose.y_m * cos - pose.x_m * sin;
     let r_by = |of: f64, by_alpha: f64| lever * by_alpha - of * of_sensor / square;
     let r = of_sensor + pose.x_m * cos + pose.y_m * sin;
@@ -251,14 +253,14 @@ fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> 
         reserved: 0,
     };
     let numbers = [x1_m, y1_m, x2_m, y2_m, line.r_m, line.alpha_rad, line.sd_r_m, line.sd_alpha_rad];
-    // With a deviation of 1 rad or more, the line may have any direction.
+    // With a standard deviation of 1 rad or more, the direction of the line is unknown.
     let is_known = numbers.iter().all(|number| number.is_finite()) && line.sd_alpha_rad < 1.0;
     is_known.then_some(line)
 }
 
-/// Writes the corners of neighboring lines that are certainly not parallel, and that meet between the last beam of the
-/// first line and the first beam of the second one. At such a corner, both lines have about the same range, so no
-/// object is between them.
+/// Writes the corners of neighboring lines to `out`. Two lines have a corner if they are certainly not parallel, and if
+/// they meet between the last beam of the first line and the first beam of the second line. At such a corner, both
+/// lines have about the same range, so neither hides the end of the other.
 fn corners(out: &mut Lines, pose: &Pose, step: f32) {
     let count = usize::from(out.count);
     // In a full revolution, the last line is a neighbor of the first one.
@@ -286,7 +288,7 @@ fn corners(out: &mut Lines, pose: &Pose, step: f32) {
     out.corners = corners as u8;
 }
 
-/// Returns the point at which two lines meet, if they are certainly not parallel.
+/// Returns the point at which two lines meet, or `None` if they may be parallel.
 fn intersection(one: &Line, two: &Line) -> Option<(f32, f32)> {
     let sine = (two.alpha_rad - one.alpha_rad).sin();
     if sine.abs() <= 3.0 * one.sd_alpha_rad.hypot(two.sd_alpha_rad) {

@@ -11,13 +11,14 @@ use crate::search::position;
 /// Settings of a mark detector.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
-    /// Minimum level of a beam of a mark, for scanners whose intensities are reflector levels. 0 counts as 1.
+    /// Minimum intensity of a beam in a mark, for scanners whose intensities are reflector levels. 0 counts as 1.
     pub min_level: u8,
-    /// Minimum intensity of a beam of a mark, for other scanners. 0 counts as 1. `None`: other scanners have no marks.
+    /// Minimum intensity of a beam in a mark, for other scanners. 0 counts as 1. If it is `None`, scans of other
+    /// scanners have no marks.
     pub level: Option<u16>,
     /// Maximum difference between the ranges of neighboring beams in a mark, in mm.
     pub max_range_step_mm: u16,
-    /// Maximum number of consecutive beams in a mark that have no range or not enough intensity.
+    /// Maximum number of consecutive beams inside a mark that have no range or not enough intensity.
     pub max_gap: u16,
 }
 
@@ -32,7 +33,7 @@ impl Default for Settings {
     }
 }
 
-/// Finds the marks of each scan. No state is kept from one scan to the next.
+/// Finds the marks of each scan. The marks of a scan do not depend on earlier scans.
 pub struct MarkDetector {
     settings: Settings,
 }
@@ -43,7 +44,7 @@ impl MarkDetector {
         MarkDetector { settings }
     }
 
-    /// Writes the marks of `scan` into `out`, every byte of it.
+    /// Writes the marks of `scan` into `out`. Writes every byte of `out`.
     pub fn update(&mut self, scan: &Scan, out: &mut Marks) {
         (out.count, out.flags, out.reserved) = (0, 0, 0);
         match self.min_intensity(scan) {
@@ -53,9 +54,10 @@ impl MarkDetector {
         out.mark_array[usize::from(out.count)..].fill(Mark::default());
     }
 
-    /// Returns the minimum intensity of a mark of `scan`, or the reason why there can be no marks, as flags.
+    /// Returns the minimum intensity of a beam in a mark of `scan`. If `scan` cannot have marks, returns the reason as
+    /// flags of [`Marks`].
     fn min_intensity(&self, scan: &Scan) -> Result<u16, u8> {
-        // The scanner's mode must have intensities, and the scan must contain them.
+        // The scanner's measuring mode must have intensities, and the scan must contain them.
         if scan.intensity_bits == 0 || scan.contents & (ArrayFlags::UPPER | ArrayFlags::WIDE) == 0 {
             return Err(Marks::UNAVAILABLE);
         }
@@ -65,7 +67,7 @@ impl MarkDetector {
         self.settings.level.map(|level| level.max(1)).ok_or(Marks::UNAVAILABLE | Marks::NO_LEVEL)
     }
 
-    /// Writes the marks. Each beam of a mark has at least the intensity `min_intensity`.
+    /// Writes the marks into `out`. Each beam of a mark has at least the intensity `min_intensity`.
     fn find(&self, scan: &Scan, min_intensity: u16, out: &mut Marks) {
         let (mut count, mut overflow) = (0, false);
         let mut push = |open: &OpenMark| match out.mark_array.get_mut(count) {
@@ -106,7 +108,7 @@ impl MarkDetector {
     }
 }
 
-/// Returns the first beam from `from` on that has at least the intensity `min_intensity`.
+/// Returns the first beam from `from` on that has at least the intensity `min_intensity`, or `None` if there is none.
 fn first_bright(intensities: &Intensities<'_>, from: usize, min_intensity: u16) -> Option<usize> {
     match intensities {
         Intensities::Narrow(values) => {
@@ -117,17 +119,17 @@ fn first_bright(intensities: &Intensities<'_>, from: usize, min_intensity: u16) 
     }
 }
 
-/// Mark that may get more beams: sums over its beams. The sums are integers, so that they are the same on every
-/// machine.
+/// Mark to which more beams may be added, as sums over its beams. The sums are integers, so that they are the same on
+/// every machine. The weight of a beam is its intensity.
 #[derive(Clone, Copy, Default)]
 struct OpenMark {
-    /// Sum of the weights w.
+    /// Sum of the weights.
     weight: u64,
-    /// Sum of w * i, with the beam's index i.
+    /// Sum of the products of weight and index of each beam.
     beams: u64,
-    /// Sum of w times the difference of the exact angle from the angle of the beam, in millionths of a degree.
+    /// Sum of the products of weight and [`offset_udeg`] of each beam, in millionths of a degree.
     offset_udeg: i64,
-    /// Sum of w * r, with the range r in device units.
+    /// Sum of the products of weight and range of each beam, in device units.
     ranges: u64,
     last_range: u16,
     peak: u16,
@@ -179,13 +181,13 @@ impl OpenMark {
     }
 }
 
-/// Returns an angle in 1/1000 degree, counted from any revolution, from -180,000 to below 180,000.
+/// Removes whole revolutions from an angle in 1/1000 degree. The result is at least -180,000 and below 180,000.
 fn in_range_mdeg(mdeg: i128) -> i32 {
     ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
-/// Returns the difference of the exact angle of beam `i` from its angle on the grid, in millionths of a degree; 0
-/// without an exact angle. The angles may differ by whole revolutions.
+/// Returns the difference between the exact angle of beam `i` and its angle at equal steps, in millionths of a degree,
+/// without whole revolutions. Returns 0 if the beam has no exact angle.
 fn offset_udeg(scan: &Scan, i: usize) -> i64 {
     let Some(exact) = exact_angle(scan.exact_angles(), i) else { return 0 };
     let off = exact - (scan.first_angle + i as f64 * scan.step);

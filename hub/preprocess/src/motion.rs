@@ -1,12 +1,13 @@
-//! Estimation of a robot's motion from scan to scan. First, the corners and lines of both scans are matched. Then all
-//! beams are matched: each beam should end on a surface of the reference scan.
+//! Estimation of a robot's motion from scan to scan. Each scan is matched with an earlier scan, the reference scan.
+//! First, corners and lines of both scans are matched. Then all beams are matched: each beam should end on a surface of
+//! the reference scan.
 //!
 //! The method is point-to-line matching as in Censi: "An ICP variant using a point-to-line metric" (ICRA 2008), with
-//! the covariance of Censi: "An accurate closed-form estimate of ICP's covariance" (ICRA 2007). Surfaces are the line
-//! features of the scan; elsewhere, a few neighboring readings define a surface.
+//! the covariance of Censi: "An accurate closed-form estimate of ICP's covariance" (ICRA 2007). The surfaces are the
+//! line features of the scan. Where there is no line feature, a few neighboring readings define a surface.
 //!
-//! Each scan is compared with a reference scan, which is kept until the robot has left its position. A robot that
-//! stands therefore does not drift.
+//! A reference scan is kept until the robot has moved away from the position at which it was measured. The estimated
+//! position of a robot that stands therefore does not drift.
 
 mod covariance;
 mod matching;
@@ -29,7 +30,7 @@ pub struct Settings {
     pub max_step_m: f64,
     /// Maximum turn from one scan to the next, in degrees; less than 90.
     pub max_turn_deg: f64,
-    /// Minimum share of a scan's readings that lie on surfaces of the scan that it is compared with.
+    /// Minimum share of a scan's readings that lie on surfaces of the reference scan.
     pub min_overlap: f64,
 }
 
@@ -49,8 +50,9 @@ impl Settings {
 pub struct MotionEstimator {
     pose: Pose,
     settings: Settings,
-    /// The reference scan, and the current one.
+    /// The reference scan.
     reference: PreparedScan,
+    /// The current scan.
     current: PreparedScan,
     matcher: ScanMatcher,
     /// State of the odometry; `None` before the first scan.
@@ -58,32 +60,33 @@ pub struct MotionEstimator {
     /// Stamp of the last scan, in ns.
     stamp_ns: u64,
     velocity: Velocity,
-    /// Velocity of the last step, if that step was rejected because its velocity differs too much from the velocity
-    /// before.
+    /// Velocity of the last step, if this velocity was rejected because it differs too much from the velocity before.
     rejected: Option<Velocity>,
     undistorted: UndistortedScan,
     finder: LineFinder,
     lines: Lines,
 }
 
-/// Position of the robot, and its last step.
+/// Position and last step of the robot.
 #[derive(Clone, Copy, Default)]
 struct OdometryState {
-    /// Position at the reference scan, relative to the start, and its covariance.
+    /// Position at the reference scan, relative to the start.
     origin: Pose2,
+    /// Covariance of `origin`.
     of_origin: Square,
     /// Position at the last scan, in the frame of the reference scan.
     last: Pose2,
-    /// Covariance of `last` that the noise of the last scan causes. `None` if the last scan is the reference.
+    /// Covariance of `last` that the noise of the last scan causes. `None` if the last scan is the reference scan.
     extra_covariance: Option<Square>,
     /// Covariance of `last` from all causes.
     of_last: Square,
-    /// Whether there is a direction in which the surroundings do not define `last`.
+    /// Whether `last` is degenerate: there is a direction in which the surroundings do not define it.
     is_degenerate: bool,
-    /// Whether the sum of all steps contains a degenerate one.
+    /// Whether the position is open: a step since the start was degenerate.
     is_open: bool,
     /// The last step.
     step: Pose2,
+    /// Number of steps that were refused since the start.
     refused_steps: u16,
 }
 
@@ -107,7 +110,8 @@ impl MotionEstimator {
         }
     }
 
-    /// Continues with these `settings` for a sensor at `pose`. If the pose has changed, the estimator restarts.
+    /// Changes the settings and the pose of the sensor. If the pose differs from the previous one, the estimator
+    /// restarts.
     pub fn change(&mut self, pose: Pose, settings: Settings) {
         if self.pose != pose {
             self.reset();
@@ -121,13 +125,13 @@ impl MotionEstimator {
         self.odometry = None;
     }
 
-    /// Returns the velocity during the last scan.
+    /// Returns the robot's velocity during the last scan.
     pub fn velocity(&self) -> Velocity {
         self.velocity
     }
 
-    /// Writes the motion since the last scan into `out`, every byte of it. `stamp_ns` is the stamp of `scan`, and
-    /// `period_ns` the time from one scan to the next, 0 if it is unknown.
+    /// Writes the motion since the last scan into `out`. Writes every byte of `out`. `stamp_ns` is the stamp of `scan`.
+    /// `period_ns` is the period of the scans, or 0 if it is unknown.
     pub fn update(&mut self, scan: &Scan, stamp_ns: u64, period_ns: u64, out: &mut Motion) {
         *out = Motion::default();
         let elapsed_ns = stamp_ns.saturating_sub(std::mem::replace(&mut self.stamp_ns, stamp_ns));
@@ -175,7 +179,8 @@ impl MotionEstimator {
             }
             None => {
                 if self.velocity != Velocity::default() {
-                    // This scan becomes the reference, and its velocity is unknown.
+                    // This scan becomes the reference scan. The velocity during this scan is unknown, so undo its
+                    // correction.
                     self.velocity = Velocity::default();
                     self.take(scan);
                 }
@@ -187,8 +192,9 @@ impl MotionEstimator {
         }
     }
 
-    /// Corrects the current scan by the velocity of the `first` step, which took the robot `seconds`. Repeats the match
-    /// until velocity and step agree. Returns the position, the step, and the remaining offset of the beams.
+    /// Corrects the current scan by the velocity that follows from the step in `first` and its duration of `seconds`.
+    /// Repeats correction and match until velocity and step agree. Returns the position, the step, and the remaining
+    /// offset of the beams.
     fn correct(
         &mut self,
         scan: &Scan,
@@ -205,8 +211,8 @@ impl MotionEstimator {
             let offset = change.offset(scan);
             let is_again = self.rejected.is_some_and(|rejected| rejected.difference(&measured).is_possible());
             if !change.is_possible() && !is_again {
-                // No robot changes its velocity that fast. Either the step is an error, or a person carried the sensor.
-                // If the next step agrees with this step, this step was right.
+                // No robot changes its velocity so fast. Either the step is an error, or a person has moved the robot.
+                // If the next step has about the same velocity, the velocity is accepted then.
                 self.rejected = Some(measured);
                 return (self.stop_or_continue(scan, odometry, found), offset);
             }
@@ -221,7 +227,7 @@ impl MotionEstimator {
             match self.find(odometry, Some(before.pose)) {
                 Some(again) => found = again,
                 None => {
-                    // The correction was wrong, so use the step without it.
+                    // The corrected scan does not match, so use the step of the uncorrected scan.
                     self.velocity = expected;
                     self.take(scan);
                     return (first, offset);
@@ -230,9 +236,9 @@ impl MotionEstimator {
         }
     }
 
-    /// Decides after a rejected velocity between two cases. If a person carried the sensor, the robot stands. If the
-    /// `found` step is an error, the robot continues as before. The scan fits better with the right velocity, so both
-    /// velocities are tried. Returns the position and the step.
+    /// Decides after a rejected velocity between two cases: a person has carried the robot and it stands now, or the
+    /// robot moves as before. A scan fits better if it is corrected with the right velocity, so this function tries
+    /// both velocities. Returns the position and the step.
     fn stop_or_continue(
         &mut self,
         scan: &Scan,
@@ -255,7 +261,8 @@ impl MotionEstimator {
         self.find(odometry, begin).unwrap_or(found)
     }
 
-    /// Prepares the current scan, corrected as if all beams had been measured at once.
+    /// Prepares `scan` as the current scan. If the velocity distorts it, it is corrected as if all beams had been
+    /// measured at once.
     fn take(&mut self, scan: &Scan) {
         let scan = match self.velocity.distorts(scan, MIN_DISTORTION_M) {
             true => self.undistorted.compute(scan, &self.velocity.of_sensor(&self.pose)),
@@ -265,8 +272,8 @@ impl MotionEstimator {
         self.current.take(&self.pose, scan, &self.lines);
     }
 
-    /// Returns the robot's position and its step, if they are within the limits. The search starts at `begin`, if
-    /// `begin` is known.
+    /// Returns the robot's position and its step, or `None` if they are not within the limits of the settings. The
+    /// search starts at `begin`, or at [`initial_guess`] if `begin` is `None`.
     fn find(&mut self, odometry: &OdometryState, begin: Option<Pose2>) -> Option<(Match, Pose2)> {
         let settings = self.settings;
         let begin =
@@ -276,7 +283,7 @@ impl MotionEstimator {
         (settings.allows(&step) && found.overlap >= settings.min_overlap).then_some((found, step))
     }
 
-    /// Makes the current scan the reference for later ones.
+    /// Makes the current scan the reference scan for later scans.
     fn set_reference(&mut self, odometry: OdometryState) {
         self.current.set_ignored_scans(self.matcher.ignored_scans());
         std::mem::swap(&mut self.reference, &mut self.current);
@@ -299,7 +306,8 @@ fn without_jitter(elapsed_ns: u64, period_ns: u64) -> u64 {
     periods.map_or(elapsed_ns, |periods| periods.saturating_mul(period_ns))
 }
 
-/// Writes `step`, which leads to `found`. The beams may be off by `offset`, because the velocity changes.
+/// Writes the `step` that leads to the position `found`, and the sum of all steps. The beams may be off by `offset`,
+/// because the velocity changes.
 fn write(
     odometry: &OdometryState,
     found: &Match,
@@ -309,8 +317,9 @@ fn write(
     out: &mut Motion,
 ) {
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
-    // Both scans have their own noise. The noise of the reference scan moves both positions by the same amount, so it
-    // counts only once.
+    // The noise of the last scan and the noise of the current scan are independent. The noise of the reference scan
+    // moves both positions by the same amount, so the step does not depend on it. If the last scan is the reference
+    // scan, its noise is the only noise of the step's start.
     let reference_covariance = odometry.extra_covariance.unwrap_or(found.of_reference);
     let mut covariance = covariance::of_step(&found.own, &reference_covariance, &odometry.last, step);
     add_uncertainty(&mut covariance, odometry, found, step, offset);
@@ -336,9 +345,8 @@ fn write(
     }
 }
 
-/// Returns the covariance of the position to which `step` leads, in the frame of the reference scan. Each position in
-/// that frame is found without the other positions, so the covariances of the steps between the positions are not
-/// summed.
+/// Returns the covariance of the position to which `step` leads, in the frame of the reference scan. Every position in
+/// this frame is matched with the reference scan itself, so the covariance does not contain those of earlier steps.
 fn covariance_in_reference(
     odometry: &OdometryState,
     found: &Match,
@@ -359,30 +367,35 @@ fn add_uncertainty(
     step: &Pose2,
     offset: &[f64; 3],
 ) {
-    // Readings that are on no surface contradict this step. They may mean that the robot moved as before.
+    // Readings that are on no surface contradict this step. Perhaps the robot moved as in the previous step instead.
     let other = [step.x - odometry.step.x, step.y - odometry.step.y, step.yaw - odometry.step.yaw];
     covariance::add_outer(covariance, &other, 1.0 - found.overlap);
     covariance::add_outer(covariance, offset, 1.0);
 }
 
-/// Minimum distortion of a scan that is corrected, in meters from its first to its last beam. It is also the change of
-/// the distortion from which the correction is repeated. A repeated correction adds the noise of the last step.
+/// Minimum distortion of a scan that is corrected: the motion from its first to its last beam, in meters.
 const MIN_DISTORTION_M: f64 = 0.003;
+/// Minimum change of the distortion for which the correction is repeated, in meters. It is greater than
+/// [`MIN_DISTORTION_M`], because a repeated correction adds the noise of the last step.
 const MIN_DISTORTION_CHANGE_M: f64 = 0.01;
 /// Maximum number of corrections after a change of velocity. Each correction leaves less than half of the error.
 const MAX_CORRECTIONS: u8 = 4;
-/// Time between two scans from which a velocity is computed, in seconds.
+/// Minimum time between two scans from which a velocity is computed, in seconds.
 const MIN_INTERVAL_S: f64 = 0.005;
+/// Maximum time between two scans from which a velocity is computed, in seconds.
 const MAX_INTERVAL_S: f64 = 1.0;
-/// Distance from the reference scan at which another scan becomes the reference. Up to this distance, the robot sees
-/// the surfaces of the reference scan from about the same side.
+/// Maximum distance from the position of the reference scan. Beyond it, another scan becomes the reference scan. Up to
+/// this distance, the robot sees the surfaces of the reference scan from about the same side.
 const MAX_REFERENCE_DISTANCE_M: f64 = 0.15;
+/// Maximum turn since the reference scan. Beyond it, another scan becomes the reference scan.
 const MAX_REFERENCE_ANGLE_RAD: f64 = 0.15;
-/// Minimum share of readings on surfaces of the reference scan. With less, another scan becomes the reference.
+/// Minimum share of readings on surfaces of the reference scan. With a lower share, another scan becomes the reference
+/// scan.
 const MIN_REFERENCE_OVERLAP: f64 = 0.5;
 
-/// Returns the position at which the matching starts. Corners and lines that may be the same in both scans propose
-/// positions. The position with which most of a few sampled beams agree is returned.
+/// Returns the position at which the matching starts. The candidates are the position after the same step as before,
+/// the last position, and the positions at which corners or lines of both scans coincide. The function samples a few
+/// beams, and returns the candidate with which most of them agree.
 fn initial_guess(
     reference: &PreparedScan,
     current: &PreparedScan,
@@ -407,6 +420,7 @@ fn initial_guess(
     best.pose
 }
 
+/// Search for the position at which the matching starts. `pose` is the best position so far.
 struct Guess<'a> {
     reference: &'a PreparedScan,
     current: &'a PreparedScan,
@@ -427,7 +441,7 @@ impl Guess<'_> {
         self.current.points().len().div_ceil(SAMPLED_BEAMS).max(1)
     }
 
-    /// Returns the number of sampled beams that end on a surface.
+    /// Returns the number of sampled beams that end on a surface of the reference scan if the robot is at `pose`.
     fn score(&self, pose: &Pose2) -> usize {
         let width = MAX_DEVIATIONS * self.reference.noise.hypot(self.current.noise) + EXTRA_DISTANCE_M;
         let fits = |point: &&(f64, f64)| {
@@ -439,7 +453,8 @@ impl Guess<'_> {
         self.current.points().iter().step_by(self.stride()).filter(fits).count()
     }
 
-    /// Makes `pose` the best position, if it is possible and more beams agree with it.
+    /// Makes `pose` the best position, if the settings allow it and more beams agree with it than with the best
+    /// position so far.
     fn try_pose(&mut self, pose: Pose2) {
         let step = self.odometry.last.inverse().then(&pose);
         if !self.settings.allows(&step) || self.tries >= MAX_TRIES {
@@ -452,7 +467,8 @@ impl Guess<'_> {
         }
     }
 
-    /// Tries the positions at which corners coincide. Corners with the same opening may be the same.
+    /// Tries the positions at which a corner of the current scan coincides with a corner of the reference scan. Only
+    /// corners with about the same angle between their lines are compared.
     fn try_corners(&mut self) {
         let (reference, current) = (self.reference, self.current);
         let opening = |view: &PreparedScan, corner: &Corner| {
@@ -476,8 +492,9 @@ impl Guess<'_> {
         }
     }
 
-    /// Tries the positions at which lines coincide. A line defines how far the robot turned, and how far it moved
-    /// across the line.
+    /// Tries the positions at which a line of the current scan coincides with a line of the reference scan. A line
+    /// defines only how far the robot turned, and how far it moved across the line. Along the line, the robot is
+    /// assumed to move as in the previous step.
     fn try_lines(&mut self) {
         let (reference, current) = (self.reference, self.current);
         let expected = self.odometry.last.then(&self.odometry.step);
@@ -487,7 +504,8 @@ impl Guess<'_> {
                 let (alpha, of_other) = (f64::from(line.alpha_rad), f64::from(other.alpha_rad));
                 let yaw = turned(alpha, of_other);
                 let (sin, cos) = of_other.sin_cos();
-                // If the line is behind the robot's center, its normal points the other way.
+                // If the robot's center has moved to the other side of the line, the normal of the line points in the
+                // opposite direction.
                 let is_same_side = (alpha + yaw - of_other).cos() > 0.0;
                 let r = f64::from(if is_same_side { line.r_m } else { -line.r_m });
                 let across = f64::from(other.r_m) - r - (cos * expected.x + sin * expected.y);
@@ -497,19 +515,22 @@ impl Guess<'_> {
     }
 }
 
-/// Returns the turn from one direction of a line to another, less than a quarter turn either way.
+/// Returns the turn from one direction of a line to another direction, at most a quarter turn either way. The opposite
+/// direction of a line is the same direction.
 fn turned(from: f64, to: f64) -> f64 {
     (to - from + FRAC_PI_2).rem_euclid(PI) - FRAC_PI_2
 }
 
-/// Number of beams that are sampled.
+/// Maximum number of beams that are sampled to compare two positions.
 const SAMPLED_BEAMS: usize = 48;
 /// Maximum number of positions that are tried.
 const MAX_TRIES: usize = 64;
-/// Maximum distance of a beam's end from a surface: a number of standard deviations plus a distance in meters.
+/// Maximum distance between the end of a sampled beam and its surface, in standard deviations. [`EXTRA_DISTANCE_M`] is
+/// added to it.
 const MAX_DEVIATIONS: f64 = 3.0;
+/// Additional distance between the end of a sampled beam and its surface, in meters.
 const EXTRA_DISTANCE_M: f64 = 0.01;
-/// Maximum difference between the openings of two equal corners: 5 degrees.
+/// Maximum difference between the angles of two corners that may be the same corner: 5 degrees.
 const MAX_OPENING_DIFFERENCE_RAD: f64 = 0.09;
-/// Minimum number of beams of a line whose direction is reliable.
+/// Minimum number of beams of a line whose direction is accurate enough for a guess.
 const MIN_LINE_BEAMS: u16 = 10;

@@ -1,7 +1,7 @@
 //! Search for rare values in arrays with one value for each beam.
 
-/// Returns the index of the first value from `from` on for which `is_it` is true. These values are rare, so whole
-/// blocks are compared, without a branch for each value.
+/// Returns the index of the first value from `from` on for which `is_it` is true, or `None` if there is no such value.
+/// Such values must be rare: the search tests whole blocks of values, without a branch for each value.
 pub(crate) fn position<T: Copy>(values: &[T], from: usize, is_it: impl Fn(T) -> bool) -> Option<usize> {
     const BLOCK: usize = 32;
     let mut begin = from;

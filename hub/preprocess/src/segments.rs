@@ -1,5 +1,6 @@
-//! Segments of neighboring foreground beams, with their positions and whether they are supported. A distant edge
-//! flickers in single beams, but an object is seen by several beams, or for longer.
+//! Segments of neighboring foreground beams, with their positions and whether they are supported. At a distant edge,
+//! single beams flicker between background and foreground. An object is in several beams, or in several scans, which
+//! supports its segment.
 
 use std::f64::consts::{PI, TAU};
 use std::mem::{replace, take};
@@ -10,16 +11,16 @@ use crate::directions::{Directions, exact_angle};
 
 /// Cuts the foreground of one sensor into segments.
 ///
-/// Points are computed in 64-bit floating point and rounded to mm. The four basic operations and the square root of
-/// this format have the same results on every machine.
+/// Points are computed in 64-bit floating point and rounded to mm. The results are the same on every machine, because
+/// only the four basic operations and the square root are used, which are exactly defined for this format.
 pub struct Segmenter {
     pose: Pose,
     directions: Directions,
-    /// Limits for two neighboring beams.
+    /// Limits for two neighboring beams of a scan without exact angles.
     step_limit: StepLimit,
-    /// Foreground of the previous scan.
+    /// Foreground points of the previous scan.
     previous: Points,
-    /// Buffer for the foreground of the current scan.
+    /// Buffer for the foreground points of the current scan.
     scratch: Points,
 }
 
@@ -30,21 +31,22 @@ struct Points {
     count: usize,
 }
 
-/// Limits that follow from the angle between two points.
+/// Values that are computed once from the angle between two beams (the step), to decide whether two points belong to
+/// one segment.
 #[derive(Clone, Copy, Default)]
 struct StepLimit {
-    /// 2 (1 - cos step), of the law of cosines.
+    /// The term 2 (1 - cos step) of the law of cosines.
     spread: f64,
     /// Maximum distance between two points of one surface, in mm per mm of range.
     slope: f64,
 }
 
-/// Minimum angle at which a surface is seen as one segment.
+/// Minimum angle between a beam and a surface at which the surface becomes one segment.
 const MIN_INCIDENCE_DEG: f64 = 10.0;
-/// Additional distance for the noise of two ranges, in mm.
+/// Distance in mm by which two points of one segment may be farther apart because of the noise of their ranges.
 const NOISE_MARGIN_MM: f64 = 15.0;
-/// Maximum distance of a single beam's point from a point of the previous scan that supports it, in mm. It is the
-/// distance that a person at 3 m/s runs in one revolution of a scanner at 10 Hz.
+/// Maximum distance between the point of a single beam and a point of the previous scan that supports it, in mm. A
+/// person at 3 m/s runs this distance in one revolution of a scanner at 10 Hz.
 const MAX_SUPPORT_DISTANCE_MM: f64 = 300.0;
 
 impl Segmenter {
@@ -61,11 +63,12 @@ impl Segmenter {
         }
     }
 
-    /// Fills in the segments of `foreground`, which was computed from `scan`. Writes every byte of them.
+    /// Fills in the segments of `foreground`, which was computed from `scan`. Writes every byte of the segments.
     ///
-    /// Two neighboring foreground beams belong to one segment if their points are as near to each other as two points
-    /// of a surface at an angle of 10 degrees to the beam. The limit is r sin(step) / sin(10 degrees - step) + 15 mm,
-    /// where r is the range of the first beam. If the scan has exact angles, step is the difference between them.
+    /// Two neighboring foreground beams belong to one segment if their points are no farther apart than two points of a
+    /// surface at an angle of 10 degrees to the beam. The limit is r sin(step) / sin(10 degrees - step) + 15 mm, where
+    /// r is the range of the first beam and step is the angle between the beams. If the scan has exact angles, step is
+    /// computed from them.
     ///
     /// A segment is supported if it has several beams, or if its point is at most 0.3 m from a foreground point of the
     /// previous scan that was passed to this function or to [`pass`](Self::pass).
@@ -110,8 +113,8 @@ impl Segmenter {
         self.scratch = replace(&mut self.previous, now);
     }
 
-    /// Stores the points of a `foreground` that support the next segments, like [`update`](Self::update), but finds no
-    /// segments.
+    /// Stores the points of `foreground`, which support segments of the next scan, but does not find segments. Call
+    /// this function instead of [`update`](Self::update) if the segments of `scan` are not needed.
     pub fn pass(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.fit(scan);
         let mut now = take(&mut self.scratch);
@@ -122,8 +125,8 @@ impl Segmenter {
         self.scratch = replace(&mut self.previous, now);
     }
 
-    /// Calls `visit` with each beam whose bit is set: its index, its range in device units, its range in mm with its
-    /// exact angle if it has one, and its point.
+    /// Calls `visit` for each beam whose bit is set. The arguments are the index of the beam, its range in device
+    /// units, its range in mm together with its exact angle (if there is one), and its point.
     fn each_point(
         &self,
         scan: &Scan,
@@ -149,8 +152,8 @@ impl Segmenter {
         }
     }
 
-    /// Returns whether a point at `next_mm` on the next beam, with this `exact` angle, belongs to the same segment as
-    /// the last point of `open`.
+    /// Returns whether a point belongs to the same segment as the last point of `open`. The point is on the next beam,
+    /// at the range `next_mm`, and at the angle `exact` if the scan has exact angles.
     fn joins(&self, open: &OpenSegment, (next_mm, exact): (f64, Option<f64>)) -> bool {
         let range_mm = open.last_mm;
         let step =
@@ -168,7 +171,7 @@ impl Segmenter {
 }
 
 impl Points {
-    /// Adds a point. There is memory for one point of each beam.
+    /// Adds a point. Each beam must add at most one point, because there is no memory for more.
     fn add(&mut self, point: (f64, f64)) {
         if let Some(slot) = self.points.get_mut(self.count) {
             *slot = point;
@@ -176,7 +179,7 @@ impl Points {
         }
     }
 
-    /// Returns whether one of the points is near enough to `point` to support it.
+    /// Returns whether one of these points is near enough to `point` to support it.
     fn has_near(&self, point: (f64, f64)) -> bool {
         let square_distance = |other: &(f64, f64)| {
             let (dx, dy) = (other.0 - point.0, other.1 - point.1);
@@ -189,19 +192,20 @@ impl Points {
 }
 
 impl StepLimit {
-    /// Returns the limits for two points that are `radians` apart in either direction, perhaps plus whole revolutions.
+    /// Returns the limits for two beams with a step of `radians`. The step may be negative, and may include whole
+    /// revolutions.
     fn of(radians: f64) -> StepLimit {
         let step = ((radians + PI).rem_euclid(TAU) - PI).abs();
         let spread = 2.0 * (1.0 - step.cos());
-        // No scanner has steps of 10 degrees or more. With a step of 10 degrees or more, only the margin for noise can
-        // join two points.
+        // The formula is not defined for a step of 10 degrees or more, which no scanner has. With such a step, only the
+        // margin for noise can join two points.
         let flattest = MIN_INCIDENCE_DEG.to_radians();
         let slope = if step < flattest { step.sin() / (flattest - step).sin() } else { 0.0 };
         StepLimit { spread, slope }
     }
 }
 
-/// A segment that may get more beams.
+/// A segment to which more beams may be added.
 struct OpenSegment {
     first: usize,
     last: usize,

@@ -1,5 +1,5 @@
-//! Motion of a robot in the plane: its velocity, transforms between its positions, and the correction of scans, because
-//! a moving robot measures each beam from another position.
+//! Motion of a robot in the plane: its velocity, transforms between its positions, and the correction of scans. Scans
+//! are corrected because a moving robot measures each beam from another position.
 
 use std::f64::consts::{PI, TAU};
 
@@ -17,18 +17,18 @@ pub struct Velocity {
 }
 
 impl Velocity {
-    /// Returns the constant velocity that leads to the position `x`, `y`, `yaw` within `seconds`, in meters and
-    /// radians.
+    /// Returns the constant velocity that leads to the position `x`, `y` (in meters) and the direction `yaw` (in
+    /// radians) within `seconds`, in the frame of the start.
     pub fn of_step((x, y, yaw): (f64, f64, f64), seconds: f64) -> Velocity {
-        // The step is the chord of an arc.
+        // A robot with a constant velocity moves on an arc, and the step is the chord of this arc.
         let half = yaw / 2.0;
         let arc = if half.abs() > MIN_ARC_RAD { half / half.sin() } else { 1.0 } / seconds;
         let (sin, cos) = half.sin_cos();
         Velocity { x: arc * (cos * x + sin * y), y: arc * (cos * y - sin * x), yaw: yaw / seconds }
     }
 
-    /// Returns the position after `seconds`, or before if they are negative, in the frame of the start: x and y in
-    /// meters, yaw in radians.
+    /// Returns the position after `seconds` in the frame of the start: x and y in meters, yaw in radians. A negative
+    /// number of seconds gives the position before the start.
     #[inline]
     pub fn position(&self, seconds: f64) -> (f64, f64, f64) {
         let half = self.yaw * seconds / 2.0;
@@ -53,36 +53,36 @@ impl Velocity {
         Velocity { x: other.x - self.x, y: other.y - self.y, yaw: other.yaw - self.yaw }
     }
 
-    /// Moves this velocity a part of the way toward the `measured` velocity, which has noise.
+    /// Changes this velocity by [`FILTER_GAIN`] of its difference from the `measured` velocity, which has noise.
     pub(crate) fn approach(&mut self, measured: &Velocity) {
         let Velocity { x, y, yaw } = self.difference(measured);
         (self.x, self.y, self.yaw) =
             (self.x + FILTER_GAIN * x, self.y + FILTER_GAIN * y, self.yaw + FILTER_GAIN * yaw);
     }
 
-    /// Returns whether a robot with this velocity moves by more than `limit_m`, or turns by more than a fifth of that
-    /// number in radians, while `scan` is measured.
+    /// Returns whether a robot with this velocity, while `scan` is measured, moves by more than `limit_m` meters or
+    /// turns by so much that walls at [`WALL_DISTANCE_M`] move by more than `limit_m`.
     pub(crate) fn distorts(&self, scan: &Scan, limit_m: f64) -> bool {
         let [first_s, last_s] = times(scan);
         let span_s = last_s - first_s;
         span_s * self.x.hypot(self.y) > limit_m || span_s * self.yaw.abs() > limit_m / WALL_DISTANCE_M
     }
 
-    /// Returns whether a robot can change its velocity by this difference from one scan to the next.
+    /// Returns whether a robot can change its velocity by this difference of velocities from one scan to the next.
     pub(crate) fn is_possible(&self) -> bool {
         self.x.hypot(self.y) < MAX_CHANGE_M_S && self.yaw.abs() < MAX_CHANGE_RAD_S
     }
 
-    /// Returns the mean offset of the beams of `scan`, if the beams were corrected by a velocity that differs from the
-    /// true velocity by this difference.
+    /// Returns the mean offset of the beams of `scan` in x, y and yaw, if the beams were corrected by a velocity that
+    /// differs from the true velocity by this difference.
     pub(crate) fn offset(&self, scan: &Scan) -> [f64; 3] {
         let [first_s, last_s] = times(scan);
         [self.x, self.y, self.yaw].map(|speed| speed * (first_s + last_s) / 2.0)
     }
 }
 
-/// Position and direction in some frame: meters, and radians counterclockwise from -pi to pi. It is also the transform
-/// from the frame of a robot at this pose into that frame.
+/// Position and direction of a robot in a frame: meters, and radians counterclockwise from -pi to pi. It is also the
+/// transform from the robot's own frame into that frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose2 {
     /// Position ahead, in meters.
@@ -108,7 +108,7 @@ impl Pose2 {
         Pose2 { x, y, yaw: (yaw + PI).rem_euclid(TAU) - PI, cos, sin }
     }
 
-    /// Returns this transform followed by `next`, which is given in the frame of this one.
+    /// Returns the pose in the outer frame of a robot that is at the pose `next` in the frame of this pose.
     pub fn then(&self, next: &Pose2) -> Pose2 {
         let (x, y) = self.point((next.x, next.y));
         Pose2::new(x, y, self.yaw + next.yaw)
@@ -120,19 +120,19 @@ impl Pose2 {
         Pose2::new(x, y, -self.yaw)
     }
 
-    /// Transforms a point out of this frame.
+    /// Transforms a point from the frame of this pose to the outer frame.
     #[inline]
     pub fn point(&self, (x, y): (f64, f64)) -> (f64, f64) {
         (self.x + self.cos * x - self.sin * y, self.y + self.sin * x + self.cos * y)
     }
 
-    /// Transforms a direction out of this frame.
+    /// Transforms a direction from the frame of this pose to the outer frame.
     #[inline]
     pub(crate) fn turned(&self, (x, y): (f64, f64)) -> (f64, f64) {
         (self.cos * x - self.sin * y, self.sin * x + self.cos * y)
     }
 
-    /// Transforms a direction into this frame.
+    /// Transforms a direction from the outer frame to the frame of this pose.
     pub(crate) fn turned_back(&self, (x, y): (f64, f64)) -> (f64, f64) {
         (self.cos * x + self.sin * y, self.cos * y - self.sin * x)
     }
@@ -150,8 +150,8 @@ impl UndistortedScan {
         UndistortedScan { words: vec![ScanWord::default(); beams + Scan::words(0)].into(), beams }
     }
 
-    /// Computes `scan` without the distortion by a sensor that moves with `velocity`. Beams have exact angles. If two
-    /// beams were measured in the same direction, the nearer one remains.
+    /// Computes `scan` without the distortion that a sensor with this `velocity` causes. The beams of the result have
+    /// exact angles. If two points fall on the same beam, the nearer one remains.
     pub(crate) fn compute(&mut self, scan: &Scan, velocity: &Velocity) -> &Scan {
         let count = scan.beams().min(self.beams);
         let [first_s, last_s] = times(scan);
@@ -191,7 +191,8 @@ impl UndistortedScan {
                 usize::try_from(beam).ok().filter(|beam| *beam < count)
             };
             let Some(mut beam) = beam_of(slot).filter(|_| range >= 1.0) else { continue };
-            // Points of consecutive revolutions may fall on the same beams, and leave neighboring beams empty.
+            // Points of consecutive revolutions may fall on the same beam, and leave a neighboring beam empty. Use the
+            // neighboring beam then.
             if arrays.ranges[beam] != NO_RETURN {
                 let other = (f64::from(arrays.angles[beam]) - first_angle) / scan.step;
                 let next = beam_of(if slot > other { slot.round() + 1.0 } else { slot.round() - 1.0 });
@@ -208,29 +209,32 @@ impl UndistortedScan {
 /// Returns the times of the first and the last beam, in seconds after the stamp of `scan`.
 pub(crate) fn times(scan: &Scan) -> [f64; 2] {
     let last = scan.beams().saturating_sub(1);
-    // If a scan takes several revolutions, the last beam is not measured last.
+    // If a scan takes several revolutions, the last beam need not be the one that is measured last.
     let turns = usize::from(scan.turns.max(1));
     let of_turns = (last + 1).saturating_sub(turns)..=last;
     let latest = of_turns.map(|beam| scan.beam_ns(beam)).max().unwrap_or(0);
     [scan.beam_ns(0), latest].map(|time| 1e-9 * time as f64)
 }
 
-/// Returns whether the last of `beams` beams, `step` radians apart, is a neighbor of the first one.
+/// Returns whether `beams` beams that are `step` radians apart form a whole revolution, so that the last beam is a
+/// neighbor of the first one.
 pub(crate) fn is_whole(beams: usize, step: f64) -> bool {
     beams as f64 + 1.5 >= TAU / step.abs()
 }
 
 /// Value of a beam without a reading in an undistorted scan.
 const NO_RETURN: u16 = u16::MAX;
-/// Limit for half of the turn of a step, in radians. Below the limit, the arc counts as its chord.
+/// Half of the turn of a step, in radians, below which the arc counts as a straight line.
 const MIN_ARC_RAD: f64 = 1e-6;
-/// Part of the way to the measured velocity, per scan.
+/// Share of the difference from the measured velocity by which the filtered velocity changes at each scan.
 const FILTER_GAIN: f64 = 0.3;
-/// Maximum change of velocity from one scan to the next, in m/s. Robots brake and turn less hard.
+/// Maximum change of velocity from one scan to the next, in m/s. Even if a robot brakes, its velocity changes less.
 const MAX_CHANGE_M_S: f64 = 2.0;
+/// Maximum change of the speed of a turn from one scan to the next, in rad/s. The speed of a real robot's turn changes
+/// less.
 const MAX_CHANGE_RAD_S: f64 = 6.0;
-/// Assumed distance of walls in meters, for comparing turns with motion. A turn by 1 rad moves the points of a wall at
-/// this distance by this distance.
+/// Assumed distance of walls in meters, for comparing turns with motion. A turn by an angle in radians moves the points
+/// of such a wall by the angle times this distance.
 const WALL_DISTANCE_M: f64 = 5.0;
 
 #[cfg(test)]
@@ -247,7 +251,7 @@ mod tests {
             let velocity = Velocity::of_step(step, seconds);
             let again = velocity.position(seconds);
             let half = velocity.position(seconds / 2.0);
-            // The second half begins where the first one ends.
+            // The second half of the motion begins where the first half ends.
             let (sin, cos) = half.2.sin_cos();
             let twice =
                 (half.0 + cos * half.0 - sin * half.1, half.1 + sin * half.0 + cos * half.1, 2.0 * half.2);

@@ -1,9 +1,9 @@
-//! Check whether something is near the robot: the minimal distance check of the paper, with circles around the robot's
-//! center.
+//! Check whether something is near the robot: the minimal distance check of the paper. A zone is a circle around the
+//! robot's center.
 //!
-//! A [`ZoneChecker`] counts violations over scans. Its table has the ranges of each beam that lie inside each circle.
-//! The table is computed once per layout of the scans, in floating point and millimeters. A scan then needs only
-//! comparisons of integers in device units.
+//! A [`ZoneChecker`] compares each scan with a table, and counts violations over several scans. For each beam and each
+//! circle, the table has the ranges that lie inside the circle. The table is computed once per layout of the scans, in
+//! floating point and millimeters. To check a scan, it is then sufficient to compare integers in device units.
 
 use std::f64::consts::TAU;
 
@@ -14,42 +14,43 @@ use crate::search::position;
 /// Sector of the sensor's view in which parts of the robot itself are visible.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sector {
-    /// First sensor angle in 1/1000 degree, as in the scan: 0 ahead, counter-clockwise.
+    /// First angle of the sector in 1/1000 degree, as in the scan: 0 ahead, counter-clockwise.
     pub from_mdeg: i32,
-    /// Last sensor angle in 1/1000 degree, inclusive.
+    /// Last angle of the sector in 1/1000 degree, inclusive.
     pub to_mdeg: i32,
-    /// Minimum range. Nearer readings are the robot's own body and are ignored.
+    /// Range at which the robot's own body ends. Nearer readings are ignored.
     pub range_mm: u16,
 }
 
-/// Maximum number of sectors of a sensor. More are ignored.
+/// Maximum number of sectors of a sensor. Further sectors are ignored.
 pub const MAX_SECTORS: usize = 64;
 
 /// Settings of a check.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// Radii of the circles, the largest first, at most [`MAX_ZONES`]. More are ignored.
+    /// Radii of the circles, the largest first. Only the first [`MAX_ZONES`] are used.
     pub radii_mm: Vec<u16>,
-    /// The robot's own body. Where sectors overlap, the largest range counts.
+    /// The robot's own body. Where sectors overlap, the one with the largest range is used.
     pub body_mask: Vec<Sector>,
     /// Distance in mm by which a circle is extended along every beam that meets it.
     pub margin_mm: u16,
     /// Number of beams that must end inside a zone for a scan to violate the zone. 0 counts as 1.
     pub min_beams: u16,
-    /// Number of consecutive scans that must violate a zone; 0 counts as 1.
+    /// Number of consecutive scans that must violate a zone before the verdict reports the violation. 0 counts as 1.
     pub min_scans: u16,
     /// Maximum share of invalid beams among the beams through the largest circle. If the share is larger, the verdict
     /// is unknown.
     pub max_invalid: f64,
-    /// Whether an object between the sensor and the near side of a circle counts as outside, if the sensor is outside
-    /// the circle.
+    /// Whether an object between the sensor and the near side of a circle counts as outside the circle. It matters only
+    /// if the sensor is outside the circle. If it is not set, such an object counts as inside.
     pub exact: bool,
-    /// Whether a beam without a return has met nothing. Otherwise, it is invalid.
+    /// Whether a beam without a return counts as a beam that has met nothing. Otherwise, the beam is invalid.
     pub no_return_is_far: bool,
 }
 
 impl Default for Settings {
-    /// Returns 1 m and 0.6 m (paper III.B.1), one beam, one scan. A tenth of the beams may be invalid.
+    /// Returns circles of 1 m and 0.6 m (paper III.B.1). One beam in one scan is a violation, and a tenth of the beams
+    /// may be invalid.
     fn default() -> Self {
         Settings {
             radii_mm: vec![1000, 600],
@@ -75,32 +76,33 @@ pub struct Warning {
     pub distance_mm: u32,
 }
 
-/// Compares scans of one sensor with its circles.
+/// Compares the scans of one sensor with circles around the robot's center.
 ///
-/// Rules for cases that the paper leaves open:
-/// - Until `min_scans` scans have been seen since the start, a silence, a scan with too many invalid beams or a change
-///   of the sensor's layout, the absence of a violation proves nothing. The verdict is unknown then, because clear
-///   would be a guess.
+/// The paper leaves some cases open. These rules apply to them:
+/// - The count of scans restarts after a silence, after a scan with too many invalid beams, and after a change of the
+///   sensor's layout. Until it reaches `min_scans`, the absence of a violation proves nothing, so the verdict is
+///   unknown. Clear would be a guess.
 /// - A beam is relevant if it can have a reading inside the largest circle and outside the robot's own body. The
-///   reading is in the scan's units and below the scan's codes. All other beams count neither as invalid nor in the
-///   total.
-/// - If a violation takes more beams than are relevant, no zone can ever be violated, so the verdict is unknown.
-///   Examples are an empty scan, a check without circles, a pose that is not finite, and a sensor that looks past the
+///   reading must be possible in the scan's units, below the scan's codes. The share of invalid beams is computed only
+///   from relevant beams.
+/// - If fewer than `min_beams` beams are relevant, no zone can ever be violated, so the verdict is unknown. Examples
+///   are an empty scan, a check without circles, a pose that is not finite, and a sensor whose beams all miss the
 ///   largest circle.
 pub struct ZoneChecker {
     min_beams: u16,
     min_scans: u16,
     table: Table,
-    /// Number of scans since the start, a silence, a scan with too many invalid beams or a change of the layout.
+    /// Number of scans since the start, a silence, a scan with too many invalid beams or a change of the layout,
+    /// whichever was last.
     scan_count: u16,
-    /// For each circle, number of consecutive scans in which enough beams met something inside.
+    /// For each circle, the number of consecutive scans in which enough beams ended inside the circle.
     streaks: [u16; MAX_ZONES],
-    /// Whether scans may be older than their stamps.
+    /// Whether scans may be older than their stamps, because they come from a backlog.
     is_backlogged: bool,
 }
 
 impl ZoneChecker {
-    /// Creates a check for a sensor at `pose` with at most `beams` beams. More are ignored.
+    /// Creates a check for a sensor at `pose` with at most `beams` beams. Further beams are ignored.
     pub fn new(pose: Pose, settings: &Settings, beams: usize) -> ZoneChecker {
         ZoneChecker {
             min_beams: settings.min_beams.max(1),
@@ -112,8 +114,8 @@ impl ZoneChecker {
         }
     }
 
-    /// Writes the result for `scan` into `out`, every byte of it. A table is computed only for the first scan of a
-    /// layout.
+    /// Writes the result for `scan` into `out`. Writes every byte of `out`. If the layout of the scans has changed, the
+    /// table is computed first.
     pub fn update(&mut self, scan: &Scan, out: &mut Zones) {
         let layout = Layout::of(scan, self.table.max_beams());
         if self.table.layout != layout {
@@ -136,15 +138,16 @@ impl ZoneChecker {
         out.invalid_beams = invalid;
         self.write_circles(&inside, out);
         if !is_valid {
-            // The scan may have ended the run of violations of a zone although the object is still there.
+            // The invalid beams may have ended a run of violations although the object is still inside the zone.
             self.scan_count = 0;
         }
     }
 
-    /// Checks an incomplete scan of `count` beams with the unit `unit_um`. Both values must be the same as in the last
-    /// scan. `ranges` are the first ranges of the scan. For a scan with exact `angles`, `ranges` are all ranges, and a
-    /// nearer point may still replace one of them. Returns the zone that the scan violates if no more points arrive, or
-    /// `None`. Before the first complete scan, the result is `None`.
+    /// Checks an incomplete scan of `count` beams with the unit `unit_um`. `ranges` are the first ranges of the scan.
+    /// For a scan with exact `angles`, `ranges` are all ranges, and a nearer point may still replace one of them.
+    ///
+    /// Returns a warning if the points that have arrived violate a zone. Otherwise returns `None`. Also returns `None`
+    /// before the first complete scan, and if `count` or `unit_um` differs from the last complete scan.
     pub fn check_partial(
         &mut self,
         count: usize,
@@ -167,16 +170,16 @@ impl ZoneChecker {
         Some(Warning { verdict, beam, distance_mm })
     }
 
-    /// Writes the result of missing scans into `out`: only the circles are known. Afterwards, the count of consecutive
-    /// scans restarts.
+    /// Writes the result for a silence into `out`: only the circles are known. The count of scans and the counts of
+    /// violations restart.
     pub fn write_stale(&mut self, out: &mut Zones) {
         self.reset();
         *out = Zones { count: self.table.circles as u8, ..Zones::unknown() };
         self.write_circles(&[0; MAX_ZONES], out);
     }
 
-    /// Sets whether scans may be older than their stamps from now on. For a scan that may be older, points inside the
-    /// smallest circle count. Without these points, the verdict is unknown.
+    /// Sets whether scans may be older than their stamps from now on. The verdict on such a scan is stop if the
+    /// smallest circle is violated, and unknown otherwise.
     pub fn set_backlogged(&mut self, is_backlogged: bool) {
         self.is_backlogged = is_backlogged;
     }
@@ -186,7 +189,7 @@ impl ZoneChecker {
         self.table.effective_beams
     }
 
-    /// Returns whether fewer beams are relevant than a violation takes. The verdict is then always unknown.
+    /// Returns whether fewer beams are relevant than a violation needs. The verdict is then always unknown.
     pub fn is_blind(&self) -> bool {
         self.effective_beams() < self.min_beams
     }
@@ -261,7 +264,7 @@ struct Table {
     pose: Pose,
     /// Number of circles, at most [`MAX_ZONES`].
     circles: usize,
-    /// Radii of the circles; 0 for unused ones.
+    /// Radii of the circles; 0 for unused circles.
     radii_mm: [u16; MAX_ZONES],
     /// The robot's own body: the sectors, and their number.
     sectors: ([Sector; MAX_SECTORS], usize),
@@ -271,24 +274,24 @@ struct Table {
     max_invalid: f64,
 
     layout: Layout,
-    /// Valid readings inside each circle, beyond the robot's own body.
+    /// For each circle and each beam, the valid readings inside the circle and beyond the robot's own body.
     inside: [Spans; MAX_ZONES],
     nearest: Nearest,
-    /// 1 for relevant beams, which can have a reading inside the largest circle; 0 for the others.
+    /// 1 for each relevant beam, which can have a reading inside the largest circle; 0 for each other beam.
     is_effective: Box<[u16]>,
     /// Number of relevant beams.
     effective_beams: u16,
-    /// Maximum number of invalid beams with which the verdict does not become unknown.
+    /// Maximum number of invalid beams. With more, the verdict is unknown.
     max_invalid_beams: u16,
 }
 
 /// Points of a scan inside the circles.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct ZoneHits {
-    /// Number of beams that met something inside each circle.
+    /// Number of beams that end inside each circle.
     inside: [u16; MAX_ZONES],
-    /// Beam whose point is nearest to the robot's center, and its distance in mm, rounded down. The first one of
-    /// several.
+    /// Beam whose point is nearest to the robot's center, and the distance of this point in mm, rounded down. If
+    /// several points are equally near, the first beam.
     nearest: Option<(u16, u32)>,
 }
 
@@ -360,15 +363,16 @@ impl Table {
         let own = in_units(self.body_mask_mm(angle) as f64, self.layout.unit_mm());
         let (sx, sy) = self.sensor_mm();
         if (sx, sy) == (0.0, 0.0) && self.pose.yaw_rad.is_finite() {
-            // At the robot's center, all beams are equal, and scans with exact angles need this function often.
+            // If the sensor is at the robot's center, `q` is 0 for all beams. Skip the sine and cosine, because scans
+            // with exact angles need this function often.
             return Beam { q: 0.0, own };
         }
         let (ux, uy) = self.pose.direction(angle);
         Beam { q: sx * ux + sy * uy, own }
     }
 
-    /// Returns the readings of `beam` inside circle `zone`, as a range: the first reading, and the reading after the
-    /// last.
+    /// Returns the readings of `beam` inside the circle with the index `zone`: the first reading, and the reading after
+    /// the last one, in device units.
     fn span(&self, beam: &Beam, zone: usize) -> (u64, u64) {
         let unit_mm = self.layout.unit_mm();
         let (sx, sy) = self.sensor_mm();
@@ -377,8 +381,8 @@ impl Table {
         (from.max(beam.own), in_units(hi_mm as f64, unit_mm))
     }
 
-    /// Returns the number of relevant beams without a reading. A beam that was not measured counts if it lies in a gap
-    /// of more than two spacings between points. The sensor's own points have a spacing of `spacing` radians.
+    /// Returns the number of relevant beams without a reading. The scanner's own points are `spacing` radians apart. A
+    /// beam that was not measured counts only if the measured beams on both sides are more than two spacings apart.
     fn invalid_beams(&self, ranges: &[u16], spacing: f32) -> u16 {
         let Layout { valid_to, no_return, beyond, .. } = self.layout;
         let is_invalid = |value: u16| {
@@ -394,7 +398,8 @@ impl Table {
         if is_complete { invalid } else { invalid - self.unmeasured_between(ranges, spacing) }
     }
 
-    /// Returns the number of relevant beams that were not measured, but have measured beams near enough on both sides.
+    /// Returns the number of relevant beams that were not measured, but lie between two measured beams that are at most
+    /// two spacings apart.
     fn unmeasured_between(&self, ranges: &[u16], spacing: f32) -> u16 {
         let is_measured = |value: &u16| *value != Scan::NOT_MEASURED;
         let (Some(first), Some(last)) =
@@ -424,8 +429,8 @@ impl Table {
         unmeasured
     }
 
-    /// Returns the points inside the circles for `ranges`, which are the first ranges of a scan with the table's
-    /// layout. If there are exact `angles`, the points are computed from these angles.
+    /// Returns the points inside the circles. `ranges` are the first ranges of a scan with the table's layout. If there
+    /// are exact `angles`, the points are computed from these angles.
     fn hits(&mut self, ranges: &[u16], angles: &[f32]) -> ZoneHits {
         if !angles.is_empty() {
             return self.exact_hits(ranges, angles);
@@ -444,7 +449,8 @@ impl Table {
         let radius_mm = self.radii_mm[..self.circles].iter().max().map_or(0.0, |&radius| f64::from(radius));
         let reach = (sensor_distance_mm + radius_mm + f64::from(self.margin_mm) + 1.0) / unit_mm;
         let (mut zone_hits, mut best) = (ZoneHits::default(), (f64::INFINITY, None));
-        // A greater range than `limit` is neither inside a circle nor nearer than the nearest point so far.
+        // A point at a greater range than `limit` is outside all circles, and farther away than the nearest point so
+        // far.
         let mut limit = self.layout.valid_to;
         let mut next = 0;
         while let Some(i) = position(ranges, next, |range| range <= limit)
@@ -474,8 +480,8 @@ impl Table {
         zone_hits
     }
 
-    /// Returns the beam of a point, and the distance of the point in mm. `square` is the square of the point's distance
-    /// minus the square of the sensor's distance, in device units.
+    /// Returns the beam of a point, and the distance of the point from the robot's center in mm. `square` is the square
+    /// of this distance minus the square of the sensor's distance from the center, in device units.
     fn at_distance(&self, beam: usize, square: f64) -> (u16, u32) {
         let unit_mm = self.layout.unit_mm();
         let (sx, sy) = self.sensor_mm();
@@ -483,12 +489,12 @@ impl Table {
         (beam as u16, floor(distance_mm) as u32)
     }
 
-    /// Returns the sensor's position in the robot's frame.
+    /// Returns the sensor's position in the robot's frame, in mm.
     fn sensor_mm(&self) -> (f64, f64) {
         (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m)
     }
 
-    /// Returns the range at which the robot's own body ends along a beam.
+    /// Returns the range in mm at which the robot's own body ends along the beam at `angle`; 0 if there is no body.
     fn body_mask_mm(&self, angle: f64) -> u64 {
         let sectors = &self.sectors.0[..self.sectors.1];
         if sectors.is_empty() {
@@ -499,9 +505,9 @@ impl Table {
         sectors.iter().filter(is_in_sector).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
     }
 
-    /// Returns the ranges in mm between which a beam is inside a circle; 0 and 0 if it never is. `q` is s.u and
-    /// `square` is |s|^2, with the sensor's position s and the beam's direction u (a line through a circle; paper
-    /// III.B.1).
+    /// Returns the two ranges in mm between which a beam is inside a circle; 0 and 0 if the beam misses the circle. `q`
+    /// is s.u and `square` is |s|^2, where s is the sensor's position and u is the beam's direction (a line through a
+    /// circle; paper III.B.1).
     fn chord_mm(&self, q: f64, square: f64, radius_mm: f64) -> (u64, u64) {
         let outside = square - radius_mm * radius_mm;
         let disc = q * q - outside;
@@ -518,10 +524,11 @@ impl Table {
     }
 }
 
-/// Beam with precomputed values: `q` is s.u in mm, with the sensor's position s and the beam's direction u, and `own`
-/// is the range at which the robot's own body ends, in device units.
+/// Values of a beam from which its readings inside a circle are computed.
 struct Beam {
+    /// The scalar product s.u in mm, where s is the sensor's position and u is the beam's direction.
     q: f64,
+    /// Range at which the robot's own body ends, in device units.
     own: u64,
 }
 
@@ -530,11 +537,12 @@ fn in_units(mm: f64, unit_mm: f64) -> u64 {
     ceil(mm / unit_mm) as u64
 }
 
-/// Maximum rounding error of a quotient.
+/// Maximum relative rounding error of a quotient.
 const ROUNDING_ERROR: f64 = 1e-6;
 
-/// Tolerance in mm within which a value counts as a whole number. Rounding never makes a verdict clear. But an object
-/// exactly on a circle is outside, regardless of the errors of sine and cosine.
+/// Difference from a whole number within which a value counts as this whole number. Apart from that, values are rounded
+/// so that rounding never makes a verdict clear. With the tolerance, an object exactly on a circle is always outside,
+/// whatever the errors of sine and cosine are.
 const ROUNDING_MM: f64 = 1e-6;
 
 fn floor(value: f64) -> f64 {
@@ -545,17 +553,19 @@ fn ceil(value: f64) -> f64 {
     if (value - value.round()).abs() <= ROUNDING_MM { value.round() } else { value.ceil() }
 }
 
-/// Search for the reading that is nearest to the robot's center, exact to the millimeter (rounded down). Only a few
-/// beams are computed one by one.
+/// Search for the reading that is nearest to the robot's center, exact to the millimeter (rounded down). The distances
+/// of single beams are computed only for the few blocks of beams that can contain the nearest reading.
 struct Nearest {
-    /// Readings that count: valid ones beyond the robot's own body.
+    /// Readings that count: valid readings beyond the robot's own body.
     measurable: Spans,
-    /// Twice s.u for each beam, in device units, with the sensor's position s and the beam's direction u.
+    /// For each beam, twice the scalar product s.u in device units, where s is the sensor's position and u is the
+    /// beam's direction.
     twice_q: Box<[f64]>,
-    /// Values for each block of beams: the minimum of `twice_q`, the shortest reading that counts in the current scan,
-    /// and the lower bound of the readings' squared distances.
+    /// For each block of beams, the minimum of `twice_q`.
     min_twice_q: Box<[f64]>,
+    /// For each block of beams, a lower bound of the readings that count in the current scan.
     shortest: Box<[u16]>,
+    /// For each block of beams, a lower bound of the values that [`Nearest::find`] compares.
     bounds: Box<[f64]>,
 }
 
@@ -571,15 +581,16 @@ impl Nearest {
         }
     }
 
-    /// Completes the blocks. Call it when all beams are set.
+    /// Computes `min_twice_q`. Call this function when `twice_q` is set for all beams.
     fn finish(&mut self) {
         for (block, min_value) in self.twice_q.chunks(BLOCK_LEN).zip(&mut self.min_twice_q) {
             *min_value = block.iter().copied().fold(f64::INFINITY, f64::min);
         }
     }
 
-    /// Returns the beam whose point is nearest to the center, the first beam if there are several, and the square of
-    /// the point's distance minus the square of the sensor's distance: r^2 + 2qr, in device units.
+    /// Returns the beam whose point is nearest to the center, or the first of several such beams. Also returns the
+    /// square of the point's distance from the center minus the square of the sensor's distance. This value is
+    /// r^2 + 2qr in device units, where r is the range and q is s.u.
     fn find(&mut self, ranges: &[u16]) -> Option<(usize, f64)> {
         self.bound(ranges);
         let bounds = &self.bounds[..ranges.len().div_ceil(BLOCK_LEN)];
@@ -595,7 +606,7 @@ impl Nearest {
         (beam != usize::MAX).then_some((beam, square))
     }
 
-    /// Computes the lower bound of each block, from its shortest reading that counts and its most favorable beam.
+    /// Computes `shortest` and `bounds` of each block. A bound follows from `shortest` and `min_twice_q` of its block.
     fn bound(&mut self, ranges: &[u16]) {
         let (blocks, rest) = ranges.as_chunks::<BLOCK_LEN>();
         let (from_blocks, from_rest) = self.measurable.from[..ranges.len()].as_chunks::<BLOCK_LEN>();
@@ -618,7 +629,8 @@ impl Nearest {
         }
     }
 
-    /// Returns `nearest`, or a reading of the block that is nearer.
+    /// Returns the nearest reading of the block, or `nearest` if no reading of the block is nearer. Both are pairs of
+    /// r^2 + 2qr and the index of the beam.
     fn nearer(&self, block: usize, ranges: &[u16], nearest: (f64, usize)) -> (f64, usize) {
         let mut nearest = nearest;
         for (i, &range) in ranges.iter().enumerate().skip(block * BLOCK_LEN).take(BLOCK_LEN) {
@@ -633,16 +645,19 @@ impl Nearest {
     }
 }
 
-/// Number of beams of a block: so few that their directions differ little, and so many that there are few blocks.
+/// Number of beams of a block. It is so low that the directions of a block's beams differ little, and so high that
+/// there are few blocks.
 const BLOCK_LEN: usize = 32;
 
-/// Ranges `from..from + len` of each beam in device units. One comparison of integers tests a value.
+/// For each beam, the readings that count: those in `from..from + len`, in device units. A single comparison of
+/// integers tests a reading.
 #[derive(Clone)]
 struct Spans {
-    /// Minimum value; the maximum of the type for beams that do not exist.
+    /// Minimum reading that counts; the maximum of the type for beams that do not exist.
     from: Box<[u16]>,
+    /// Number of readings that count.
     len: Box<[u16]>,
-    /// For each block of beams, the lowest value from which no value counts.
+    /// For each block of beams, the reading from which on no reading counts.
     ends: Box<[u16]>,
 }
 
@@ -660,33 +675,33 @@ impl Spans {
         self.ends.fill(0);
     }
 
-    /// Sets the values of beam `i` that count: from `from`, below `below`.
+    /// Sets which readings of beam `i` count: those from `from` on that are less than `below`.
     fn set(&mut self, i: usize, from: u64, below: u16) {
         self.from[i] = from.min(u64::from(u16::MAX)) as u16;
         self.len[i] = below.saturating_sub(self.from[i]);
         self.ends[i / BLOCK_LEN] = self.ends[i / BLOCK_LEN].max(below);
     }
 
-    /// Returns whether the value counts.
+    /// Returns whether the reading `value` of beam `i` counts.
     #[inline]
     fn has(&self, i: usize, value: u16) -> bool {
         value.wrapping_sub(self.from[i]) < self.len[i]
     }
 
-    /// Returns whether a value of beam `i` can count.
+    /// Returns whether any reading of beam `i` can count.
     fn has_any(&self, i: usize) -> bool {
         self.len[i] > 0
     }
 
-    /// Returns the number of beams whose value counts. `shortest` has the shortest value of each block that may count.
-    /// In most rooms, most blocks can be skipped, because their shortest value is too long.
+    /// Returns the number of beams whose reading counts. For each block, `shortest` has a lower bound of the readings
+    /// that may count. In most rooms, most blocks can be skipped, because even this bound is too long.
     fn count(&self, ranges: &[u16], shortest: &[u16]) -> u16 {
         let may_count = |&block: &usize| shortest[block] < self.ends[block];
         let blocks = (0..ranges.len().div_ceil(BLOCK_LEN).min(self.ends.len())).filter(may_count);
         blocks.map(|block| self.count_in(block, ranges)).sum()
     }
 
-    /// Returns the number of beams of a block whose value counts.
+    /// Returns the number of beams of a block whose reading counts.
     #[inline(never)]
     fn count_in(&self, block: usize, ranges: &[u16]) -> u16 {
         let beams = block * BLOCK_LEN..ranges.len().min((block + 1) * BLOCK_LEN);

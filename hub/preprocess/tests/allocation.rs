@@ -1,4 +1,4 @@
-//! Test that no processor allocates memory, either for a scan or for the first scan of another layout.
+//! Test that no processor allocates memory when it processes a scan, not even for the first scan of another layout.
 
 #[path = "../../daemon/tests/counting/mod.rs"]
 mod counting;

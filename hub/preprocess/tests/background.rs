@@ -1,6 +1,6 @@
-//! Tests of background models. Each method is compared with a slow, independent version in floating point, beam by
-//! beam. The comparison uses many surroundings, with commands between the scans. Other tests cover shapes, commands,
-//! saved models, and scans that no scanner sends.
+//! Tests of background models. Each method is compared beam by beam with a slow, independent version in floating point.
+//! The comparison uses scans of many random surroundings, with commands such as a reset between the scans. Other tests
+//! are about shapes of scans, commands, saved models, and scans that no scanner sends.
 
 mod surroundings;
 
@@ -12,12 +12,12 @@ use surroundings::{
     ranges_mm, reading_mm, unit_mm,
 };
 
-/// State of one beam in the paper's method.
+/// State of one beam in the slow version of the paper's method.
 #[derive(Clone, Default)]
 struct Beam {
     /// Background in mm; 0 if it is unknown.
     background_mm: f64,
-    /// Consecutive readings in mm that belong to one candidate.
+    /// Consecutive readings in mm that agree with one candidate.
     run_mm: Vec<f64>,
 }
 
@@ -181,12 +181,12 @@ fn paper_method_matches_the_reference() {
     );
 }
 
-/// Surface that a beam has met.
+/// Surface that a beam has met, in the slow version of the method `multi`.
 #[derive(Clone, Copy, Debug)]
 struct SlowSurface {
     /// Range in device units.
     range: f64,
-    /// Weight in scans.
+    /// Weight of the surface, in scans in which the beam met it.
     weight: f64,
 }
 
@@ -203,16 +203,16 @@ const NO_SURFACE: SlowSurface = SlowSurface { range: -FAR_RANGE, weight: 0.0 };
 struct ReferenceMulti {
     settings: Settings,
     beams: Vec<[SlowSurface; 3]>,
-    /// Number of consecutive readings without a return, for each beam. Scans in which the beam had no reading do not
-    /// count.
+    /// For each beam, the number of consecutive scans without a return. Scans in which the beam had no reading are
+    /// ignored.
     lost_scans: Vec<u32>,
-    /// Foreground beams of the last scan with their readings. `reported` contains the foreground beams that counted as
-    /// objects.
+    /// Foreground beams of the last scan, with their readings.
     foreground: Vec<(usize, f64)>,
+    /// Those beams in `foreground` that counted as objects.
     reported: Vec<(usize, f64)>,
     is_frozen: bool,
     is_fresh: bool,
-    /// Number of scans after which a surface is background, as of the last scan.
+    /// Number of scans until a surface is background, as computed for the last scan.
     scans: f64,
 }
 
@@ -310,7 +310,7 @@ impl ReferenceMulti {
         }
     }
 
-    /// Removes foreground that does not count as an object.
+    /// Changes the class of foreground beams that do not count as an object to unknown.
     fn remove_unconfirmed(
         &mut self,
         classes: &mut [Class],
@@ -323,7 +323,7 @@ impl ReferenceMulti {
             .map(|i| (i, readings[i].expect("only readings are in the foreground")))
             .collect();
         let mut reported = Vec::new();
-        // Two beams belong to one run if all beams between them have codes.
+        // Two foreground beams belong to one run if all beams between them have codes.
         let codes = |from: usize, to: usize| (from + 1..to).all(|i| readings[i].is_none());
         for run in foreground.chunk_by(|a, b| codes(a.0, b.0)) {
             let (first, last) = (run[0].0, run[run.len() - 1].0);
@@ -422,7 +422,7 @@ fn multi_method_matches_the_reference() {
             let known: Vec<f64> =
                 slow.beams[i].iter().filter(|s| s.is_background(slow.scans)).map(|s| s.range).collect();
             let at = if range == Background::FAR { FAR_RANGE } else { f64::from(range) };
-            // A surface at range 0 cannot be distinguished from an unknown one.
+            // A background at range 0 cannot be distinguished from an unknown background.
             assert!(known.contains(&at) || range == 0 && known.is_empty(), "beam {i}: {range}, {known:?}");
         }
     }
@@ -446,14 +446,14 @@ fn background_of(model: &BackgroundModel) -> Box<Background> {
     background
 }
 
-/// Returns `model` with its head changed by `change`.
+/// Returns a copy of `model` whose head `change` has changed.
 fn with(model: &Background, change: impl FnOnce(&mut BackgroundHead)) -> Box<Background> {
     let mut other = model.boxed();
     change(&mut other);
     other
 }
 
-/// Passes `scan` to `model` this number of times, and returns the last foreground.
+/// Passes `scan` to `model`, `times` times, and returns the last foreground.
 fn update_times(model: &mut BackgroundModel, scan: &Scan, times: usize) -> Box<Foreground> {
     let mut out = Foreground::of(scan.beams());
     (0..times).for_each(|_| model.update(scan, &mut out));
@@ -528,7 +528,7 @@ fn saved_model_is_loaded_only_if_the_layout_fits() {
         let out = update_times(&mut early, &scan(361, 1, 1_000), 1);
         assert_eq!((out.generation, out.beams), (1, 360));
 
-        // The loaded background does not match the first scan, so the model is reset.
+        // If the loaded background does not match the first scan, the model is reset.
         let mut wrong = model(method);
         wrong.load(&saved).unwrap();
         assert_eq!(update_times(&mut wrong, &scan(181, 1, 1_000), 1).generation, 2);
@@ -569,8 +569,8 @@ fn learns_background_from_the_first_scan() {
     }
 }
 
-/// A wall that returns 15 % of the beams is learned in 20 s. A person who stands there for 5 s is not learned, even if
-/// some beams that meet the person have no return.
+/// A wall that returns only 15 % of the beams becomes background in 20 s. A person who stands for 5 s in a room without
+/// returns does not become background, even if some beams that meet the person have no return.
 #[test]
 fn learns_faint_wall_but_not_a_standing_person() {
     let mut random = fastrand::Rng::with_seed(3);
@@ -615,7 +615,8 @@ fn no_scan_or_model_causes_a_panic() {
                 Segmenter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() }, MAX_TEST_BEAMS);
             let mut bytes = [0_u8; Scan::len(MAX_TEST_BEAMS + 20, 1)];
             for _ in 0..40 {
-                // Most scans keep the shape of the previous one, however unusual it is.
+                // Most scans keep the shape of the previous scan, however unusual it is, because only the bytes after
+                // the head change.
                 let from = if random.u8(..8) == 0 { 0 } else { Scan::HEAD };
                 random.fill(&mut bytes[from..]);
                 let scan = Scan::of_bytes(&bytes);

@@ -1,4 +1,4 @@
-//! Tests of line features: comparison with a slow version that tries all cuts, scans with known lines, and input
+//! Tests of line features: a comparison with a slow version that tries all cuts, scans with known lines, and scans
 //! without information.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
@@ -29,13 +29,13 @@ fn scan(head: ScanHead, range: impl Fn(f64) -> Option<f64>) -> Box<Scan> {
     Scan::of(head, &(0..head.count.into()).map(unit).collect::<Vec<_>>())
 }
 
-/// Returns a normally distributed number with deviation 1, by the method of Box and Muller.
+/// Returns a normally distributed number with standard deviation 1, by the method of Box and Muller.
 fn normal(random: &mut Rng) -> f64 {
     (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
 }
 
 fn find(scan: &Scan, pose: Pose, settings: Settings) -> Box<Lines> {
-    // Fill the payload with garbage, which must not remain.
+    // Fill the payload with garbage before, because no garbage must remain in the result.
     let mut lines = Box::new(Lines::default());
     bytemuck::bytes_of_mut(&mut *lines).fill(0xA5);
     LineFinder::new(pose, settings, scan.beams()).update(scan, &mut lines);
@@ -50,7 +50,8 @@ fn room(angle: f64) -> f64 {
     x.min(y)
 }
 
-/// Returns a scan of a room that is drawn from `seed`. The room is a star of 6 to 20 corners, and the noise is 20 mm.
+/// Returns a scan of a room that is drawn from `seed`. The walls are a polygon around the sensor with 6 to 20 corners
+/// at random distances. The noise is 20 mm.
 fn star(seed: u64, beams: usize) -> Box<Scan> {
     let mut random = Rng::with_seed(seed);
     let corners = random.usize(6..=20);
@@ -70,8 +71,8 @@ fn star(seed: u64, beams: usize) -> Box<Scan> {
     scan(head, |angle| ranges.get(((angle + PI) / head.step).round() as usize).copied())
 }
 
-/// Returns the minimum sum of squares along the beams for one line. The slow search varies the distance and the
-/// direction of the line step by step.
+/// Returns the minimum, over all lines, of the sum of squared distances along the beams between points and line. The
+/// slow search varies the distance and the direction of the line step by step.
 fn slow_line(beams: &[(f64, f64)]) -> f64 {
     let error = |r: f64, alpha: f64| -> f64 {
         let off = |&(angle, range): &(f64, f64)| {
@@ -113,7 +114,7 @@ fn slow_line(beams: &[(f64, f64)]) -> f64 {
     best
 }
 
-/// Returns the minimum sum of squares for `count` lines, by trying all cuts.
+/// Returns the minimum sum of squared distances for `count` lines. The function tries all cuts.
 fn slow_error(scan: &Scan, count: usize) -> f64 {
     let beams: Vec<(f64, f64)> =
         (0..scan.beams()).filter_map(|i| Some((scan.angle(i), scan.distance_m(i)?))).collect();
@@ -133,7 +134,8 @@ fn slow_error(scan: &Scan, count: usize) -> f64 {
     best[n]
 }
 
-/// Returns the sum of squares of the found lines, and the number of beams on them.
+/// Returns the sum of squared distances along the beams from the lines that were found, and the number of beams on
+/// these lines.
 fn fit_error(scan: &Scan, lines: &Lines) -> (f64, usize) {
     let (mut sum, mut beams) = (0.0, 0);
     for line in lines.lines() {
@@ -175,7 +177,7 @@ fn is_near(one: f32, two: f64, tolerance: f64) -> bool {
     (f64::from(one) - two).abs() < tolerance
 }
 
-/// The found lines are the walls with their ends and corners, for any mount of the sensor.
+/// The lines are the walls of the room, with the right ends and corners, for any pose of the sensor on the robot.
 #[test]
 fn room_has_four_lines_and_its_corners() {
     let mut random = Rng::with_seed(3);
@@ -192,7 +194,7 @@ fn room_has_four_lines_and_its_corners() {
         });
         for refine in [false, true] {
             let lines = find(&scan, pose, Settings { refine, ..Settings::default() });
-            // Beam 0 cuts the wall that it meets.
+            // The wall that beam 0 meets is two lines, one at the start of the scan and one at the end.
             assert_eq!((lines.lines().len(), lines.corners().len()), (5, 4), "{lines:?}");
             assert!(is_near(lines.noise_m, 0.01, 0.002), "{}", lines.noise_m);
             assert!(usize::from(lines.on_lines) >= 98 * count / 100 && usize::from(lines.readings) == count);
@@ -215,7 +217,7 @@ fn room_has_four_lines_and_its_corners() {
     }
 }
 
-/// The reported deviations equal the measured deviations of lines over many scans.
+/// The standard deviations that a line reports agree with the measured deviations of the lines of many scans.
 #[test]
 fn reported_deviations_match_measured_deviations() {
     let mut random = Rng::with_seed(4);
@@ -233,7 +235,7 @@ fn reported_deviations_match_measured_deviations() {
             found.push(*line);
         }
     }
-    // The criterion lets noise split a line in about one of N scans, where N is the number of beams.
+    // With this criterion, noise splits a line in about one of N scans, where N is the number of beams.
     assert!(found.len() >= 390, "noise alone makes no lines: one line in {} of 400", found.len());
     let count = found.len() as f64;
     let spread = |of: fn(&Line) -> f32| {
@@ -247,7 +249,8 @@ fn reported_deviations_match_measured_deviations() {
     assert!((0.8..1.25).contains(&(reported_alpha / alpha)), "{reported_alpha}, and it is {alpha}");
 }
 
-/// The points of a scanner with exact angles do not lie on the grid of beams.
+/// If a scan has exact angles, its points are not in the directions of the beams at equal steps. The lines must be
+/// computed from the exact angles.
 #[test]
 fn lines_use_exact_angles() {
     let mut random = Rng::with_seed(5);
@@ -297,7 +300,7 @@ fn assert_sound(lines: &Lines, scan: &Scan, settings: &Settings) {
     assert!(unused.iter().all(|line| *line == Line::default()));
 }
 
-/// Input without information yields no line, or a line with large deviations.
+/// A scan without information has no line, or only lines with large standard deviations.
 #[test]
 fn uninformative_input_yields_no_certain_line() {
     let mut random = Rng::with_seed(6);
@@ -317,7 +320,7 @@ fn uninformative_input_yields_no_certain_line() {
         assert_sound(&lines, &scan, &settings);
         assert_eq!(lines.count, 0, "{lines:?}");
     }
-    // If there is only noise, no line is more certain than its points.
+    // If the ranges are only noise, the lines have large standard deviations.
     for refine in [false, true] {
         let settings = Settings { refine, ..settings };
         let ranges: Vec<f64> = (0..361).map(|_| 3.0 + random.f64()).collect();
@@ -327,14 +330,14 @@ fn uninformative_input_yields_no_certain_line() {
         assert!(lines.noise_m > 0.1, "{}", lines.noise_m);
         assert!(lines.lines().iter().all(|line| line.sd_r_m > 0.02), "{lines:?}");
     }
-    // All ranges are equal. Short lines approximate such a circle.
+    // If all ranges are equal, short lines approximate the circle.
     let circle = scan(wide, |_| Some(5.0));
     let lines = find(&circle, Pose::default(), settings);
     assert_sound(&lines, &circle, &settings);
     assert!(lines.lines().iter().all(|line| (f64::from(line.r_m) - 5.0).abs() < 0.02), "{lines:?}");
 }
 
-/// No scan causes a panic, and all results are plausible.
+/// No scan, whatever its content, causes a panic, and all results are plausible.
 #[test]
 fn no_scan_causes_a_panic() {
     for seed in 0..3000 {

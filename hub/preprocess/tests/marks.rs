@@ -1,4 +1,5 @@
-//! Tests of marks. They are compared with a slow version that follows the definition of marks in floating point.
+//! Tests of marks. The marks are compared with those of a slow version that follows the definition of marks, in
+//! floating point.
 
 mod scans;
 
@@ -14,7 +15,8 @@ struct Hit {
     intensity: u8,
 }
 
-/// Returns the beams that can belong to marks, in groups. A group ends where beams are too far apart or ranges jump.
+/// Returns the beams that can belong to marks, one group for each mark. A group ends if the next beam is too far away,
+/// or if its range differs too much.
 fn groups(scan: &Scan, settings: Settings) -> Vec<Vec<Hit>> {
     let mut groups: Vec<Vec<Hit>> = Vec::new();
     for beam in 0..usize::from(scan.count) {
@@ -53,7 +55,7 @@ fn assert_mark(scan: &Scan, group: &[Hit], mark: &Mark) {
     assert_eq!(mark.edge == 1, first == 0 || last == usize::from(scan.count) - 1);
 }
 
-/// Fills `scan` with a wall that has steps and a few reflectors.
+/// Fills `scan` with the ranges of a wall that has steps, and the intensities of a few reflectors.
 fn fill(random: &mut Rng, scan: &mut Scan) {
     let max = scan.no_return;
     let unit_mm = scans::unit_mm(scan) as u16;
@@ -109,7 +111,7 @@ fn marks_match_the_reference() {
     assert!(marks > 10_000 && edges > 100 && overflows > 10, "{marks} {edges} {overflows}");
 }
 
-/// Returns a scan of eleven beams at 1 m, one degree apart.
+/// Returns a scan of eleven beams at 1 m, one degree apart. `intensities` has pairs of beam and intensity.
 fn scan_with_intensities(intensities: &[(usize, u8)]) -> Box<Scan> {
     let head = ScanHead { intensity_bits: 3, ..ScanHead::lms(11, -1000, 1000, 1, 13) };
     let mut scan = Scan::of(head, &[1000; 11]);
@@ -132,7 +134,7 @@ fn half_units_are_rounded_up() {
     scan.step = 0.001_f64.to_radians();
     let mark = find(&scan, Settings::default()).mark_array[0];
     assert_eq!((mark.angle_mdeg, mark.range_dmm), (-1000 + 5, 10_005));
-    // The centers are 8/3 and 7/3 degrees after the first beam.
+    // The centers of the two marks are 8/3 and 7/3 degrees after the first beam, which is at -1 degree.
     let angle = |beams| find(&scan_with_intensities(beams), Settings::default()).mark_array[0].angle_mdeg;
     assert_eq!((angle(&[(2, 1), (3, 2)]), angle(&[(2, 2), (3, 1)])), (1667, 1333));
 }
@@ -183,7 +185,7 @@ fn intensities_above_a_level_are_marks() {
     assert_eq!((found.count, found.is_available(), found.lacks_level()), (1, true, false));
     let mark = found.mark_array[0];
     assert_eq!((mark.first_beam, mark.last_beam, mark.peak, mark.weight), (2, 4, 255, 240 + 255 + 241));
-    // `level` does not apply to reflector levels, and `min_level` does not apply to intensities.
+    // `level` has no effect on scanners with reflector levels, and `min_level` has no effect on other scanners.
     let lms = find(&scan_with_intensities(&[(4, 3)]), Settings { level: Some(5), ..Settings::PAPER });
     assert_eq!((lms.count, lms.is_available(), lms.lacks_level()), (1, true, false));
     assert_eq!(find(&scan_with_intensities(&[(4, 3)]), settings).count, 0);
@@ -198,7 +200,7 @@ fn mark_position_uses_exact_angles() {
     let near = |angle: f64, expected: f64| assert!((angle - expected).abs() < 1e-3, "{angle} {expected}");
     near(angle([0, 0, 100, 100, 0, 0, 0, 0]), -45.0 * (2.5 + 0.125));
     near(angle([200, 0, 0, 0, 0, 0, 0, 0]), -45.0 * 0.125);
-    // Behind the scanner, the angle continues from the other side, as for sectors.
+    // Behind the scanner, at 180 degrees, the angle of a mark changes its sign, as for sectors.
     near(angle([0, 0, 0, 0, 200, 0, 0, 0]), 360.0 - 45.0 * 4.125);
     near(angle([0, 0, 0, 0, 0, 0, 0, 200]), 360.0 - 45.0 * 7.125);
 }

@@ -1,6 +1,6 @@
-//! Tests of the motion of a robot. They include a comparison with a slow version that tries all pairs of points, and
-//! drives with known motion. They also include surroundings in which some directions are undetermined, and input
-//! without information.
+//! Tests of the motion of a robot. The motion is compared with a slow version that tries all pairs of points, and with
+//! the true motion of simulated drives. Other tests have surroundings that do not define the position in some
+//! directions, and scans without information.
 
 mod drives;
 
@@ -11,7 +11,7 @@ use fastrand::Rng;
 use scanhub_preprocess::motion::{MotionEstimator, Pose2, Settings};
 use scanhub_schema::{ArrayFlags, Motion, MotionMethod, Pose, Scan};
 
-/// Returns the motion for each of `scans`. The old content of a payload must not remain in it.
+/// Returns the motion for each of `scans`. The payloads contain garbage before, which must not remain.
 fn estimate_motion(scans: &[Box<Scan>], pose: Pose, settings: Settings) -> Vec<Motion> {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
     let mut estimator = MotionEstimator::new(pose, settings, beams);
@@ -34,15 +34,17 @@ fn pose_difference(one: &Pose2, other: &Pose2) -> (f64, f64) {
     (between.x.hypot(between.y), between.yaw.abs())
 }
 
-/// Returns the position of `now` relative to `reference`, calculated from all pairs of points. Each point is pulled to
-/// the line through the nearest point and its neighbors. Near points have more weight than far ones.
+/// Returns the position of `now` relative to `reference`, calculated from all pairs of points. Each point of `now` is
+/// pulled to the line through the nearest point of `reference` and the neighbors of this point. Points near their line
+/// have more weight than points far from it.
 fn reference_match(reference: &Scan, now: &Scan) -> Pose2 {
     let points = |scan: &Scan| -> Vec<(f64, f64)> {
         let of = |i: usize| Some((scan.distance_m(i)?, scan.angle(i)));
         (0..scan.beams()).filter_map(of).map(|(r, a)| (r * a.cos(), r * a.sin())).collect()
     };
     let (kept, now) = (points(reference), points(now));
-    // The line goes through seven neighbors. Its normal is the direction of minimum spread, found by trying many.
+    // The line goes through the point and three neighbors on each side. The normal of the line is the direction of
+    // minimum spread. It is found by trying many directions.
     let normal_at = |at: usize| -> (f64, f64) {
         let near = &kept[at.saturating_sub(3)..(at + 4).min(kept.len())];
         let spread = |angle: f64| -> f64 {
@@ -137,8 +139,8 @@ fn steps_sum_to_the_pose_with_right_covariance() {
     assert!((0.5..2.0).contains(&mean), "in variances: {mean}");
 }
 
-/// Returns the square of `error` in standard deviations of `covariance`. The mean of this square is 3 if the covariance
-/// is right. The square is NaN if the covariance is not positive definite.
+/// Returns the squared length of `error` in standard deviations of `covariance`. If the covariance is right, the mean
+/// of this square over many errors is 3. The square is NaN if the covariance is not positive definite.
 fn normalized(error: [f64; 3], covariance: &[f32; 9]) -> f64 {
     let (mut lower, mut whitened) = ([[0.0; 3]; 3], [0.0; 3]);
     for i in 0..3 {
@@ -153,8 +155,8 @@ fn normalized(error: [f64; 3], covariance: &[f32; 9]) -> f64 {
     whitened.iter().map(|value| value * value).sum()
 }
 
-/// Returns two values about the errors of the sums at the end of `drives`: the mean of their squares, in variances; and
-/// the share of the errors within two standard deviations.
+/// Compares the sum of all steps at the end of each drive with the true position. Returns the mean of the squared
+/// errors in variances, and the share of the errors that are within two standard deviations.
 fn errors_of_sums(drives: impl Iterator<Item = Drive>) -> (f64, f64) {
     let (mut squares, mut within, mut count) = (0.0, 0.0, 0.0);
     for drive in drives {
@@ -173,8 +175,8 @@ fn errors_of_sums(drives: impl Iterator<Item = Drive>) -> (f64, f64) {
     (squares / count, within / count)
 }
 
-/// If a robot does not move, all its positions are found on the same scan, so the covariance does not grow with the
-/// number of steps.
+/// If a robot does not move, all its scans are matched with the same reference scan, so the covariance of its position
+/// does not grow with the number of steps.
 #[test]
 fn pose_covariance_is_right_while_standing() {
     let standing = (1000..1100).map(|seed| {
@@ -245,8 +247,8 @@ fn corrects_scans_of_an_already_moving_robot() {
 }
 
 /// A robot turns at 120 degrees/s, and moves by 0.2 m between two scans. In one case, a person has carried the robot,
-/// and it does not move now. In the other case, the robot was pushed and still turns. Both scans must be corrected with
-/// the right velocity, because the later steps use them.
+/// and it does not move now. In the other case, the robot was pushed and still turns. In both cases, the scan must be
+/// corrected with the right velocity, because later steps are computed from this scan.
 #[test]
 fn carried_or_pushed_robot_uses_the_right_velocity() {
     for deg_per_s in [0.0, 120.0] {
@@ -365,8 +367,8 @@ fn people_do_not_bias_the_motion() {
 fn uninformative_scans_are_refused_or_uncertain() {
     let drive = Drive::through_a_room(2, 361, 60, 0.01);
     let mut random = Rng::with_seed(9);
-    // In scans 10 to 19, nine of ten beams have no return. In scans 20 to 29, no beam has one. In scans 30 to 39, the
-    // robot is lifted, and ranges are random.
+    // In scans 10 to 19, nine of ten beams have no return. In scans 20 to 29, no beam has a return. In scans 30 to 39,
+    // the robot is lifted, and the ranges are random.
     let mut scans = drive.scans.clone();
     for (at, scan) in scans.iter_mut().enumerate() {
         let no_return = scan.no_return;
@@ -402,8 +404,8 @@ fn uninformative_scans_are_refused_or_uncertain() {
     assert!((42..60).all(|at| found[at].has_step()), "it goes on");
 }
 
-/// Scan 30 sees only one wall. The next step includes the uncertainty of that position, and from then on the sum
-/// includes it.
+/// In scan 30, only one wall is visible, so the position along this wall is unknown. The covariance of the next step
+/// includes this uncertainty, and the covariance of the sum includes it from then on.
 #[test]
 fn step_from_an_uncertain_position_is_uncertain() {
     let mut open = 0;

@@ -1,6 +1,7 @@
-//! Tests of the map of a moving scanner. They include a comparison with a slow version whose map does not scroll,
-//! drives with known people, and positions without information. Other tests check lines, motion and map for a lifted
-//! robot, for few returns, and for a clock that jumps. The processors must not panic, and no result may be too certain.
+//! Tests of the map of a moving scanner: a comparison with a slow version whose map does not scroll, drives among
+//! people whose positions are known, and positions without information. Other tests run lines, motion and map together,
+//! with a lifted robot, with few returns, and with a clock that jumps. The processors must not panic, and must not
+//! report a wrong result as certain.
 
 mod drives;
 
@@ -25,7 +26,7 @@ const MAP_SETTINGS: Settings = Settings {
     no_return_is_far: None,
 };
 
-/// Returns the motion of a robot at `pose`.
+/// Returns the payload with which the motion of a robot at `pose` is reported.
 fn motion_at(pose: &Pose2, is_first: bool) -> Motion {
     let method = if is_first { MotionMethod::First } else { MotionMethod::Both };
     Motion { x_m: pose.x, y_m: pose.y, yaw_rad: pose.yaw, method: method as u8, ..Motion::default() }
@@ -40,7 +41,7 @@ fn velocity(drive: &Drive, number: usize) -> Velocity {
 /// Slow version of the method, with a map of unlimited size.
 #[derive(Default)]
 struct ReferenceModel {
-    /// `hits` and `free` of each square.
+    /// For each square, `hits` and `free` as in a cell of the map.
     squares: HashMap<(i32, i32), (i32, i32)>,
 }
 
@@ -53,7 +54,7 @@ impl ReferenceModel {
         self.squares.get(&(x + dx, y + dy)).copied().unwrap_or_default()
     }
 
-    /// Returns the class of each beam before short runs are filtered, and adds the scan to the map.
+    /// Returns the class of each beam without the filter of short runs, and adds the scan to the map.
     fn update(&mut self, pose: &Pose2, velocity: &Velocity, scan: &Scan) -> Vec<Class> {
         let neighbors =
             |reach: i32| (-reach..=reach).flat_map(move |dx| (-reach..=reach).map(move |dy| (dx, dy)));
@@ -120,7 +121,7 @@ fn classes_match_the_reference() {
             model.set_motion(&Pose::default(), &motion_at(place, number == 0), &velocity);
             model.update(scan, &mut out);
             for (one, other) in model.classes().iter().zip(&expected) {
-                // The filter of runs changes foreground of short runs to unknown. This version does not do that.
+                // The model changes foreground in short runs to unknown. The slow version does not have this filter.
                 let is_same = one == other || (*one, *other) == (Class::Unknown, Class::Foreground);
                 same += usize::from(is_same);
                 foreground += usize::from(*one == Class::Foreground && is_same);
@@ -133,8 +134,8 @@ fn classes_match_the_reference() {
     }
 }
 
-/// Returns three numbers of beams from scan `from` on: beams that met people and are foreground, beams that met people
-/// and are not foreground, and beams that are foreground and met no person.
+/// Returns three counts of beams from scan `from` on: beams that met people and are foreground, beams that met people
+/// but are not foreground, and beams that are foreground but met no person.
 fn count_moving(drive: &Drive, from: usize) -> (usize, usize, usize) {
     let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), 361);
     let mut model = BackgroundModel::new(Settings { scans: None, ..MAP_SETTINGS }, 361);
@@ -166,7 +167,7 @@ fn distinguishes_walkers_from_a_driving_robot() {
     }
 }
 
-/// A beam meets the leg of a chair in only some of the scans.
+/// Legs of chairs become background, although beams meet such a thin leg in only some of the scans.
 #[test]
 fn chair_legs_are_static_while_people_walk() {
     for seed in 200..203 {
@@ -229,7 +230,7 @@ fn shows_the_static_scene_as_background() {
     };
     let count = (0..361).filter(near).count();
     assert!(count > 300, "{count} of 361, those along walls aside");
-    // A background from a single position is not a map.
+    // Loading a background has no effect, because a background that was measured from a single position is not a map.
     let generation = model.generation();
     model.load(&shown).unwrap();
     model.update(scan, &mut out);
@@ -260,7 +261,7 @@ fn no_pose_or_scan_causes_a_panic() {
     }
 }
 
-/// Number of scans of an LMS in ten seconds. The default depends on the duration of a scan.
+/// Settings with the number of scans of an LMS in ten seconds. The default would depend on the times in the scans.
 const TEN_SECONDS: Settings = Settings { scans: Some(375), ..MAP_SETTINGS };
 
 /// All results of a scan.
@@ -291,7 +292,7 @@ fn process_all(scans: &[Box<Scan>]) -> Vec<ScanResult> {
     scans.iter().map(|scan| &**scan).enumerate().map(process).collect()
 }
 
-/// Returns the largest error of the step's three numbers, in reported standard deviations.
+/// Returns the largest error of the three numbers of the step, in the standard deviations that `motion` reports.
 fn deviations(truth: &Pose2, motion: &Motion) -> f64 {
     let off = [
         f64::from(motion.dx_m) - truth.x,
@@ -302,7 +303,7 @@ fn deviations(truth: &Pose2, motion: &Motion) -> f64 {
     off.into_iter().enumerate().map(of).fold(0.0, f64::max)
 }
 
-/// Replaces each range by the result of `change` for its beam and range.
+/// Replaces each valid range by the result of `change`, which receives the index of the beam and the range.
 fn change_ranges(scan: &mut Scan, mut change: impl FnMut(usize, f64) -> f64) {
     let valid_to = scan.valid_to;
     for (i, range) in scan.arrays().ranges.iter_mut().enumerate().filter(|(_, range)| **range <= valid_to) {
@@ -331,7 +332,7 @@ fn lifting_the_scanner_is_refused_or_uncertain() {
                     assert!(off < 5.0, "{place}, scan {at}: off by {off} deviations, {:?}", result.motion);
                 }
                 assert!(results[..20].iter().all(|result| result.foreground == 0), "{place}");
-                // If the ranges are very different, the step must be refused, not just uncertain.
+                // If the ranges are very different, the step must be refused. An uncertain step is not sufficient.
                 if (factor - 1.0_f64).abs() > 0.3 {
                     for at in [20, 30] {
                         assert_eq!(results[at].motion.method(), MotionMethod::Refused, "{place}, scan {at}");
@@ -345,7 +346,7 @@ fn lifting_the_scanner_is_refused_or_uncertain() {
     }
 }
 
-/// One beam in ten has a return, which is too few to detect motion.
+/// Only one beam in ten has a return. These are too few beams to detect moving objects.
 #[test]
 fn scans_with_few_returns_have_no_foreground() {
     let mut random = Rng::with_seed(9);
@@ -376,7 +377,7 @@ fn scans_with_few_returns_have_no_foreground() {
     }
 }
 
-/// If the beams of a scan have impossible times, the times do not correct the scan.
+/// If the times of a scan's beams are impossible, the scan is not corrected with these times.
 #[test]
 fn impossible_times_of_beams_are_ignored() {
     let mut random = Rng::with_seed(4);

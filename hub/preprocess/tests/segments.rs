@@ -1,5 +1,5 @@
-//! Tests of segments. They are compared with a slow version that calculates each point with sine and cosine, and each
-//! distance from two points.
+//! Tests of segments. The segments are compared with those of a slow version, which calculates each point with sine and
+//! cosine, and each distance from two points.
 
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{ArrayFlags, Foreground, ForegroundHead, MAX_SEGMENTS, Pose, Scan, ScanHead, Segment};
@@ -7,7 +7,7 @@ use scanhub_schema::{ArrayFlags, Foreground, ForegroundHead, MAX_SEGMENTS, Pose,
 /// Number of beams of all scans in these tests.
 const BEAM_COUNT: usize = 401;
 
-/// Returns a foreground with the beams and ranges in `ranges`, in the order of the beams.
+/// Returns a foreground with the beams in `ranges`, which has pairs of beam and range in the order of the beams.
 fn foreground(ranges: &[(usize, u16)]) -> Box<Foreground> {
     let mut foreground = Foreground::of_bytes(&vec![0xA5; Foreground::len(BEAM_COUNT)]);
     let head =
@@ -63,7 +63,8 @@ fn segments_match_the_reference() {
         let (mut range_mm, share) = (2_000.0, 0.3 + 0.7 * random.f64());
         let mut ranges = Vec::new();
         for i in 0..BEAM_COUNT {
-            // Most ranges are a surface with noise. Some have a step that may divide the surface.
+            // Most ranges differ from the previous range only by noise. Some ranges differ by a step, which may start
+            // another segment.
             let step_mm = if random.u8(..8) == 0 { 600.0 } else { 30.0 };
             range_mm = (range_mm + step_mm * (random.f64() - 0.5)).clamp(50.0, 8_000.0);
             if random.f64() < share {
@@ -129,7 +130,8 @@ fn segment_points_follow_a_change_of_angles() {
     assert_eq!(x_mm(-180_000, 1000), (1_000, 0));
 }
 
-/// Consecutive scans have walls of several beams, and single foreground beams that appear again, move, or disappear.
+/// The foreground of consecutive scans has runs of several beams, and single beams that appear again, move, or
+/// disappear.
 #[test]
 fn neighbors_or_previous_scan_support_a_segment() {
     let mut random = fastrand::Rng::with_seed(27);
@@ -142,7 +144,8 @@ fn neighbors_or_previous_scan_support_a_segment() {
         for round in 0..2_000 {
             let mut ranges = Vec::new();
             for i in (0..BEAM_COUNT).filter(|i| i % 3 != 2) {
-                // One beam in two has a neighbor, at another range or at the range of a wall.
+                // Skip every third beam, so that a beam has a neighbor on one side only. Half of the ranges are equal,
+                // so that two neighbors can form a segment.
                 let range_mm = if random.bool() { 2_000 } else { random.u32(500..8_000) };
                 if random.u8(..10) == 0 {
                     ranges.push((i, (range_mm / unit_mm) as u16));

@@ -1,6 +1,6 @@
-//! Tests of segments, lines and marks of simulated scans. They are compared with the truth of the world. The beams are
-//! as wide as real ones, and can report ranges between two surfaces. `cargo test -p scanhub-preprocess --test spot --
-//! --nocapture` prints the figures.
+//! Tests of segments, lines and marks of simulated scans, which are compared with the true targets of the beams. The
+//! beams are as wide as those of a real scanner, and can report ranges between two surfaces. `cargo test -p
+//! scanhub-preprocess --test spot -- --nocapture` prints the figures.
 
 #[path = "../../../tests/testkit/decoded_scan.rs"]
 mod decoded_scan;
@@ -20,7 +20,7 @@ use scanhub_sim::world::World;
 const SCAN_PERIOD_NS: u64 = 26_640_000;
 
 const WORLDS: [&str; 5] = ["room", "fig8", "crowd", "house", "demo"];
-/// Seed that was not used for tuning.
+/// Seed of the worlds. It was not used when the settings of the processors were tuned.
 const SEED: u64 = 20;
 
 fn room(name: &str, change: impl Fn(NoiseModel) -> NoiseModel) -> Room {
@@ -29,19 +29,19 @@ fn room(name: &str, change: impl Fn(NoiseModel) -> NoiseModel) -> Room {
     Room::of_port(&world.with_noise(layers), SEED, 0)
 }
 
-/// Returns two rooms of a world: one as in its file, and one in which beams have no width.
+/// Returns two rooms of the world `name`: one with the noise of the world's file, and one in which beams have no width.
 fn wide_and_narrow(name: &str) -> [Room; 2] {
     [room(name, |layers| layers), room(name, |layers| NoiseModel { spot: false, ..layers })]
 }
 
-/// Returns the scan that the hub publishes, and what its beams met.
+/// Returns the scan with the index `number` as the hub publishes it, and the true targets of its beams.
 fn scan_and_targets(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
     let look = room.labeled_scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, number * SCAN_PERIOD_NS);
     (decoded_scan::scan(&look.words, Unit::Mm), look.truth)
 }
 
-/// Counts false segments in 1400 scans: all of them, and those with support. The beams of a false segment meet neither
-/// a person nor an object that was put down, moved or taken away.
+/// Returns two counts for 1400 scans: the false segments, and the false segments that are supported. The beams of a
+/// false segment meet neither a person nor an object that was put down, moved or taken away.
 fn false_segments(room: &Room) -> [usize; 2] {
     let beams = Variant::HALF.beams();
     let mut model = BackgroundModel::new(BackgroundSettings::default(), beams);
@@ -51,7 +51,7 @@ fn false_segments(room: &Room) -> [usize; 2] {
         let (scan, target) = scan_and_targets(room, number);
         model.update(&scan, &mut foreground);
         segmenter.update(&scan, &mut foreground);
-        // The first 600 scans learn the background.
+        // The first 600 scans are for learning the background.
         for (i, segment) in foreground.segments().iter().enumerate().filter(|_| number >= 600) {
             let target = &target[usize::from(segment.first)..=usize::from(segment.last)];
             if target.iter().all(|target| *target == (BeamTarget::Static { since_ns: 0 })) {
@@ -76,17 +76,18 @@ fn mixed_ranges_rarely_form_supported_segments() {
             *sum += supported;
         }
     }
-    // Limits for 7000 scans.
+    // These limits are for the 7000 scans of all five worlds.
     assert!(sums[0] <= 21 && sums[0] <= sums[1] + 10, "{sums:?}");
 }
 
-/// Counts lines in 100 scans. Lines at people and at objects that were put down or moved do not count. The three
-/// numbers are:
+/// Returns three counts of lines in 100 scans. Lines at people and at objects that were put down or moved are ignored.
+/// The counts are:
 ///
 /// - all lines
-/// - lines with a mixed range: the range of a beam differs by more than 60 mm from the range of a beam without width
-///   and noise
-/// - false lines among these: more than 60 mm from the surfaces that most of their beams meet
+/// - lines with a mixed range: the range of one of their beams differs by more than 60 mm from the range of a beam
+///   without width and noise
+/// - false lines among the lines with a mixed range: lines that are more than 60 mm away from the surfaces that most of
+///   their beams meet
 fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
     let mut finder = LineFinder::new(Pose::default(), LineSettings::default(), Variant::HALF.beams());
     let mut lines = Lines::default();
@@ -134,8 +135,9 @@ fn mixed_ranges_form_no_lines() {
     assert!(lines > 3_000 && mixed > 50 && wrong * 500 <= lines, "{sums:?}");
 }
 
-/// Returns a room with a reflecting strip half a meter in front of a wall. The strip is perpendicular to its beam. The
-/// scans have the usual noise, but no constant error of the device. They also have no codes, which would split a mark.
+/// Returns a room with a reflecting strip half a meter in front of a wall. The strip is perpendicular to the beam that
+/// meets its middle. The scans have the noise `layers`, but no constant error of the scanner, and no codes, which would
+/// split a mark.
 fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: NoiseModel, seed: u64) -> Room {
     let (sin, cos) = angle_deg.to_radians().sin_cos();
     let board = |width_mm: f64, range_mm: f64, surface: &str| {
@@ -149,7 +151,8 @@ fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: NoiseModel, seed:
     Room::new(&world.with_noise(NoiseModel { bias_mm: 0.0, errors: 0.0, ..layers }), seed)
 }
 
-/// Returns the RMS errors of angle in degrees and of range in mm, and the number of scans without a mark.
+/// Detects the mark of a strip in many scans. Returns the RMS error of its angle in degrees, the RMS error of its range
+/// in mm, and the number of scans without a mark.
 fn mark_errors(width_mm: f64, range_mm: f64, layers: NoiseModel, random: &mut Rng) -> (f64, f64, u32) {
     let mut detector = MarkDetector::new(MarkSettings::default());
     let mut marks = Marks::default();

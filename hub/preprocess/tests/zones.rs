@@ -1,7 +1,7 @@
-//! Tests of zones, verdicts and early warnings. Zones are compared with two slow versions without tables. The formula,
-//! beam by beam, must give the same results. Plain geometry must agree, except within a millimeter of a circle.
-//! Warnings of a partial scan are compared with a new check. The new check gets the same scans, but the beams that have
-//! not arrived meet no objects.
+//! Tests of zones, verdicts and early warnings. Zones are compared with two slow versions that use no table. The first
+//! version evaluates the formula beam by beam, and must have the same results. The second version uses plain geometry,
+//! and must agree except within a millimeter of a circle. The warning for a partial scan is compared with the result of
+//! another check. This check gets the same scans, but the beams that have not arrived meet no objects.
 
 mod scans;
 
@@ -9,7 +9,7 @@ use fastrand::Rng;
 use scanhub_preprocess::zones::{Sector, Settings, Warning, ZoneChecker};
 use scanhub_schema::{ArrayFlags, Code, Pose, Scan, ScanHead, Verdict, Zones};
 
-/// Random configuration.
+/// Random settings, and a random pose of the sensor.
 struct Case {
     pose: Pose,
     settings: Settings,
@@ -57,7 +57,7 @@ impl Case {
         [self.pose.x_m * 1000.0, self.pose.y_m * 1000.0]
     }
 
-    /// Returns the two ranges between which a beam is inside a circle, calculated by the formula, in mm.
+    /// Returns the two ranges in mm between which a beam is inside a circle. The function uses the formula.
     fn chord(&self, u: [f64; 2], radius: f64) -> (f64, f64) {
         let [x, y] = self.sensor_mm();
         let (q, square) = (x * u[0] + y * u[1], x * x + y * y);
@@ -73,14 +73,14 @@ impl Case {
         ((lo - margin + 1e-6).floor().max(0.0), (hi + margin - 1e-6).ceil())
     }
 
-    /// Returns whether a reading is inside a circle, calculated by the formula.
+    /// Returns whether a reading is inside a circle. The function uses the formula.
     fn violates(&self, u: [f64; 2], own_range: f64, range: f64, radius: f64) -> bool {
         let (lo, hi) = self.chord(u, radius);
         range >= own_range && range < hi && (!self.settings.exact || lo == 0.0 || range > lo)
     }
 
-    /// Returns whether a reading of this beam can be inside the largest circle. Checks the shortest readings beyond the
-    /// robot's own body and beyond the circle's near side.
+    /// Returns whether a reading of this beam can be inside the largest circle. It is sufficient to check the shortest
+    /// readings beyond both the robot's own body and the near side of the circle.
     fn can_violate(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
         let (unit, radius) = (scans::unit_mm(scan), f64::from(self.settings.radii_mm[0]));
         let shortest = (own.max(self.chord(u, radius).0) / unit).floor();
@@ -88,9 +88,9 @@ impl Case {
         values.into_iter().any(|value| self.violates(u, own, value * unit, radius))
     }
 
-    /// Returns the minimum distance from the center to the part of a beam that this reading marks as occupied. The part
-    /// consists of the point and the margin on both sides. Unless `exact` is set, it also includes everything behind
-    /// the point.
+    /// Returns the minimum distance from the robot's center to the part of a beam that counts as occupied because of a
+    /// reading at `range`. This part consists of the point and the margin on both sides. If `exact` is not set, it also
+    /// includes the beam behind the point.
     fn distance(&self, u: [f64; 2], range: f64) -> f64 {
         let [x, y] = self.sensor_mm();
         let margin = f64::from(self.settings.margin_mm);
@@ -99,7 +99,7 @@ impl Case {
         (x + at * u[0]).hypot(y + at * u[1])
     }
 
-    /// Fills `scan` with readings, many of them near the circles and the end of the robot's own body.
+    /// Fills `scan` with readings, many of them near a circle or near the end of the robot's own body.
     fn fill(&self, random: &mut Rng, scan: &mut Scan) {
         let max = max(scan);
         let crowded = random.bool();
@@ -122,7 +122,7 @@ impl Case {
     }
 }
 
-/// Returns the maximum value of the scan's bits.
+/// Returns the maximum value that the range bits of the scan can hold.
 fn max(scan: &Scan) -> u16 {
     scan.no_return
 }
@@ -143,7 +143,7 @@ fn beam_reading(scan: &Scan, i: usize, no_return_is_far: bool) -> BeamReading {
     }
 }
 
-/// Compares `out`, apart from the verdict, with the formula and with geometry.
+/// Compares `out` with the formula and with geometry, except the verdict.
 fn compare(case: &Case, scan: &Scan, out: &Zones) -> CaseTally {
     let mut tally = CaseTally::default();
     let mut beams = vec![0; case.settings.radii_mm.len()];
@@ -207,7 +207,7 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> CaseTally {
     tally
 }
 
-/// Counts from one scan. They give the expected verdict and the coverage of the test.
+/// Counts from one scan. The test computes the expected verdict from them, and checks that it covers all cases.
 #[derive(Default)]
 struct CaseTally {
     sure: u32,
@@ -228,7 +228,7 @@ fn zones_match_the_reference_and_geometry() {
         let case = Case::new(&mut random);
         let mut check = case.check();
         let mut out = uninitialized_zones();
-        // Another unit is another layout, so the counts restart.
+        // Scans with another unit have another layout, so the counts of the check restart.
         for unit_mm in [1, 10, 100] {
             let mut scan = scans::layout(&mut random, unit_mm);
             let mut streaks = vec![0; case.settings.radii_mm.len()];
@@ -269,7 +269,7 @@ fn zones_match_the_reference_and_geometry() {
     assert!(close > 1000 && sure > 10_000 && blind > 100, "{close} {sure} {blind}");
 }
 
-/// An object stays inside the circle, but one scan in this time is invalid.
+/// An object stays inside the circle, but one of the scans is invalid. The check must not report clear after it.
 #[test]
 fn invalid_scan_delays_a_clear_verdict() {
     let settings = Settings { radii_mm: vec![1000, 600], min_scans: 2, ..Settings::default() };
@@ -291,8 +291,8 @@ fn invalid_scan_delays_a_clear_verdict() {
 #[test]
 fn point_on_a_circle_is_outside_from_any_pose() {
     let mut random = Rng::with_seed(2);
-    // Position of a sensor that looks ahead; and the ranges at which the beam ahead enters and leaves the circle of 1
-    // m.
+    // Each entry has the position of a sensor that points ahead, and the ranges at which its beam ahead enters and
+    // leaves the circle of 1 m.
     let places = [
         ([0.0, 0.0], 0, 1000),
         ([0.3, 0.0], 0, 700),
@@ -304,7 +304,8 @@ fn point_on_a_circle_is_outside_from_any_pose() {
     ];
     for (place, lo_mm, hi_mm) in places {
         for round in 0..200 {
-            // Turn the sensor about the robot's center. This changes nothing for the beam.
+            // Rotate the sensor around the robot's center. This does not change the ranges at which the beam enters and
+            // leaves the circle.
             let yaw_rad = if round < 4 { f64::from(round).to_radians() * 90.0 } else { 7.0 * random.f64() };
             let (sin, cos) = yaw_rad.sin_cos();
             let pose = Pose {
@@ -335,7 +336,7 @@ fn point_on_a_circle_is_outside_from_any_pose() {
     }
 }
 
-/// Returns a payload with garbage, as in a loan of shared memory.
+/// Returns a payload that contains garbage, like a new loan of shared memory.
 fn uninitialized_zones() -> Zones {
     bytemuck::pod_read_unaligned(&[0xA5; size_of::<Zones>()])
 }
@@ -345,7 +346,8 @@ const SCANS_PER_CASE: u16 = 6;
 
 const INVALID_CODE: u16 = 0x1FFF - 5;
 
-/// Returns a scan of a hundred beams over 180 degrees. All ranges are 5 m, except those in `beams`.
+/// Returns a scan of a hundred beams over 180 degrees. All ranges are 5 m, except those in `beams`, which has pairs of
+/// beam and range.
 fn scan(beams: &[(usize, u16)]) -> Box<Scan> {
     let mut scan = Scan::of(ScanHead::lms(100, -90_000, 1800, 1, 13), &[5000; 100]);
     beams.iter().for_each(|&(i, range_mm)| scan.arrays().ranges[i] = range_mm);
@@ -427,8 +429,8 @@ fn too_many_invalid_beams_yield_unknown_or_stop() {
 
 #[test]
 fn body_mask_hides_the_robot_itself() {
-    // The sectors cover beams 0 to 10. The body ends inside the circle in one case, and hides the whole circle in the
-    // other.
+    // The sectors cover beams 0 to 10. In the first case, the robot's body ends inside the circle. In the second case,
+    // it hides the whole circle.
     let partly = [Sector { from_mdeg: -90_000, to_mdeg: -72_000, range_mm: 400 }];
     let wholly = [Sector { range_mm: 1000, ..partly[0] }, partly[0]];
     let body: Vec<_> = (0..12).map(|i| (i, 399)).collect();
@@ -491,13 +493,13 @@ fn unviolable_circle_is_never_clear() {
         of(whole, &Settings { body_mask: all.to_vec(), ..settings.clone() }, &scan(&[])).0,
         Verdict::Unknown
     );
-    // A sensor 2 m ahead of the center looks away from the circle. If it is turned by 180 degrees, it looks into the
-    // circle.
+    // A sensor 2 m ahead of the center points away from the circle, so no beam meets the circle. If the sensor is
+    // rotated by 180 degrees, its beams meet the circle.
     let facing_away = Pose { x_m: 2.0, ..Pose::default() };
     assert_eq!(of(facing_away, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
     let back = Pose { yaw_rad: std::f64::consts::PI, ..facing_away };
     assert_eq!(of(back, &settings, &scan(&[])).0, Verdict::Clear);
-    // The circle is too far away for 13 bits in mm, but not in cm.
+    // The circle is too far away for ranges of 13 bits in mm, but not for ranges in cm.
     let far = Pose { x_m: 9.2, ..back };
     assert_eq!(of(far, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
     let mut cm = scan(&[]);
@@ -506,7 +508,8 @@ fn unviolable_circle_is_never_clear() {
 }
 
 /// Returns a clockwise revolution of 200 beams, 1.8 degrees apart. The scanner's own points are also 1.8 degrees apart.
-/// All ranges are 5 m, except the ranges in `beams`, which have an exact angle in degrees.
+/// All ranges are 5 m, except those in `beams`. Each entry of `beams` has a beam, its range, and its exact angle in
+/// degrees.
 fn revolution(beams: &[(usize, u16, f32)]) -> Box<Scan> {
     let head = ScanHead {
         step: -1.8_f64.to_radians(),
@@ -541,8 +544,8 @@ fn zones_use_exact_points_if_available() {
         zones_of_revolution(Pose::default(), &settings, &revolution(&[(7, 700, -12.0), (190, 999, 17.5)]));
     assert_eq!((near.verdict(), near.nearest()), (Verdict::Slow, Some((7, 700))));
     assert_eq!((near.zones()[0].beams, near.zones()[1].beams), (2, 0));
-    // The sensor is 2 m ahead of the center. An object straight behind it at 1001 mm is just inside the circle. An
-    // object half a beam to the side is not.
+    // The sensor is 2 m ahead of the center. An object straight behind the sensor at 1001 mm is just inside the circle.
+    // An object at the same range, but half a beam to the side, is outside.
     let ahead = Pose { x_m: 2.0, ..Pose::default() };
     assert_eq!(
         zones_of_revolution(ahead, &settings, &revolution(&[(100, 1001, -180.0)])).zones()[0].beams,
@@ -556,7 +559,8 @@ fn zones_use_exact_points_if_available() {
         zones_of_revolution(ahead, &settings, &revolution(&[(100, 1001, -182.6)])).zones()[0].beams,
         0
     );
-    // The middle of beam 99 is next to the robot's body, but a point of the beam may be on the body.
+    // The middle of beam 99 is next to the robot's body. But the exact angle of a point may be in the sector of the
+    // body.
     let body = [Sector { from_mdeg: -180_000, to_mdeg: -179_000, range_mm: 2000 }];
     let masked = Settings { body_mask: body.to_vec(), ..settings };
     assert_eq!(zones_of_revolution(ahead, &masked, &revolution(&[(99, 1500, -178.3)])).zones()[0].beams, 1);
@@ -602,14 +606,14 @@ fn changing_speed_does_not_interrupt_scan_counting() {
 const BEAM_COUNT: usize = 100;
 const FAR_MM: u16 = 5000;
 
-/// Returns a scan of 180 degrees. Only `near` beams have short ranges.
+/// Returns a scan of 180 degrees. At most `near` random beams have short ranges.
 fn random_scan(random: &mut Rng, near: usize) -> Box<Scan> {
     let mut scan = Scan::of(ScanHead::lms(BEAM_COUNT, -90_000, 1800, 1, 13), &[FAR_MM; BEAM_COUNT]);
     (0..near).for_each(|_| scan.arrays().ranges[random.usize(..BEAM_COUNT)] = random.u16(..1200));
     scan
 }
 
-/// Returns the zones of the last of `scans`. They come from a new check that has processed the earlier scans.
+/// Passes all `scans` to a new check, and returns the zones for the last scan.
 fn zones_of(pose: Pose, settings: &Settings, scans: &[Box<Scan>]) -> Zones {
     let (mut check, mut out) = (ZoneChecker::new(pose, settings, BEAM_COUNT), Zones::unknown());
     scans.iter().for_each(|scan| check.update(scan, &mut out));
@@ -645,7 +649,7 @@ fn partial_scan_warns_and_complete_scan_confirms() {
                 scans.push(part);
                 let zones = zones_of(pose, &settings, &scans);
                 scans.pop();
-                // The first complete scan of a layout builds the table, so there is no warning before it.
+                // The check computes its table for the first complete scan of a layout, so it cannot warn before.
                 let expected = worst(&zones).filter(|_| !scans.is_empty());
                 assert_eq!(early.map(|warning| warning.verdict), expected, "{received} of {near}");
                 if let Some(Warning { beam, distance_mm, .. }) = early {
@@ -681,7 +685,8 @@ fn scan_with_another_layout_causes_no_warning() {
     assert_eq!(check.check_partial(BEAM_COUNT, 1000, &[], &[]), None);
 }
 
-/// If the spacing of a rotating scanner's points varies by an arc second, the layout does not change.
+/// If the spacing between the points of a rotating scanner varies by an arc second, the layout does not change, so the
+/// check counts consecutive scans.
 #[test]
 fn slightly_uneven_revolutions_are_consecutive() {
     let settings = Settings { min_scans: 2, ..Settings::default() };

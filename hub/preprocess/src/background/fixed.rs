@@ -1,22 +1,23 @@
 //! Two methods that learn a background beam by beam, for a sensor that does not move: the method of the paper with one
 //! range per beam ([`SingleSurface`]), and a method with several surfaces per beam ([`MultiSurface`]).
 //!
-//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of
-//! [`MultiSurface`] were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
+//! The code executes the same steps for every beam, whatever the beam hits, so that the compiler can vectorize the
+//! steps. The constants of [`MultiSurface`] were found with `benches/perception`, on seeds 0 to 9 of the simulated
+//! scenes.
 
 use super::{Class, INVALID, Limits, RunFilter};
 use crate::search::position;
 use scanhub_schema::Background;
 
-/// State of the paper's method: one range per beam. A new range replaces it once the new range was read in enough
-/// consecutive scans. A beam that flips between two surfaces never learns either of them.
+/// State of the paper's method: one range per beam. Another range replaces it when the other range was read in enough
+/// consecutive scans. If the readings of a beam flip between two surfaces, neither of them becomes background.
 #[derive(Clone)]
 pub(super) struct SingleSurface {
     /// Ranges in device units, [`Background::UNKNOWN`] or [`Background::FAR`].
     background: Box<[u16]>,
-    /// Candidates for the background, where `run` is not 0.
+    /// Candidates for the background. The candidate of a beam is valid only if the beam's `run` is not 0.
     candidate: Box<[u16]>,
-    /// Number of consecutive readings of the candidate.
+    /// Number of consecutive readings that agree with the candidate.
     run: Box<[u16]>,
 }
 
@@ -33,9 +34,9 @@ impl SingleSurface {
         self.run.fill(0);
     }
 
-    /// Classifies the beams and learns from them (paper III.B.3). A beam without a reading neither counts nor ends a
-    /// run. A reading behind the background counts, but is never foreground. The scan that completes a run is compared
-    /// with the old background.
+    /// Classifies the beams and learns from them (paper III.B.3). A beam without a reading neither continues nor ends a
+    /// run. A reading behind the background can be part of a run, but is never foreground. A scan that completes a run
+    /// is still compared with the old background.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
         for ((&reading, &background), class) in readings.iter().zip(&self.background).zip(classes) {
             let other = if reading < background { Class::Foreground } else { Class::Behind };
@@ -80,43 +81,44 @@ impl SingleSurface {
     }
 }
 
-/// State of the method with several surfaces per beam. At edges, a beam flips between two surfaces, and both are
-/// learned. [`RunFilter`] decides how many neighboring beams make an object.
+/// State of the method with several surfaces per beam. At an edge, the readings of a beam flip between two surfaces,
+/// and this method learns both. [`RunFilter`] decides how many neighboring foreground beams are an object.
 #[derive(Clone)]
 pub(super) struct MultiSurface {
     blocks: Box<[BeamBlock]>,
     run_filter: RunFilter,
-    /// Nearest background of each beam, while a scan is processed.
+    /// Buffer for the nearest background of each beam while a scan is processed; [`INVALID`] if it is unknown.
     nearest: Box<[u16]>,
 }
 
 /// Surfaces that a block of neighboring beams has met.
 ///
 /// In a room where nothing moves, each beam of most blocks meets the same fully known surface in every scan. Such a
-/// block changes only the range of each surface in a scan, so it takes a short path with the same result.
+/// block is *settled*. A scan changes only the ranges of its surfaces, so a short path handles it. The result is the
+/// same.
 #[derive(Clone)]
 #[cfg_attr(test, derive(Debug, PartialEq))]
 struct BeamBlock {
     slots: [Slots; SLOT_COUNT],
-    /// Weight that the next surface of the beam gains: more if previous scans had no return.
+    /// Weight that the next surface that the beam meets will gain. It is higher if the previous scans had no return.
     gain: [i16; BLOCK_LEN],
-    /// Ranges of the surfaces, if each beam has only one surface, and it is fully known. The slots then have older
-    /// ranges.
+    /// Ranges of the surfaces of a settled block; `None` if the block is not settled. While the block is settled, the
+    /// ranges in the slots are out of date.
     single_surfaces: Option<[u16; BLOCK_LEN]>,
 }
 
-/// One slot of each beam of a block, which may have a surface.
+/// One slot of each beam of a block. A slot may contain a surface.
 #[derive(Clone)]
 #[cfg_attr(test, derive(Debug, PartialEq))]
 struct Slots {
     /// Range of the surface, in device units.
     range: [u16; BLOCK_LEN],
-    /// Weight of the surface, a measure of how well it is known. It grows with each scan in which the beam met the
-    /// surface, and decreases in others. [`NO_WEIGHT`]: there is no surface.
+    /// Weight of the surface, a measure of how well it is known. The weight grows with each scan in which the beam met
+    /// the surface, and decreases with other scans. [`NO_WEIGHT`] means that the slot has no surface.
     weight: [i16; BLOCK_LEN],
 }
 
-/// Bounds of ranges and weights, as numbers that compare like signed ranges and weights.
+/// Bounds of ranges and weights, converted by [`signed`], so that signed comparisons can be used.
 #[derive(Clone, Copy)]
 struct WeightBounds {
     threshold: i16,
@@ -142,8 +144,8 @@ impl MultiSurface {
         self.run_filter.reset();
     }
 
-    /// Compares all beams with the state before this scan, then learns from them. `readings` and `classes` have whole
-    /// blocks.
+    /// Compares all beams with the state before this scan, and then learns from the beams. `readings` and `classes` are
+    /// padded to whole blocks.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
         let bounds = WeightBounds::of(limits);
         let (read, _) = readings.as_chunks::<BLOCK_LEN>();
@@ -168,9 +170,10 @@ impl MultiSurface {
         }
     }
 
-    /// Classifies the beams between `right` and `left`, the nearest beams with a known background on either side. A
-    /// beam that is at most [`MAX_NEIGHBORS`] beams away from both is foreground if it ends nearer than both
-    /// backgrounds, and meets no surface that it has met for a while.
+    /// Classifies the beams between `right` and `left`. Their own background is unknown, but `right` and `left` are the
+    /// nearest beams on both sides with a known background. A beam that is at most [`MAX_NEIGHBORS`] beams away from
+    /// both is foreground if it ends nearer than both backgrounds, and if it does not meet a surface that it has
+    /// already met for some time.
     fn compare_with_neighbors(
         &self,
         right: usize,
@@ -192,13 +195,13 @@ impl MultiSurface {
         }
     }
 
-    /// Returns range and weight of each surface of beam `i`, whose block is not settled.
+    /// Returns range and weight of each slot of beam `i`. The block of the beam must not be settled.
     fn surfaces(&self, i: usize) -> impl Iterator<Item = (u16, i16)> {
         let beam = i % BLOCK_LEN;
         self.blocks[i / BLOCK_LEN].slots.iter().map(move |slots| (slots.range[beam], slots.weight[beam]))
     }
 
-    /// Uses `range` as the only background of beam `i`, as well known as possible.
+    /// Uses `range` as the only background of beam `i`, with the maximum weight.
     pub(super) fn adopt(&mut self, i: usize, range: u16) {
         let (block, beam) = (&mut self.blocks[i / BLOCK_LEN], i % BLOCK_LEN);
         block.clear_single_surfaces();
@@ -207,9 +210,9 @@ impl MultiSurface {
         block.slots[0].weight[beam] = i16::MAX;
     }
 
-    /// Returns the best known background of beam `i`, or the nearer one of two that are equally well known. A surface
-    /// takes precedence over no return, however frequent no return is. A model that starts without the surface would
-    /// report it as foreground.
+    /// Returns the background of beam `i`: the known surface with the greatest weight. If two weights are equal,
+    /// returns the nearer surface. A surface takes precedence over no return, however frequent no return is. Otherwise,
+    /// a model that loads the result would report the surface as foreground.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         if let Some(ranges) = &self.blocks[i / BLOCK_LEN].single_surfaces {
             return ranges[i % BLOCK_LEN];
@@ -228,8 +231,8 @@ impl BeamBlock {
         single_surfaces: None,
     };
 
-    /// Classifies each beam by its own background, and finds the nearest background of each beam; [`INVALID`] if there
-    /// is none.
+    /// Classifies each beam by its own background. Writes the nearest background of each beam to `nearest`, or
+    /// [`INVALID`] if the beam has no known background.
     #[inline]
     fn compare(
         &mut self,
@@ -252,7 +255,7 @@ impl BeamBlock {
         }
     }
 
-    /// Writes the ranges of a settled block into the slots, because a beam has a reading of something else.
+    /// Ends the short path: writes the ranges of a settled block back into its slots. Does nothing for other blocks.
     fn clear_single_surfaces(&mut self) {
         if let Some(ranges) = self.single_surfaces.take() {
             for slots in &mut self.slots {
@@ -288,10 +291,10 @@ impl BeamBlock {
         }
     }
 
-    /// Updates the surfaces. The beam met the surface that is nearest to the reading, if that surface is within the
-    /// threshold. The other surfaces lose weight. A surface that the beam passed through loses more weight than a
-    /// surface that may be hidden. If the reading meets no surface, it replaces the surface with the lowest weight,
-    /// unless all weights are too high.
+    /// Updates the surfaces of each beam. The beam met the surface that is nearest to its reading, if this surface is
+    /// within the threshold. All other surfaces of the beam lose weight. A surface in front of the reading loses more
+    /// weight than a surface behind the reading, which may be hidden. If the reading meets no surface, it replaces the
+    /// surface with the lowest weight, unless even the lowest weight is too high.
     #[inline]
     fn learn(&mut self, readings: &[u16; BLOCK_LEN], bounds: WeightBounds) {
         match &mut self.single_surfaces {
@@ -323,7 +326,8 @@ impl BeamBlock {
         self.single_surfaces = self.single_surfaces(bounds.full);
     }
 
-    /// Returns the ranges of the surfaces, if each beam has only one surface, and the weight of that surface is `full`.
+    /// Returns the ranges of the surfaces if the block is settled: each beam has only one surface, with the weight
+    /// `full`. Otherwise returns `None`.
     #[inline]
     fn single_surfaces(&self, full: i16) -> Option<[u16; BLOCK_LEN]> {
         let (mut ranges, mut known, mut empty) = ([0; BLOCK_LEN], [0; BLOCK_LEN], [0; BLOCK_LEN]);
@@ -338,7 +342,8 @@ impl BeamBlock {
         (known == [-1; BLOCK_LEN] && empty == [1 - SLOT_COUNT as i16; BLOCK_LEN]).then_some(ranges)
     }
 
-    /// Returns the weights that the surfaces gain in this scan.
+    /// Returns the weight that a surface gains if its beam meets it in this scan, and updates the gains for the next
+    /// scan.
     #[inline]
     fn gain(&mut self, readings: [u16; BLOCK_LEN], bounds: WeightBounds) -> [i16; BLOCK_LEN] {
         let (mut gains, mut next_gains) = (self.gain, self.gain);
@@ -362,21 +367,23 @@ fn all_meet(range: &[u16; BLOCK_LEN], readings: &[u16; BLOCK_LEN], bounds: Weigh
     })
 }
 
-/// Returns the change of the `range` of a surface after a `reading` that met it: their difference divided by 16,
-/// rounded to zero. It uses shifts, which stay 16 bits wide, unlike a division.
+/// Returns the change of the `range` of a surface after a `reading` that met the surface: the difference of both
+/// divided by 16, rounded to zero. The function uses shifts, because a division would not stay 16 bits wide.
 #[inline]
 fn step(range: u16, reading: u16) -> i16 {
     let difference = reading.wrapping_sub(range) as i16;
     difference.wrapping_add((difference >> 15) & ((1 << DRIFT_SHIFT) - 1)) >> DRIFT_SHIFT
 }
 
-/// Returns -1, which has all bits set, or 0. An `if` in a short loop would become a branch for each beam.
+/// Returns -1, which has all bits set, if `is_set` is true, and 0 otherwise. An `if` in a short loop would become a
+/// branch for each beam.
 #[inline]
 fn mask(is_set: bool) -> i16 {
     -i16::from(is_set)
 }
 
-/// Returns the surfaces of one beam after `reading`. The surface that the beam met gains this weight.
+/// Returns ranges and weights of the surfaces of one beam after `reading`. The surface that the beam met gains the
+/// weight `gain`.
 #[inline]
 fn learned(
     range: [u16; SLOT_COUNT],
@@ -418,7 +425,8 @@ fn learned(
     (new_range, new_weight)
 }
 
-/// Maps unsigned to signed numbers in the same order. For 16 bits, SSE2 compares only signed ones in one instruction.
+/// Maps unsigned numbers to signed numbers in the same order. SSE2 compares 16-bit numbers in one instruction only if
+/// they are signed.
 fn signed(value: u16) -> i16 {
     (value ^ 0x8000) as i16
 }
@@ -436,38 +444,40 @@ impl WeightBounds {
     }
 }
 
-/// Number of surfaces per beam: two surfaces at an edge, and a third one that may replace either.
+/// Maximum number of surfaces per beam: two surfaces at an edge, and a third surface that may replace one of them.
 const SLOT_COUNT: usize = 3;
 /// Number of beams of a [`BeamBlock`]: as many 16-bit numbers as the processor handles in one instruction.
 pub(super) const BLOCK_LEN: usize = 8;
-/// Share of the distance between a surface and a reading by which the surface moves, in whole units: 1/16, as a number
-/// of bits. The surface moves too slowly to follow a person who walks.
+/// Share of its distance from a reading by which a surface moves toward the reading: 1/16, as a number of bits to
+/// shift. With this share, a surface is too slow to follow a person who walks.
 const DRIFT_SHIFT: u32 = 4;
 
-/// Weight of a surface that does not exist.
+/// Weight in a slot without a surface.
 const NO_WEIGHT: i16 = i16::MIN;
-/// Weight of a scan in which the surface was met. It is fully known after the configured number of scans.
+/// Weight that a surface gains in a scan in which the beam met it. After the configured number of such scans, the
+/// surface is fully known.
 const MET_WEIGHT: i16 = 8;
-/// A surface also counts as met in the preceding scans without a return. The surface gains the weight of at most this
-/// number of scans, including the scan in which it was met. The number is also limited to one per this number of
-/// configured scans. A wall that returns 15 % of the beams therefore becomes background after 5/4 of the configured
-/// scans, and a lost beam does not make a standing person background any sooner.
+/// Maximum number of scans whose weight a surface gains in one scan. If the scans before had no return, the surface
+/// also counts as met in them. A wall that returns only 15 % of the beams therefore becomes background after 5/4 of the
+/// configured scans.
 const MAX_NO_RETURN_SCANS: u16 = 16;
+/// Number of configured scans per scan of this maximum. If few scans are configured, the maximum is therefore lower, so
+/// that a lost beam does not make a standing person background any sooner.
 const SCANS_PER_NO_RETURN: u16 = 16;
-/// Weight that a surface loses in a scan that saw something behind it. An object that was removed is no longer
-/// background after 3/4 of the configured scans, and a surface that is met in more than a third of the scans finally
+/// Weight that a surface loses in a scan in which the beam ended behind it. An object that was removed is therefore no
+/// longer background after 3/4 of the configured scans. A surface that is met in more than a third of the scans finally
 /// becomes background.
 const PASSED_LOSS: i16 = 4;
-/// Weight that a surface loses in a scan that saw something in front of it. The surface may still exist. It is not 0,
-/// because otherwise hidden surfaces could take all slots.
+/// Weight that a surface loses in a scan in which the beam ended in front of it. The loss is small, because the surface
+/// may still exist. It is not 0, because otherwise hidden surfaces could take all slots.
 const HIDDEN_LOSS: i16 = 1;
-/// Weight per configured scan from which on a surface is background: 5/8 of the full weight, so that readings may be
+/// Weight per configured scan with which a surface is background: 5/8 of the full weight, so that some readings may be
 /// missing.
 const KNOWN_WEIGHT: u16 = 5;
-/// Weight per configured scan below which a surface can be replaced.
+/// Weight per configured scan below which a new surface can replace a surface.
 const REPLACEABLE_WEIGHT: u16 = 2;
-/// Maximum number of beams from a beam with an unknown background to the nearest beam on each side whose known
-/// background is used instead.
+/// Maximum distance in beams from a beam with an unknown background to the nearest beams with a known background, whose
+/// backgrounds are used instead.
 const MAX_NEIGHBORS: usize = 8;
 
 #[cfg(test)]
@@ -475,7 +485,7 @@ mod tests {
     use super::super::{ScanHead, Settings};
     use super::*;
 
-    /// Two whole blocks of beams and a part of one. Each beam hits one surface, or a window.
+    /// Number of beams: two whole blocks and a part of a third one. Each beam hits one surface, or a window.
     const BEAMS: usize = 19;
 
     #[test]
@@ -498,7 +508,8 @@ mod tests {
                 };
             }
             if number % 1_000 == 0 {
-                // Load a model, so that the windows are known before the gains of their beams have grown.
+                // Load the readings as a model, so that the windows are background before the gains of their beams have
+                // grown.
                 for multi in [&mut short, &mut long] {
                     multi.reset();
                     let valid = readings.iter().enumerate().filter(|&(_, &reading)| reading != INVALID);

@@ -1,6 +1,6 @@
-//! Background for a scanner that moves: a map of the standing objects around the robot, which scrolls with the robot. A
-//! beam is in the foreground if it ends in space that earlier scans saw free. Space behind objects, and the edge of the
-//! space that was seen, are unknown. The robot's position is given with each scan.
+//! Background for a scanner that moves: a map of the standing objects around the robot. The map scrolls with the robot,
+//! whose position the caller sets before each scan. A beam is in the foreground if it ends in space that earlier scans
+//! saw free. Space behind objects is unknown, and so is the edge of the space that scans saw.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -17,54 +17,64 @@ pub(super) struct OccupancyMap {
     cells: Box<[Cell]>,
     /// Effect of the last scan that met each cell, see [`CellEffect`].
     effects: Box<[u8]>,
-    /// Cell of the robot, in the middle of the map.
+    /// Cell of the sensor, in the middle of the map.
     middle: (i32, i32),
+    /// Poses at the current scan; `None` if the position is unknown.
     map_pose: Option<MapPose>,
+    /// Number of the current scan in `effects`, from 1 to [`CellEffect::SCANS`].
     scan: u8,
-    /// Positions of the sensor at the times of the beams, in cells, while a scan is processed.
+    /// Buffer for the positions of the sensor at the times of the beams, in cells, while a scan is processed.
     starts: Box<[(f32, f32)]>,
-    /// Ends of the beams in cells, while a scan is processed.
+    /// Buffer for the ends of the beams, in cells, while a scan is processed. NaN for beams without a range.
     ends: Box<[(f32, f32)]>,
     run_filter: RunFilter,
 }
 
-/// A square of the floor.
+/// A cell of the map: a square of the floor, with counts of the scans that met it.
 #[derive(Clone, Copy, Default)]
 struct Cell {
-    /// Number of scans in which a beam ended in the cell, minus the number of later scans that saw through it.
+    /// Number of scans in which a beam ended in the cell. Each later scan that saw through the cell decreases it, by 1
+    /// or more.
     hits: u16,
     /// Number of scans that saw through the cell, minus an eighth of the number of scans in which a beam ended in it.
     free: u16,
-    /// Number of times that a beam ended in the cell after other beams had seen through the cell. Chair legs are
-    /// thinner than the distance between two beams.
+    /// Number of times that a beam ended in the cell after scans had seen through the cell. It is for thin objects,
+    /// such as chair legs, which are often between two beams.
     returns: u8,
     /// Number of consecutive scans that saw through the cell.
     through: u8,
 }
 
-/// Position of the robot and its sensor in the map, and the directions of the beams.
+/// Poses of the robot and its sensor at a scan, and the values from which the ends of the scan's beams are computed.
 #[derive(Clone, Copy)]
 struct MapPose {
     robot: Pose2,
-    /// Position of the sensor.
+    /// Position of the sensor in the map, in meters.
     x: f64,
     y: f64,
+    /// Pose of the sensor on the robot.
     pose: Pose,
     /// Velocity of the sensor.
     velocity: Velocity,
+    /// First angle and step of the beams.
     angles: (f64, f64),
+    /// Device unit of the ranges in meters.
     unit_m: f64,
 }
 
-/// Effect of a scan on a cell, in a byte: three times the number of the scan, plus one of these values.
+/// Effect of a scan on a cell, stored in a byte: three times the number of the scan, plus one of the values `THROUGH`,
+/// `NEAR` and `ENDED`. A later scan has a greater number, so its effect replaces that of an earlier scan. If a scan has
+/// several effects on a cell, the one with the greatest value remains.
 struct CellEffect;
 
 impl CellEffect {
-    /// Number of scans after which the scan's number in the byte wraps.
+    /// Maximum number of a scan in the byte. The next scan has the number 1 again.
     const SCANS: u8 = 84;
+    /// A beam saw through the cell.
     const THROUGH: u8 = 0;
     /// A beam ended next to the cell.
     const NEAR: u8 = 1;
+    /// A beam ended in the cell.
     const ENDED: u8 = 2;
 }
 
@@ -89,9 +99,9 @@ impl OccupancyMap {
         self.run_filter.reset();
     }
 
-    /// Takes the robot's position at the next scan from `motion`, and the robot's `velocity` during that scan. The
-    /// sensor is at `pose`. Returns whether the map still shows the robot's surroundings. After an uncertain step, it
-    /// does not.
+    /// Sets the robot's position at the next scan, which `motion` contains, and the robot's `velocity` during that
+    /// scan. The sensor is at `pose` on the robot. Returns whether the map is still valid. It is not valid if the
+    /// position is unknown or the last step was too uncertain.
     pub(super) fn set_motion(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) -> bool {
         let robot = Pose2::new(motion.x_m, motion.y_m, motion.yaw_rad);
         let (x, y) = robot.point((pose.x_m, pose.y_m));
@@ -99,7 +109,8 @@ impl OccupancyMap {
         let (angles, unit_m) = ((0.0, 0.0), 0.0);
         let velocity = velocity.of_sensor(pose);
         self.map_pose = is_known.then_some(MapPose { robot, x, y, pose: *pose, velocity, angles, unit_m });
-        // Along a corridor, the variance is large, but all positions look alike, so the map stays valid.
+        // In a corridor, the variance along the corridor is large. But all positions along the corridor look alike, so
+        // the map stays valid.
         let variance = f64::from(motion.covariance[0].max(motion.covariance[4]));
         let is_sure = motion.is_degenerate() || variance <= MAX_STEP_SIGMA_M * MAX_STEP_SIGMA_M;
         is_known && motion.has_step() && is_sure
@@ -131,7 +142,7 @@ impl OccupancyMap {
             }
             let angle = exact_angle(exact, i).unwrap_or(map_pose.angles.0 + i as f64 * map_pose.angles.1);
             let range = f64::from(reading) * map_pose.unit_m;
-            // The sensor moves while a scan is measured.
+            // The sensor moves while the scan is measured, so compute its position and direction for each beam.
             let (x, y, yaw) = map_pose.velocity.position(1e-9 * scan.beam_ns(i) as f64);
             let direction = map_pose.direction(angle + yaw);
             let start = (map_pose.x + x * forward.0 + y * left.0, map_pose.y + x * forward.1 + y * left.1);
@@ -166,7 +177,7 @@ impl OccupancyMap {
         if is_free { Class::Foreground } else { Class::Unknown }
     }
 
-    /// Moves the map to `middle`, and clears the cells that enter it.
+    /// Moves the map so that `middle` is its middle, and clears the cells that enter the map.
     fn scroll(&mut self, middle: (i32, i32)) {
         let (dx, dy) = (middle.0 - self.middle.0, middle.1 - self.middle.1);
         if dx.abs() >= MAP_WIDTH || dy.abs() >= MAP_WIDTH {
@@ -193,8 +204,8 @@ impl OccupancyMap {
         is_near(x, self.middle.0) && is_near(y, self.middle.1)
     }
 
-    /// Adds the scan to the map. Each cell counts once, and a beam that ended in a cell outweighs those that saw
-    /// through it.
+    /// Adds the scan to the map. Each cell is counted at most once per scan. If one beam ended in or next to a cell, it
+    /// does not matter that other beams saw through the cell.
     fn add_scan(&mut self, beams: usize, limits: &Limits) {
         self.scan = if self.scan >= CellEffect::SCANS { 1 } else { self.scan + 1 };
         if self.scan == 1 {
@@ -202,7 +213,7 @@ impl OccupancyMap {
         }
         let (near, ended) = (3 * self.scan + CellEffect::NEAR, 3 * self.scan + CellEffect::ENDED);
         let max_hits = limits.scans.max(MIN_FREE_SCANS);
-        // Add the ends of all beams before the cells that they saw through, because an end takes precedence.
+        // Add the ends of all beams first, because they take precedence over beams that saw through a cell.
         for i in 0..beams {
             let (x, y) = self.ends[i];
             let (x, y) = (x.floor() as i32, y.floor() as i32);
@@ -233,7 +244,8 @@ impl OccupancyMap {
         }
     }
 
-    /// Counts the cells between the sensor and the end of a beam, in steps of at most one cell.
+    /// Counts the cells between the sensor (`from`) and the `end` of a beam as seen through. Goes along the beam in
+    /// steps of one cell.
     fn note_empty_cells(&mut self, from: (f32, f32), end: (f32, f32), max_hits: u16) {
         let through = 3 * self.scan + CellEffect::THROUGH;
         let (dx, dy) = (end.0 - from.0, end.1 - from.1);
@@ -251,7 +263,7 @@ impl OccupancyMap {
                 return;
             }
             let at = (wrapped(first.0 + column) * MAP_WIDTH + wrapped(first.1 + row)) as usize;
-            // A greater value was set by a beam of this scan.
+            // An equal or greater value means that a beam of this scan has already had an effect on the cell.
             if self.effects[at] < through {
                 self.effects[at] = through;
                 self.cells[at].note_seen_through(max_hits);
@@ -259,7 +271,8 @@ impl OccupancyMap {
         }
     }
 
-    /// Returns the range at which beam `i` would end without a foreground, in device units.
+    /// Returns the range in device units at which beam `i` would end if nothing were in the foreground, or
+    /// [`Background::UNKNOWN`].
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         let Some(map_pose) = self.map_pose.filter(|map_pose| map_pose.unit_m > 0.0) else {
             return Background::UNKNOWN;
@@ -281,8 +294,8 @@ impl OccupancyMap {
 }
 
 impl Cell {
-    /// Returns whether an object stands in the cell. The object must have stood there before the cell was seen free, or
-    /// must have stood there for long enough since.
+    /// Returns whether a permanent object is in the cell: an object that beams hit before the cell was seen free, an
+    /// object that they have hit long enough since then, or a thin object.
     fn is_occupied(&self, limits: &Limits) -> bool {
         self.hits >= MIN_HITS && self.free < MIN_FREE_SCANS
             || self.hits >= limits.scans.max(MIN_HITS)
@@ -332,23 +345,25 @@ fn index(x: i32, y: i32) -> usize {
 
 /// Width of a cell in meters. A person is several cells wide, and the error of a position is less than one cell.
 const CELL_M: f64 = 0.05;
-/// Number of cells on each side of the map: 40 m.
+/// Width and height of the map in cells: 40 m.
 const MAP_WIDTH: i32 = 800;
 const CELL_COUNT: usize = (MAP_WIDTH * MAP_WIDTH) as usize;
-/// Number of cells around the end of a beam in which an object may stand, because positions and walls are uncertain.
+/// Maximum distance in cells, along each axis, between the end of a beam and an object that counts as the beam's
+/// background. It is not 0, because positions and walls are uncertain.
 const UNCERTAINTY_CELLS: i32 = 2;
-/// Number of scans that must see through a cell before it is free.
+/// Number of scans that must see through a cell before the cell is free.
 const MIN_FREE_SCANS: u16 = 5;
-/// Number of scans in which a beam must end in a cell that was never seen free before an object stands there.
+/// Number of scans in which a beam must end in a cell before the cell has a permanent object, if the cell was never
+/// seen free.
 const MIN_HITS: u16 = 3;
-/// Number of returns from which on a thin object stands in a cell, and number of consecutive scans that must see
-/// through the cell before the object is removed.
+/// Number of [`Cell::returns`] with which a cell has a permanent thin object.
 const MIN_RETURNS: u8 = 24;
+/// Number of consecutive scans that must see through a cell before a thin object in the cell is removed.
 const MAX_THROUGH_SCANS: u8 = 60;
-/// Number of cells before the end of a beam that do not count as seen free.
+/// Number of cells before the end of a beam that do not count as seen through.
 const END_MARGIN_CELLS: f32 = 2.5;
-/// Maximum standard deviation of a step after which the map is kept. With a larger error, walls would appear in free
-/// space.
+/// Maximum standard deviation of a step after which the map stays valid. With a larger error, walls would appear in
+/// free space.
 const MAX_STEP_SIGMA_M: f64 = CELL_M;
-/// Maximum distance of a robot from its start.
+/// Distance of a robot from its start beyond which its position counts as unknown.
 const MAX_DISTANCE_M: f64 = 1e6;

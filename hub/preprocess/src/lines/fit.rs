@@ -1,11 +1,13 @@
 //! Fit of the likeliest line for some beams whose noise is along the beams.
 //!
-//! A line is the pair (a, b) for which the beam in direction (cos, sin) meets it at the range 1 / (a cos + b sin): the
-//! normal form r = cos (t - alpha) * range with a = cos alpha / r and b = sin alpha / r. Ranges have normal noise along
-//! their beams. The likeliest line therefore has the minimum sum of squares of (measured range - range of the line).
-//! That difference is not linear in a and b. The expression range^2 (a cos + b sin) - range is linear, and differs from
-//! that difference only by the factor measured / true range. The sums of this expression are updated beam by beam
-//! ([`Sums`]), and give a first line. A few Gauss-Newton steps lead from the first line to the likeliest line
+//! A line is a pair of numbers (a, b): a beam in the direction (cos, sin) meets the line at the range
+//! 1 / (a cos + b sin). This is the normal form r = cos (t - alpha) * range, with a = cos alpha / r and
+//! b = sin alpha / r.
+//!
+//! Ranges have normal noise along their beams. The likeliest line therefore has the minimum sum of squares of (measured
+//! range - range of the line). This difference is not linear in a and b. The expression range^2 (a cos + b sin) - range
+//! is linear, and differs from the difference only by the factor measured / true range. Its sums are updated beam by
+//! beam ([`Sums`]), and define a first line. A few Gauss-Newton steps lead from the first line to the likeliest line
 //! ([`LineEquation::refined`]).
 
 /// A beam that has a range: its direction as a unit vector, and its range in meters.
@@ -27,7 +29,8 @@ impl Ray {
     }
 }
 
-/// Line, as the inverse ranges at which beams meet it, in 1/m.
+/// A line as the numbers a and b of this module, in 1/m. They are the inverses of the ranges at which beams along x and
+/// along y meet the line.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct LineEquation {
     pub(super) a: f64,
@@ -41,8 +44,8 @@ impl LineEquation {
         self.a * ray.cos + self.b * ray.sin
     }
 
-    /// Returns the sum of the squared differences between the ranges and the line, in m2. It is infinite if a ray does
-    /// not meet the line.
+    /// Returns the sum of the squared differences between the ranges of `rays` and the ranges at which they meet the
+    /// line, in m2. It is infinite if a ray does not meet the line.
     pub(super) fn error(&self, rays: &[Ray]) -> f64 {
         let mut sum = 0.0;
         for ray in rays {
@@ -66,11 +69,12 @@ impl LineEquation {
         }
     }
 
-    /// Returns the line after at most `steps` steps toward the likeliest line for `rays`, and its error.
+    /// Returns a line that is at most `steps` steps from this line toward the likeliest line for `rays`, and its error.
     pub(super) fn refined(self, rays: &[Ray], steps: usize) -> (LineEquation, f64) {
         let (mut line, mut error) = (self, self.error(rays));
         if let [first, .., last] = rays {
-            // If a surface is seen at a very flat angle, the line of the sums may be behind the sensor.
+            // If beams meet a surface at a very flat angle, the line of the sums may be behind the sensor. Try the line
+            // through the first and the last ray, too.
             let through = LineEquation::through(first, last);
             let alternative = through.error(rays);
             if alternative < error {
@@ -101,18 +105,21 @@ impl LineEquation {
 /// Inverse of a range that no scanner reaches: 10 km.
 const MIN_INVERSE_RANGE: f64 = 1e-4;
 
-/// Information of rays about a line: the sums of the products of slopes, and of slope times difference.
+/// Information of rays about a line, for a Gauss-Newton step and the covariance. The derivatives are those of the range
+/// at which a ray meets the line, with respect to a and b.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Information {
+    /// Sums of the products of two derivatives.
     aa: f64,
     ab: f64,
     bb: f64,
+    /// Sums of the products of a derivative and the difference between the measured range and the line.
     a: f64,
     b: f64,
 }
 
 impl Information {
-    /// Returns the information about `line`; `None` if a ray does not meet it.
+    /// Returns the information of `rays` about `line`, or `None` if a ray does not meet the line.
     pub(super) fn of(line: &LineEquation, rays: &[Ray]) -> Option<Information> {
         let mut sums = Information::default();
         for ray in rays {
@@ -132,8 +139,8 @@ impl Information {
         Some(sums)
     }
 
-    /// Returns the covariance of a and b (aa, ab, bb) if a range has this `variance`; `None` if all rays have one
-    /// direction.
+    /// Returns the covariance of a and b, as its elements aa, ab and bb, if a range has this `variance`. Returns `None`
+    /// if all rays have the same direction.
     pub(super) fn inverse(&self, variance: f64) -> Option<(f64, f64, f64)> {
         let (product, det) = (self.aa * self.bb, self.aa * self.bb - self.ab * self.ab);
         let scale = variance / det;
@@ -150,7 +157,8 @@ impl Information {
     }
 }
 
-/// Sums over rays, from which line and error are computed.
+/// Sums over rays, from which the line with the minimum error of the linear expression is computed. The error of this
+/// line is computed from them, too.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sums {
     cc: f64,

@@ -1,31 +1,33 @@
-//! Partition of the rays of a scan into pieces, each of which ends on one line.
+//! Partition of the rays of a scan into pieces. The rays of a piece end on one line. The steps are:
 //!
-//! - Neighboring pieces are joined. At first, each piece has two rays. The cheapest join is always the next one.
-//!   Joining ends when there are few enough pieces and one more join would cost too much.
-//! - The cuts between the pieces are moved to where they cost least.
-//! - Cuts are moved from where they help least to where they help most.
-//! - The rays at the ends of pieces that fit worst are dropped.
+//! - Neighboring pieces are joined. At first, each piece has two rays. The next join is always the one with the lowest
+//!   cost. Joining ends when there are few enough pieces and one more join would cost too much.
+//! - Each cut between two pieces is moved to where it costs least.
+//! - A cut that hardly helps is removed, and another piece is cut in two instead, where the cut helps most.
+//! - Rays at the ends of pieces are dropped if they fit worst.
+//!
+//! All costs are errors: sums of squared differences between ranges and lines, in m2.
 
 use super::fit::{LineEquation, Ray, Sums};
 
-/// Limits of cutting.
+/// Limits of the partition.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Bounds {
     /// Maximum number of pieces.
     pub(super) max: usize,
-    /// If there are fewer than `max` pieces, a join must cost less than this, in m2.
+    /// Maximum cost of a join in m2, if there are at most `max` pieces. With more pieces, a join may cost more.
     pub(super) penalty: f64,
-    /// Variance of a range in m2. Two pieces whose own variance is greater are joined at a higher cost.
+    /// Variance of a range in m2. The cost of joining two pieces is reduced if their own variance is greater.
     pub(super) variance: f64,
-    /// Cost of a ray that belongs to no piece, in m2, if there are too many pieces.
+    /// Cost in m2 of dropping a ray because there are too many pieces.
     pub(super) loss: f64,
-    /// Minimum number of rays of a piece. Smaller ones are dropped.
+    /// Minimum number of rays of a piece. Smaller pieces are dropped.
     pub(super) min_points: usize,
-    /// Maximum number of rounds in which cuts are moved.
+    /// Maximum number of rounds in which cuts are moved after joining.
     pub(super) rounds: usize,
-    /// Whether cuts are also moved from one piece to another.
+    /// Whether a cut may also be removed in favor of a cut in another piece.
     pub(super) exchange: bool,
-    /// Maximum number of rays at the ends of pieces that may be dropped. The rays that fit worst are dropped first.
+    /// Maximum number of rays that may be dropped at the ends of pieces. The rays that fit worst are dropped first.
     pub(super) trimmed: usize,
 }
 
@@ -64,8 +66,8 @@ impl ScanPartitioner {
         Pieces { list: &self.pieces[..self.count], is_full }
     }
 
-    /// Creates a piece of each pair of rays. In a group with an odd number of rays, the last piece has three. Groups
-    /// that are too small are dropped.
+    /// Creates a piece of each pair of neighboring rays. In a group with an odd number of rays, the last piece has
+    /// three rays. Groups that are too small are dropped.
     fn begin(&mut self, rays: &[Ray], ends: &[u16], min_points: usize) {
         self.count = 0;
         let mut first = 0;
@@ -83,7 +85,8 @@ impl ScanPartitioner {
         }
     }
 
-    /// Drops pieces that are too small. Their neighbors take over the rays that fit.
+    /// Drops pieces that are too small. The pieces next to a dropped piece take over those of its rays that fit their
+    /// lines.
     fn drop_small_pieces(&mut self, rays: &[Ray], bounds: &Bounds) {
         let mut kept_count: usize = 0;
         let mut is_apart = true;
@@ -106,7 +109,7 @@ impl ScanPartitioner {
     }
 }
 
-/// Consecutive rays that end on one line.
+/// Piece of a scan: consecutive rays that end on one line.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Piece {
     pub(super) first: usize,
@@ -115,7 +118,8 @@ pub(super) struct Piece {
     pub(super) sums: Sums,
     /// Sum of the squared differences of the ranges from the line, in m2.
     pub(super) error: f64,
-    /// Whether the next piece starts a group, so that it is never joined with this one.
+    /// Whether the next piece is never joined with this piece, because it starts a group or a piece between them was
+    /// dropped.
     pub(super) is_last: bool,
 }
 
@@ -141,8 +145,8 @@ impl Piece {
         Piece { first: self.first, end: next.end, sums, error: sums.error(), is_last: next.is_last }
     }
 
-    /// Returns the cost of joining this piece with the next one, in m2, if ranges have this `variance`. If both pieces
-    /// vary more, as surfaces do that are not quite straight, the cost is reduced.
+    /// Returns the cost of joining this piece with the next one, in m2, if ranges have this `variance`. If the ranges
+    /// of the two pieces vary more, because the surfaces are not quite straight, the cost is reduced.
     fn join_cost(&self, next: &Piece, variance: f64) -> f64 {
         if self.is_last {
             return f64::INFINITY;
@@ -152,8 +156,8 @@ impl Piece {
         ((self.sums + next.sums).error() - apart) / (apart / free / variance).max(1.0)
     }
 
-    /// Adds the rays of `gap`, the rays next to the piece first, as long as each is within three standard deviations of
-    /// the line of the piece. Returns their number.
+    /// Adds rays of `gap` to the piece, and returns the number of added rays. The first ray of `gap` must be next to
+    /// the piece. Ends at the first ray that is more than three standard deviations away from the line of the piece.
     fn grow<'a>(&mut self, gap: impl Iterator<Item = &'a Ray>, variance: f64) -> usize {
         let mut taken = 0;
         for ray in gap {
@@ -171,25 +175,29 @@ impl Piece {
     }
 }
 
-/// Joiner of neighboring pieces. It has the order of the pieces, and the cost of joining each piece with the next one.
+/// Joiner of neighboring pieces. Pieces that were joined to another piece or dropped stay in the list without rays, so
+/// the joiner stores the neighbors of each remaining piece.
 struct Joiner {
+    /// Index of the piece before each piece, or [`NO_PIECE`].
     before: Box<[u16]>,
+    /// Index of the piece after each piece, or [`NO_PIECE`].
     after: Box<[u16]>,
+    /// Cost of joining each piece with the next one.
     costs: TournamentTree,
 }
 
 const NO_PIECE: u16 = u16::MAX;
 
 impl Joiner {
-    /// Creates a joiner for pieces of at least two rays, of at most `beams` beams.
+    /// Creates a joiner for the pieces of at most `beams` beams.
     pub(super) fn new(beams: usize) -> Joiner {
         let before = vec![NO_PIECE; beams].into();
         let after = vec![NO_PIECE; beams].into();
         Joiner { before, after, costs: TournamentTree::new(beams) }
     }
 
-    /// Joins `pieces`. Returns how many pieces are left, and whether there were more pieces than allowed. The pieces
-    /// that are left are then the first ones.
+    /// Joins `pieces`. Moves the remaining pieces to the start of `pieces`, and returns their number. Also returns
+    /// whether there were more pieces than allowed.
     pub(super) fn join(&mut self, pieces: &mut [Piece], bounds: &Bounds) -> (usize, bool) {
         self.begin(pieces, bounds.variance);
         let (mut remaining, mut is_full) = (pieces.len(), false);
@@ -199,7 +207,7 @@ impl Joiner {
             if remaining <= bounds.max && is_too_dear {
                 break;
             }
-            // Without a penalty, the number of pieces is the only limit, and no cost is too high.
+            // If there is no penalty, only the number of pieces limits joining, so no join costs too much.
             is_full |= is_too_dear && bounds.penalty > 0.0;
             match self.worst(pieces, bounds.loss, price) {
                 Some(worst) if remaining > bounds.max => self.drop_piece(pieces, worst),
@@ -229,9 +237,9 @@ impl Joiner {
         self.costs.build();
     }
 
-    /// Returns the piece that is cheapest to drop, if dropping it costs less than `price`.
+    /// Returns the index of the piece with the lowest cost of dropping it, if this cost is less than `price`.
     fn worst(&self, pieces: &[Piece], loss: f64, price: f64) -> Option<usize> {
-        // A piece has at least two rays.
+        // A piece has at least two rays, so dropping it cannot cost less.
         if price <= 2.0 * loss {
             return None;
         }
@@ -276,16 +284,18 @@ impl Joiner {
     }
 }
 
-/// Tournament tree: finds the minimum of numbers that change one at a time.
+/// Tournament tree: finds the minimum of some numbers. If a single number changes, the tree is updated quickly.
 struct TournamentTree {
     values: Box<[f64]>,
-    /// Winner of each match. The root has index 1. The numbers follow after the matches.
+    /// For each inner node, the index of the smallest number below the node. The root is node 1, and the children of
+    /// node n are the nodes 2n and 2n + 1. The numbers are the leaves, from node `size` on.
     winners: Box<[u16]>,
+    /// Number of leaves, a power of two.
     size: usize,
 }
 
 impl TournamentTree {
-    /// Creates a tree for at most half as many numbers as `beams`, or for one.
+    /// Creates a tree for at most half as many numbers as `beams`, but at least one number.
     fn new(beams: usize) -> TournamentTree {
         let beams = beams.max(1);
         let values = vec![f64::INFINITY; beams].into();
@@ -311,7 +321,7 @@ impl TournamentTree {
         }
     }
 
-    /// Sets number `i`, and updates the tree.
+    /// Sets the number with the index `i`, and updates the tree.
     fn set(&mut self, i: usize, value: f64) {
         self.values[i] = value;
         let mut node = (self.size + i) / 2;
@@ -355,7 +365,7 @@ fn move_cuts(pieces: &mut [Piece], rays: &[Ray]) -> bool {
     moved
 }
 
-/// Moves cuts until none moves, at most `rounds` times.
+/// Moves all cuts in rounds until no cut moves any more, at most `rounds` times.
 fn move_cuts_until_stable(pieces: &mut [Piece], rays: &[Ray], rounds: usize) {
     for _ in 0..rounds {
         if !move_cuts(pieces, rays) {
@@ -364,12 +374,12 @@ fn move_cuts_until_stable(pieces: &mut [Piece], rays: &[Ray], rounds: usize) {
     }
 }
 
-/// Moves cuts from where they help least to where they help most, as long as this lowers the cost, at most once per
-/// piece.
+/// Joins the two pieces that are cheapest to join, and cuts another piece in two where this helps most. Repeats this as
+/// long as it lowers the cost, at most once per piece.
 fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     let min_points = bounds.min_points.max(2);
     for _ in 0..pieces.len() {
-        // Piece whose cut in two helps most.
+        // Find the piece for which a cut in two helps most.
         let mut best = (0.0, 0, 0, (Sums::default(), Sums::default()));
         for (i, piece) in pieces.iter().enumerate() {
             if piece.len() < 2 * min_points || piece.error <= best.0 {
@@ -381,7 +391,7 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
             }
         }
         let (gain, split, cut, sums) = best;
-        // Find the two neighboring pieces that are cheapest to join, and leave out the piece that will be cut.
+        // Find the two neighboring pieces that are cheapest to join. Neither may be the piece that will be cut.
         let mut cheapest = (f64::INFINITY, 0);
         for i in 1..pieces.len() {
             let price = pieces[i - 1].join_cost(&pieces[i], bounds.variance);
@@ -397,7 +407,7 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
         let left = Piece { end: cut, sums: sums.0, error: sums.0.error(), is_last: false, ..piece };
         let right = Piece { first: cut, sums: sums.1, error: sums.1.error(), ..piece };
         pieces[join] = pieces[join].joined(&pieces[join + 1]);
-        // Joining has freed a slot. Move it to where the second half belongs.
+        // Joining has freed a slot in the list. Move the slot next to the piece that is cut, for its second half.
         let at = if join < split {
             pieces[join + 1..split].rotate_left(1);
             split - 1
@@ -410,8 +420,8 @@ fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     }
 }
 
-/// Drops rays at the ends of pieces, the most expensive ray first, as long as that ray costs more than three average
-/// rays.
+/// Drops rays at the ends of pieces, the ray with the highest cost first, as long as this ray costs more than three
+/// times the mean of all rays.
 fn trim(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     let count: usize = pieces.iter().map(Piece::len).sum();
     let mut error: f64 = pieces.iter().map(|piece| piece.error).sum();
@@ -437,7 +447,8 @@ fn trim(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
     }
 }
 
-/// Returns the best place to cut a piece into two halves of at least `min_points` rays each.
+/// Returns the best cut of a piece into two parts of at least `min_points` rays each: the index of the cut, the sums of
+/// both parts, and the sum of their errors.
 fn halves(rays: &[Ray], piece: &Piece, min_points: usize) -> (usize, (Sums, Sums), f64) {
     let mut best = (piece.first, (Sums::default(), Sums::default()), f64::INFINITY);
     let mut left = Sums::of(&rays[piece.first..piece.first + min_points - 1]);
@@ -452,7 +463,8 @@ fn halves(rays: &[Ray], piece: &Piece, min_points: usize) -> (usize, (Sums, Sums
     best
 }
 
-/// Returns the best place for the cut between two pieces, if it costs less than the present one.
+/// Returns the best cut between two pieces, and the sums of both pieces then. Returns `None` if no other cut costs less
+/// than the current one.
 fn best_cut(rays: &[Ray], left: &Piece, right: &Piece) -> Option<(usize, (Sums, Sums))> {
     let here = left.error + right.error;
     let mut best = (here * 0.999_999 - 1e-12, None);
@@ -477,5 +489,6 @@ fn best_cut(rays: &[Ray], left: &Piece, right: &Piece) -> Option<(usize, (Sums, 
     best.1
 }
 
-/// Maximum number of rounds in which cuts are moved. Cuts settle in fewer rounds.
+/// Maximum number of rounds in which cuts are moved after an exchange. Usually, no cut moves any more after fewer
+/// rounds.
 const MAX_ROUNDS: usize = 8;

@@ -2,10 +2,10 @@
 
 use crate::velocity::Pose2;
 
-/// A matrix as three rows.
+/// A 3 x 3 matrix, row by row. Rows and columns are x, y and yaw.
 pub(super) type Square = [[f64; 3]; 3];
 
-/// Adds `factor` v v' to `m`.
+/// Adds the matrix `factor` v v' to `m`, where v' is the transpose of `v`.
 #[inline]
 pub(super) fn add_outer(m: &mut Square, v: &[f64; 3], factor: f64) {
     for i in 0..3 {
@@ -25,13 +25,14 @@ fn product(a: &Square, b: &Square) -> Square {
     std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum()))
 }
 
-/// Returns a b a'.
+/// Returns a b a', where a' is the transpose of `a`: the covariance `b` after the linear transform `a`.
 pub(super) fn transformed(a: &Square, b: &Square) -> Square {
     let transposed: Square = std::array::from_fn(|i| std::array::from_fn(|j| a[j][i]));
     product(&product(a, b), &transposed)
 }
 
-/// Returns the eigenvalues of a symmetric matrix, and the unit vector of each, by Jacobi's rotations.
+/// Returns the eigenvalues of a symmetric matrix, and the eigenvector of each as a unit vector. The method is Jacobi's
+/// rotations.
 pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
     let mut vectors = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     for _ in 0..JACOBI_SWEEPS {
@@ -56,19 +57,19 @@ pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
     ([m[0][0], m[1][1], m[2][2]], vectors)
 }
 
-/// Returns the covariance of `step`, which leads from `start` to another position in the same frame. The errors of the
-/// two positions, with the covariances `reference` and `own`, are independent.
+/// Returns the covariance of `step`, which leads from `start` to another position in the same frame. `reference` is the
+/// covariance of `start`, and `own` that of the other position. The errors of the two positions must be independent.
 pub(super) fn of_step(own: &Square, reference: &Square, start: &Pose2, step: &Pose2) -> Square {
     let (x, y) = (start.turned_back((1.0, 0.0)), start.turned_back((0.0, 1.0)));
     let back = rotation(x, y);
-    // Derivatives of the step with respect to its start.
+    // Derivatives of the step with respect to the position of its start.
     let by_before = [[-x.0, -y.0, step.y], [-x.1, -y.1, -step.x], [0.0, 0.0, -1.0]];
     sum(&transformed(&back, own), &transformed(&by_before, reference))
 }
 
-/// Returns the covariance of the step `first` followed by the step `next`. Their covariances are `of_first` and
-/// `of_next`. The method is from Smith, Self and Cheeseman: "Estimating uncertain spatial relationships in robotics"
-/// (1990). The two errors must be independent.
+/// Returns the covariance of the step `first` followed by the step `next`. The covariances of the two steps are
+/// `of_first` and `of_next`, and their errors must be independent. The method is from Smith, Self and Cheeseman:
+/// "Estimating uncertain spatial relationships in robotics" (1990).
 pub(super) fn of_both(of_first: &Square, of_next: &Square, first: &Pose2, next: &Pose2) -> Square {
     let (x, y) = first.turned((next.x, next.y));
     let by_first = [[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]];
@@ -90,7 +91,7 @@ pub(super) fn rows(m: &Square) -> [f32; 9] {
     std::array::from_fn(|i| m[i / 3][i % 3] as f32)
 }
 
-/// Number of sweeps after which all digits of three eigenvalues are right.
+/// Number of rounds of rotations after which all digits of the three eigenvalues are right.
 const JACOBI_SWEEPS: usize = 6;
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
-//! Match of a scan with a reference scan. Each beam should end on the surface that is nearest to its end. The position
-//! of the scan is therefore the position at which the beams are off least.
+//! Match of a scan with a reference scan. If the position of the scan is right, each beam ends on the surface of the
+//! reference scan that is nearest to its end. The match searches for the position at which the ends of the beams are
+//! nearest to their surfaces.
 //!
 //! A [`PreparedScan`] has the data of one scan for the comparison: its points, the surfaces on which they lie, and its
 //! lines.
@@ -12,32 +13,33 @@ use super::covariance::{Square, add_outer, eigen, transformed};
 use crate::directions::Directions;
 use crate::velocity::{Pose2, is_whole};
 
-/// Position of one scan relative to another.
+/// Position of the current scan relative to the reference scan.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Match {
     pub(super) pose: Pose2,
-    /// Covariance of the position that the noise of the scan causes, and covariance that the noise of the reference
-    /// causes.
+    /// Covariance of the position that the noise of the current scan causes.
     pub(super) own: Square,
+    /// Covariance of the position that the noise of the reference scan causes.
     pub(super) of_reference: Square,
-    /// Share of the readings that lie on surfaces.
+    /// Share of the readings that lie on surfaces of the reference scan.
     pub(super) overlap: f64,
     /// Sum of the weights of the readings. A reading near a surface has more weight, so a match with a greater sum fits
     /// better.
     pub(super) weight: f64,
-    /// Whether there is a direction in which the position is unknown.
+    /// Whether there is a direction in which the surroundings do not define the position.
     pub(super) is_degenerate: bool,
-    /// Whether the scans have a corner in common.
+    /// Whether both scans have a corner at the same position.
     pub(super) has_corners: bool,
-    /// Whether the scans have a line in common.
+    /// Whether both scans have a line at the same position.
     pub(super) has_lines: bool,
 }
 
-/// Matcher of scans. It remembers which readings belong to moving objects.
+/// Matcher of scans. It stores which readings of the last scan belong to moving objects.
 pub(super) struct ScanMatcher {
-    /// For each reading, 0 if its object stands, otherwise the number of reference scans for which its moving object is
-    /// ignored.
+    /// For each reading of the last scan: 0 if its object stands, or the number of reference scans for which its moving
+    /// object is ignored.
     ignored_scans: Box<[u8]>,
+    /// Buffer for the runs of the current scan.
     runs: Box<[Run]>,
 }
 
@@ -49,41 +51,49 @@ struct Run {
     all: u16,
     /// Number of readings in space that was empty before.
     in_free_space: u16,
-    /// Number of readings on objects that moved before, and maximum number of reference scans for which these objects
-    /// are ignored.
+    /// Number of readings on objects that moved before.
     on_moving_objects: u16,
+    /// Maximum number of reference scans for which these objects are ignored.
     ignored_scans: u8,
     /// Number of readings near a surface.
     beams: u16,
-    /// Sum of their squared distances from the surface, in variances of their noise.
+    /// Sum of the squared distances of these readings from their surfaces, in variances of their noise.
     squared_distances: f64,
 }
 
-/// Sums over beams near surfaces.
+/// Sums over beams near surfaces. In these sums, n is the normal of a beam's surface, and p is the end of the beam. The
+/// vector v is (nx, ny, n x p / scale). It is the derivative of the beam's distance from the surface.
 #[derive(Default)]
 struct Sums {
-    /// Sum of the weights times v v', where v is (nx, ny, n x p / scale): the number of beams that meet walls across
-    /// each direction.
+    /// Sum of the weights times v v'. For a direction, it is about the number of beams that meet walls across this
+    /// direction.
     weight: Square,
+    /// Sum of the weights times distance times v.
     slope: [f64; 3],
     /// Part of `weight` that surfaces with an uncertain direction add by chance.
     chance: f64,
+    /// Sum of v v' times the squared weight and the variance that the noise of the current scan causes.
     own: Square,
+    /// Sum of v v' times the squared weight and the variance that the noise of the reference scan causes.
     of_reference: Square,
-    /// Sum of the squared distances of the beams. `expected` is the sum of the variances by noise alone.
+    /// Sum of the squared distances of the beams from their surfaces, with weights.
     squared_distances: f64,
+    /// Value of `squared_distances` that noise alone would cause.
     expected: f64,
     weights: f64,
     beams: usize,
 }
 
-/// Directions in which the surroundings define the position.
+/// Observability of the position in three directions: how well the surroundings define it there. The directions are the
+/// eigenvectors of [`Sums::weight`].
 struct Observability {
+    /// Eigenvalues: for each direction, about the number of beams that meet walls across it.
     values: [f64; 3],
+    /// Eigenvectors: the directions.
     vectors: [[f64; 3]; 3],
-    /// For each direction, whether enough beams meet walls across it for an estimate that is better than a guess.
+    /// For each direction, whether there are enough such beams for an estimate that is better than a guess.
     is_significant: [bool; 3],
-    /// For each direction, whether enough beams meet walls across it.
+    /// For each direction, whether there are enough such beams to define the position.
     is_known: [bool; 3],
 }
 
@@ -93,9 +103,9 @@ impl ScanMatcher {
         ScanMatcher { ignored_scans: vec![0; beams].into(), runs: vec![Run::default(); beams].into() }
     }
 
-    /// Returns the position of the current scan relative to the reference, near `begin`; `None` if too few beams match.
-    /// In a direction that the surroundings do not define, the position is taken from `begin`, with a standard
-    /// deviation of `unknown_m`.
+    /// Returns the position of the current scan relative to the reference scan, near `begin`. Returns `None` if too few
+    /// beams match. In a direction that the surroundings do not define, the position is that of `begin`, with a
+    /// standard deviation of `unknown_m`.
     pub(super) fn find(
         &mut self,
         reference: &PreparedScan,
@@ -138,23 +148,23 @@ impl ScanMatcher {
         (is_finite && pose.x.is_finite() && pose.y.is_finite() && pose.yaw.is_finite()).then_some(found)
     }
 
-    /// Returns for each reading of the last scan 0 if its object stands, otherwise the number of reference scans for
-    /// which its moving object is ignored.
+    /// Returns for each reading of the last scan: 0 if its object stands, or the number of reference scans for which
+    /// its moving object is ignored.
     pub(super) fn ignored_scans(&self) -> &[u8] {
         &self.ignored_scans
     }
 
-    /// Resets the matcher: no object is known to move.
+    /// Resets the matcher, so that all objects count as standing.
     pub(super) fn reset(&mut self) {
         self.ignored_scans.fill(0);
     }
 
-    /// Marks readings of moving objects. Returns whether the marked readings have changed. A run of neighboring
-    /// readings is marked if one of these is true:
+    /// Marks readings of moving objects. Returns whether other readings are marked than before. A run of neighboring
+    /// readings is marked if one of these conditions is true:
     ///
     /// - Together, the readings of the run are farther from surfaces than noise explains.
-    /// - Most of them lie in space that was empty before.
-    /// - Most of them lie on objects that moved before.
+    /// - Most readings of the run lie in space that was empty before.
+    /// - Most readings of the run lie on objects that moved before.
     fn mark_moving(&mut self, pair: &Pair<'_>, pose: &Pose2) -> bool {
         let width = 2.0 * pair.finest;
         let beams = pair.current.points().len();
@@ -188,7 +198,8 @@ impl ScanMatcher {
         for at in 0..runs {
             let end = if at + 1 < runs { self.runs[at + 1].first.into() } else { beams };
             let run = self.runs[at];
-            // The variance of the sum of squares is twice the number of beams.
+            // If there is only noise, the variance of the sum of squares is twice the number of beams. Allow four
+            // standard deviations.
             let n = f64::from(run.beams);
             let is_off = run.squared_distances > level * (MAX_MEAN_SQUARE * n + 4.0 * (2.0 * n).sqrt());
             let ignored_scans = match is_off || 2 * run.in_free_space > run.all {
@@ -209,22 +220,24 @@ impl ScanMatcher {
 struct Pair<'a> {
     reference: &'a PreparedScan,
     current: &'a PreparedScan,
-    /// See [`scale`].
+    /// Scale of turns in meters, see [`scale`].
     scale: f64,
     /// Maximum distance of a beam from its surface in the last rounds, in meters.
     finest: f64,
 }
 
-/// A beam that ends near a surface.
+/// Residual of a beam of the current scan that ends near a surface of the reference scan.
 struct SurfaceResidual {
+    /// End of the beam in the frame of the reference scan.
     point: (f64, f64),
     surface: Surface,
+    /// The residual: the signed distance of `point` from `surface`.
     distance: f64,
     /// Whether the surface belongs to a moving object.
     is_moving: bool,
-    /// Variance of the residual that the noise of the current scan causes. `reference_variance` is the variance that
-    /// the noise of the reference causes.
+    /// Variance of the residual that the noise of the current scan causes.
     current_variance: f64,
+    /// Variance of the residual that the noise of the reference scan causes.
     reference_variance: f64,
 }
 
@@ -235,8 +248,8 @@ impl SurfaceResidual {
 }
 
 impl Pair<'_> {
-    /// Improves the position of the current scan, starting at `pose` with beams that are at most `width` away from
-    /// surfaces.
+    /// Improves the position of the current scan in rounds, starting at `pose`. The first round uses beams that end at
+    /// most `width` away from their surfaces. Each later round halves this distance.
     fn converge(&self, mut pose: Pose2, width: f64, ignored_scans: &[u8]) -> Pose2 {
         let mut width = width.max(self.finest);
         let coarse = self.current.points().len().div_ceil(COARSE_BEAMS);
@@ -255,16 +268,18 @@ impl Pair<'_> {
         pose
     }
 
-    /// Returns the share of the readings that are near a surface.
+    /// Returns the share of the current readings that are near a surface of the reference scan, if the current scan is
+    /// at `pose`.
     fn overlap(&self, pose: &Pose2) -> f64 {
         let beams = self.current.points().len();
         (0..beams).filter(|&i| self.residual(i, pose, self.finest).is_some()).count() as f64 / beams as f64
     }
 
-    /// Returns the residual of reading `i`, if it is less than `width` away from a surface.
+    /// Returns the residual of reading `i` of the current scan, or `None` if it is at least `width` away from every
+    /// surface.
     fn residual(&self, i: usize, pose: &Pose2, width: f64) -> Option<SurfaceResidual> {
         let (reading, point) = (&self.current.readings()[i], pose.point(self.current.points()[i]));
-        // The end of the nearest beam may be as far from the point as two neighboring beams are from each other.
+        // The point may be on a surface between the ends of two beams. Search as far as these ends can be apart.
         let nearest = &self.reference.readings()[self.reference.nearest(point, width + MAX_SPACING_M)?];
         let surface = nearest.surface?;
         let distance = surface.distance(point);
@@ -275,7 +290,8 @@ impl Pair<'_> {
         );
         let (current_variance, reference_variance) =
             (deviations.0 * deviations.0, deviations.1 * deviations.1);
-        // A surface that is seen edge-on also varies across the beams.
+        // For a surface along its beams, the noise of the ranges has no effect on the distance. The minimum variance is
+        // for other errors.
         let min_variance = MIN_VARIANCE_SHARE * (self.current.noise * self.current.noise);
         (distance.abs() < width).then_some(SurfaceResidual {
             point,
@@ -287,14 +303,14 @@ impl Pair<'_> {
         })
     }
 
-    /// Returns the sums over every `stride`th beam at `pose` that is less than `width` away from a surface and not on a
-    /// moving object.
+    /// Returns the sums over beams of the current scan at `pose`. Only one beam in `stride` is used, and only if it
+    /// ends less than `width` away from a surface and not on a moving object.
     fn sums(&self, pose: &Pose2, width: f64, stride: usize, ignored_scans: &[u8]) -> Sums {
         let mut sums = Sums::default();
         for i in (0..self.current.points().len()).step_by(stride.max(1)).filter(|&i| ignored_scans[i] == 0) {
             let Some(residual) = self.residual(i, pose, width).filter(|on| !on.is_moving) else { continue };
             let (share, off) = (residual.distance / width, residual.distance);
-            // Tukey's biweight.
+            // Use Tukey's biweight, so that beams far from their surfaces have little weight.
             let weight = (1.0 - share * share) * (1.0 - share * share);
             let ((nx, ny), (x, y)) = (residual.surface.normal, residual.point);
             let row = [nx, ny, (ny * x - nx * y) / self.scale];
@@ -314,8 +330,8 @@ impl Pair<'_> {
     }
 }
 
-/// Returns the root mean square distance of the points of `now` in meters. A turn by its inverse in radians moves the
-/// points by about one meter. `None` if there are no points.
+/// Returns the root mean square distance of the points of `now` from the robot's center, in meters. A turn in radians
+/// times this distance is about the distance by which the turn moves the points. Returns `None` if there are no points.
 fn scale(now: &PreparedScan) -> Option<f64> {
     let square: f64 = now.points().iter().map(|point| point.0 * point.0 + point.1 * point.1).sum();
     let scale = (square / now.points().len().max(1) as f64).sqrt();
@@ -323,8 +339,8 @@ fn scale(now: &PreparedScan) -> Option<f64> {
 }
 
 impl Observability {
-    /// Computes the observability from `sums`. A direction is known if enough beams meet walls across it. The part of
-    /// their weight that chance adds does not count.
+    /// Computes the observability from `sums` over one of every `stride` beams. A direction is known if enough beams
+    /// meet walls across it. The part of the weight that chance adds is subtracted first.
     fn of(sums: &Sums, stride: usize) -> Observability {
         let (values, vectors) = eigen(sums.weight);
         let min_beams = (MIN_BEAMS as f64 / stride as f64).max(MIN_BEAM_SHARE * sums.weights);
@@ -338,7 +354,8 @@ impl Observability {
         }
     }
 
-    /// Returns the step against `slope` in the directions that have enough beams.
+    /// Returns the step that reduces the distances, in the directions that have enough beams. In the other directions,
+    /// it is 0.
     fn solve(&self, slope: &[f64; 3]) -> [f64; 3] {
         let mut step = [0.0; 3];
         for ((value, vector), is_significant) in
@@ -352,10 +369,10 @@ impl Observability {
         step
     }
 
-    /// Returns the covariance of the position that the noise of the current scan causes, and the covariance that the
-    /// noise of the reference causes, in meters and radians.
+    /// Returns two covariances of the position in meters and radians. The first one is due to the noise of the current
+    /// scan, and the second one is due to the noise of the reference scan.
     fn covariances(&self, sums: &Sums, scale: f64, unknown_m: f64) -> (Square, Square) {
-        // If beams are off by more than their noise, the position is less certain.
+        // If the distances of beams are greater than noise explains, the position is less certain.
         let factor = (sums.squared_distances / sums.expected).max(1.0);
         let inverse = self.inverse();
         let of_radians = [1.0, 1.0, 1.0 / scale];
@@ -383,7 +400,7 @@ impl Observability {
     }
 }
 
-/// Returns whether a corner of the current scan at `pose` is also a corner of the reference.
+/// Returns whether a corner of the current scan at `pose` is also a corner of the reference scan.
 fn same_corners(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) -> bool {
     let near = MATCH_DEVIATIONS * reference.noise.hypot(current.noise) + MATCH_MARGIN_M;
     let is_same = |corner: &Corner| {
@@ -394,8 +411,8 @@ fn same_corners(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) 
     current.lines.corners().iter().any(is_same)
 }
 
-/// Returns whether a line of the current scan at `pose` is also a line of the reference: both ends of the one line lie
-/// on the other line, and the two lines overlap.
+/// Returns whether a line of the current scan at `pose` is also a line of the reference scan. The two lines are equal
+/// if both ends of the current line lie on the reference line or its extension, and if the lines overlap.
 fn same_lines(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) -> bool {
     let near = MATCH_DEVIATIONS * reference.noise.hypot(current.noise) + MATCH_MARGIN_M;
     let is_same = |line: &Line| {
@@ -417,8 +434,9 @@ fn same_lines(reference: &PreparedScan, current: &PreparedScan, pose: &Pose2) ->
     current.lines.lines().iter().any(is_same)
 }
 
-/// Readings of one scan, with their surfaces and lines.
+/// Readings of one scan, with the surfaces on which they lie, and the lines of the scan.
 pub(super) struct PreparedScan {
+    /// Pose of the sensor on the robot.
     pose: Pose,
     /// First angle, step and number of the beams.
     grid: (f64, f64, usize),
@@ -427,7 +445,7 @@ pub(super) struct PreparedScan {
     points: Box<[(f64, f64)]>,
     readings: Box<[Reading]>,
     count: usize,
-    /// Index of the first reading at or after each beam.
+    /// For each beam, the index of the first reading at or after the beam.
     slots: Box<[u16]>,
     pub(super) lines: Lines,
     /// Standard deviation of a range in meters.
@@ -442,17 +460,18 @@ pub(super) struct Reading {
     pub(super) direction: (f64, f64),
     /// Range in meters.
     pub(super) range: f64,
+    /// Surface on which the reading lies, if it is known.
     pub(super) surface: Option<Surface>,
-    /// Number of reference scans for which its object is ignored, because it was seen to move; 0 if it stands.
+    /// Number of reference scans for which the object of the reading is ignored, because it has moved; 0 if it stands.
     pub(super) ignored_scans: u8,
 }
 
-/// A plane across the floor: x nx + y ny = r.
+/// A vertical surface: the points (x, y) with x nx + y ny = r, where (nx, ny) is `normal`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Surface {
     pub(super) normal: (f64, f64),
     pub(super) r: f64,
-    /// Variance of its direction in rad2.
+    /// Variance of the direction in rad2.
     pub(super) variance: f64,
 }
 
@@ -472,7 +491,7 @@ impl PreparedScan {
         }
     }
 
-    /// Replaces the content by `scan` of a sensor at `pose`, and its `lines`.
+    /// Replaces the content by `scan`, which comes from a sensor at `pose`, and the `lines` of this scan.
     pub(super) fn take(&mut self, pose: &Pose, scan: &Scan, lines: &Lines) {
         self.lines = *lines;
         let noise = f64::from(lines.noise_m);
@@ -499,7 +518,7 @@ impl PreparedScan {
         }
     }
 
-    /// Sets the surface of the readings on each line. Readings that are far from their line are left out.
+    /// Sets the surface of the readings on each line. Readings that are far from their line get no surface.
     fn set_surfaces_of_lines(&mut self) {
         for line in self.lines.lines() {
             let alpha = f64::from(line.alpha_rad);
@@ -520,7 +539,7 @@ impl PreparedScan {
         }
     }
 
-    /// Returns the surface through reading `i` and its neighbors, if they lie on one.
+    /// Returns the surface through reading `i` and its neighbors, or `None` if they do not lie on one surface.
     fn surface_of_neighbors(&self, i: usize) -> Option<Surface> {
         let (mut first, mut last) = (i, i);
         while first > 0 && i - first < SURFACE_NEIGHBORS && self.is_connected(first) {
@@ -569,14 +588,15 @@ impl PreparedScan {
         &self.points[..self.count]
     }
 
-    /// Stores for each reading the number of reference scans for which its object is ignored.
+    /// Sets [`Reading::ignored_scans`] of all readings.
     pub(super) fn set_ignored_scans(&mut self, ignored_scans: &[u8]) {
         for (reading, scans) in self.readings[..self.count].iter_mut().zip(ignored_scans) {
             reading.ignored_scans = *scans;
         }
     }
 
-    /// Returns whether `point` is in empty space: the beams on both sides end more than `margin` meters beyond it.
+    /// Returns whether `point` is in empty space: the beams on both sides of `point` end more than `margin` meters
+    /// farther away.
     pub(super) fn sees_through(&self, point: (f64, f64), margin: f64) -> bool {
         let Some((distance, at)) = self.towards(point) else { return false };
         let last = self.grid.2 as f64 - 1.0;
@@ -584,7 +604,8 @@ impl PreparedScan {
             return false;
         }
         let first = at as usize - 1;
-        // Check one more beam on each side, because exact angles may be a step off.
+        // Check one more beam on each side, because an exact angle may differ by up to a step from the angle at equal
+        // steps.
         (first..(first + 4).min(self.grid.2)).all(|beam| {
             let reading = self.readings().get(usize::from(self.slots[beam]));
             reading.is_some_and(|one| usize::from(one.beam) == beam && one.range > distance + margin)
@@ -592,7 +613,7 @@ impl PreparedScan {
     }
 
     /// Returns the distance of `point` from the sensor, and its direction as a number of steps after the first beam.
-    /// That number may be negative, or greater than the number of beams.
+    /// The number of steps may be negative, or greater than the number of beams.
     fn towards(&self, point: (f64, f64)) -> Option<(f64, f64)> {
         let (first, step, beams) = self.grid;
         let (x, y) = (point.0 - self.pose.x_m, point.1 - self.pose.y_m);
@@ -609,9 +630,10 @@ impl PreparedScan {
         is_whole(self.grid.2, self.grid.1)
     }
 
-    /// Returns the index of the reading whose point is nearest to `point`, if it is nearer than `max_distance`. The
-    /// sine of the angle between a beam and the direction of `point` gives a lower bound for the distance of this beam
-    /// and all beams farther aside. Therefore only a few beams are compared.
+    /// Returns the index of the reading whose point is nearest to `point`, or `None` if no reading is nearer than
+    /// `max_distance`. The sine of the angle between a beam and the direction of `point` gives a lower bound for the
+    /// distance of this beam and of all beams farther to the side. Only a few beams are compared, because the search in
+    /// each direction ends when this bound exceeds the minimum so far.
     pub(super) fn nearest(&self, point: (f64, f64), max_distance: f64) -> Option<usize> {
         let (_, step, beams) = self.grid;
         if self.count == 0 {
@@ -621,8 +643,8 @@ impl PreparedScan {
         let (turn, last) = (TAU / step.abs(), beams as f64 - 1.0);
         let begin = usize::from(self.slots[at.clamp(0.0, last) as usize]);
         let mut best = (max_distance * max_distance, None);
-        // Minimum distance of a beam that is `aside` steps away, by sin a >= 2 a / pi. Exact angles are up to a step
-        // off.
+        // Lower bound for the distance of a beam that is this number of steps to the side, by sin a >= 2 a / pi. An
+        // exact angle may differ by up to a step from the angle at equal steps.
         let bound = |steps: f64| distance * ((steps - 1.5) * step.abs() / FRAC_PI_2).clamp(0.0, 1.0);
         let mut compare = |i: usize, at: f64| {
             let steps = (f64::from(self.readings[i].beam) - at).abs();
@@ -659,48 +681,55 @@ impl Surface {
     }
 }
 
-/// Maximum distance of a beam from its surface in the first round, in meters. It is halved in each round.
+/// Maximum distance between the end of a beam and its surface in the first round, in meters. Each round halves it.
 const FIRST_WIDTH_M: f64 = 0.3;
-/// Maximum distance in the last rounds, in standard deviations. With this constant of Tukey, almost nothing is lost if
-/// there is only noise.
+/// Maximum distance between the end of a beam and its surface in the last rounds, in standard deviations. It is the
+/// constant of Tukey's biweight. With this value, the position is hardly less accurate if there is only noise.
 const MAX_DEVIATIONS: f64 = 3.0;
+/// Maximum number of rounds in which a position is improved.
 const MAX_ROUNDS: usize = 20;
-/// Number of beams that are enough for all rounds except the last ones.
+/// Maximum number of beams that are used in all rounds except the last ones.
 const COARSE_BEAMS: usize = 120;
+/// Step in meters below which a position is not improved any more.
 const MIN_STEP_M: f64 = 2e-5;
+/// Turn in radians below which a position is not improved any more.
 const MIN_STEP_RAD: f64 = 1e-5;
-/// Minimum number of beams that define a direction. Fewer beams may come from a leg.
+/// Minimum number of beams on walls across a direction that define the position in this direction. Fewer beams may come
+/// from a leg.
 const MIN_BEAMS: usize = 6;
-/// Minimum number of beams with which a direction is better than a guess.
+/// Minimum number of beams on walls across a direction with which the position in this direction is better than a
+/// guess.
 const MIN_SIGNIFICANT_BEAMS: f64 = 1.5;
-/// Minimum share of all beams that define a direction. In a long corridor, door frames can be mistaken for one another.
+/// Minimum share of all beams that must be on walls across a direction to define the position in this direction. With
+/// fewer beams, one door frame in a long corridor could be mistaken for another one.
 const MIN_BEAM_SHARE: f64 = 0.03;
 /// Maximum number of readings in a run. In a longer run, one end of a wall could mark the whole wall as moving.
 const MAX_RUN_LEN: usize = 24;
-/// Maximum squared distance that a reading adds, in variances of its noise, so that a few readings at an edge do not
-/// decide about the others.
+/// Maximum squared distance that a reading adds to the sum of its run, in variances of its noise. It is limited so that
+/// a few readings at an edge do not decide for the whole run.
 const MAX_SQUARE: f64 = 9.0;
-/// Number of times that moving objects are searched for.
+/// Maximum number of searches for moving objects in one match.
 const MAX_SEARCHES: usize = 2;
-/// Maximum mean square of the readings of an object that stands, in variances of their noise.
+/// Maximum mean of the squared distances of an object that stands, in variances of the noise.
 const MAX_MEAN_SQUARE: f64 = 3.0;
 /// Number of reference scans for which a moving object is ignored.
 const IGNORED_SCANS: u8 = 3;
-/// Minimum variance across a surface, as a share of the variance of a range.
+/// Minimum variance of a beam's distance from its surface, as a share of the variance of a range.
 const MIN_VARIANCE_SHARE: f64 = 0.05;
-/// Factor of the part of the weight that is expected by chance.
+/// Factor by which the weight that is expected by chance is multiplied before it is subtracted.
 const CHANCE_FACTOR: f64 = 2.0;
 /// Maximum distance between two neighboring points whose surface is used for a point between them, in meters.
 pub(super) const MAX_SPACING_M: f64 = 0.2;
-/// Maximum distance between equal corners or equal lines: a number of standard deviations plus a distance in meters.
+/// Maximum distance between equal corners or equal lines, in standard deviations. [`MATCH_MARGIN_M`] is added to it.
 const MATCH_DEVIATIONS: f64 = 3.0;
+/// Additional distance between equal corners or equal lines, in meters.
 const MATCH_MARGIN_M: f64 = 0.02;
-/// Minimum standard deviation of a range in meters, for errors of a scanner other than noise.
+/// Minimum standard deviation of a range in meters. It accounts for errors of a scanner other than noise.
 const MIN_NOISE_M: f64 = 0.005;
-/// Number of neighbors on each side that define a surface.
+/// Maximum number of neighbors on each side of a reading that define its surface.
 const SURFACE_NEIGHBORS: usize = 4;
-/// Maximum distance between two points of one object, in meters. It is added to the distance that a surface at a flat
-/// angle explains.
+/// Maximum distance between two neighboring points of one object, in meters, in addition to the distance that a surface
+/// at a flat angle explains.
 const MAX_CONNECTED_M: f64 = 0.1;
 /// Maximum variance of the direction of a surface, which is the square of 10 degrees.
 const MAX_DIRECTION_VARIANCE: f64 = 0.03;

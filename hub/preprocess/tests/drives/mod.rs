@@ -1,4 +1,5 @@
-//! Scans of a robot that drives through random rooms, with the true positions and the beams that met a person.
+//! Scans of a robot that drives through random rooms, with the true positions of the robot and the beams that met a
+//! person.
 #![allow(dead_code)] // each test takes what it needs
 
 use std::collections::HashMap;
@@ -10,7 +11,7 @@ use scanhub_schema::{Code, Scan, ScanHead};
 
 type Point = (f64, f64);
 
-/// Consecutive scans with the truth about them.
+/// Consecutive scans of a robot, with the true positions and targets.
 pub(crate) struct Drive {
     pub(crate) scans: Vec<Box<Scan>>,
     /// Position of the robot at the end of each scan.
@@ -26,8 +27,8 @@ pub(crate) struct Drive {
     random: Rng,
 }
 
-/// Squares of 0.1 m that scans saw free, each with the number of these scans. The squares are calculated from the true
-/// positions.
+/// Squares of 0.1 m that scans saw free, each with the number of scans that saw it free. The squares are calculated
+/// from the true positions of the robot.
 #[derive(Default)]
 pub(crate) struct ObservedSquares {
     squares: HashMap<(i32, i32), (u32, u32)>,
@@ -58,7 +59,7 @@ impl ObservedSquares {
     }
 }
 
-/// Returns the square that contains the point on a beam at this `range`, for the scan with index `at`.
+/// Returns the square that contains the point at the given `range` on a beam of the scan with index `at`.
 fn square(drive: &Drive, at: usize, beam: usize, range: f64) -> (i32, i32) {
     let (scan, before) = (&drive.scans[at], &drive.poses[at.saturating_sub(1)]);
     let (pose, angle) = (relative_pose(before, &drive.poses[at], scan, beam), scan.angle(beam));
@@ -66,7 +67,8 @@ fn square(drive: &Drive, at: usize, beam: usize, range: f64) -> (i32, i32) {
     ((10.0 * x).floor() as i32, (10.0 * y).floor() as i32)
 }
 
-/// Returns the robot's position at the time of a beam of `scan`, during which it moves from `before` to `pose`.
+/// Returns the robot's position at the time of a beam of `scan`. During the scan, the robot moves from `before` to
+/// `pose`.
 fn relative_pose(before: &Pose2, pose: &Pose2, scan: &Scan, beam: usize) -> Pose2 {
     let part = 1.0 + 1e-9 * scan.beam_ns(beam) as f64 / SCAN_PERIOD_S;
     let step = before.inverse().then(pose);
@@ -76,7 +78,7 @@ fn relative_pose(before: &Pose2, pose: &Pose2, scan: &Scan, beam: usize) -> Pose
 /// Duration of a scan of an LMS at half degrees, in seconds. It is two revolutions of the mirror.
 pub(crate) const SCAN_PERIOD_S: f64 = 0.026_64;
 
-/// Returns the stamp of the scan with this number, in ns.
+/// Returns the stamp of the scan with the index `number`, in ns.
 pub(crate) fn stamp_ns(number: usize) -> u64 {
     1_000_000_000 + (number as f64 * 1e9 * SCAN_PERIOD_S) as u64
 }
@@ -86,7 +88,7 @@ struct Walker {
     by_scan: Point,
 }
 
-/// Returns the head of a scan of `count` beams. The scan's ranges are in mm.
+/// Returns the head of a scan of `count` beams with ranges in mm.
 pub(crate) fn beams_at(count: usize, first_angle: f64, step: f64) -> ScanHead {
     let no_return = Code::NoReturn.value();
     ScanHead {
@@ -113,7 +115,7 @@ pub(crate) fn scan(head: ScanHead, mut range: impl FnMut(f64) -> Option<f64>) ->
     Scan::of(head, &(0..head.count).map(unit).collect::<Vec<_>>())
 }
 
-/// Returns a normally distributed number with deviation 1, by the method of Box and Muller.
+/// Returns a normally distributed number with standard deviation 1, by the method of Box and Muller.
 pub(crate) fn normal(random: &mut Rng) -> f64 {
     (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
 }
@@ -141,14 +143,15 @@ fn distance_to_disc(from: Point, along: Point, center: Point, radius: f64) -> Op
 }
 
 impl Drive {
-    /// Returns `count` scans of `beams` beams over 180 degrees in a room of `seed` with boxes in it.
+    /// Returns `count` scans of `beams` beams over 180 degrees. The robot drives through a room with boxes, which is
+    /// drawn from `seed`.
     pub(crate) fn through_a_room(seed: u64, beams: usize, count: usize, noise_m: f64) -> Drive {
         let mut drive = Drive::new_room(seed, beams, noise_m);
         drive.drive_on(count, 0.02);
         drive
     }
 
-    /// Returns scans like [`through_a_room`](Self::through_a_room), with this number of `people` around the robot.
+    /// Returns scans like [`through_a_room`](Self::through_a_room), with `people` people around the robot.
     pub(crate) fn among_people(seed: u64, beams: usize, count: usize, people: usize) -> Drive {
         let mut drive = Drive::new_room(seed, beams, 0.01);
         for _ in 0..people {
@@ -158,8 +161,8 @@ impl Drive {
         drive
     }
 
-    /// Returns scans of a robot among this number of walking `people`. The robot drives by `speed` meters per scan, or
-    /// does not move if `speed` is 0.
+    /// Returns scans of a robot among `people` people who walk. The robot drives by `speed` meters per scan, or does
+    /// not move if `speed` is 0.
     pub(crate) fn with_walkers(seed: u64, beams: usize, count: usize, people: usize, speed: f64) -> Drive {
         let mut drive = Drive::new_room(seed, beams, 0.01);
         for _ in 0..people {
@@ -173,8 +176,8 @@ impl Drive {
         drive
     }
 
-    /// Returns scans of an LMS at half degrees on a robot that drives by `speed` meters per scan among `people`. The
-    /// room has tables and chairs with thin legs, cupboards, and pillars. The robot moves while a scan is measured.
+    /// Returns scans of an LMS at half degrees. The robot drives by `speed` meters per scan among `people` people, and
+    /// moves while a scan is measured. The room has tables and chairs with thin legs, cupboards, and pillars.
     pub(crate) fn through_furniture(seed: u64, count: usize, people: usize, speed: f64) -> Drive {
         let mut drive = Drive::new_room(seed, 361, 0.01);
         drive.furnish();
@@ -185,15 +188,16 @@ impl Drive {
         drive
     }
 
-    /// Returns scans of an LMS at half degrees on a robot that turns on the spot in a room, by `deg_per_s` from the
-    /// first scan on. At the end, the robot does not move for 20 scans.
+    /// Returns scans of an LMS at half degrees, on a robot that turns on the spot in a furnished room. From the first
+    /// scan on, the robot turns by `deg_per_s`. At the end, it does not move for 20 scans.
     pub(crate) fn on_the_spot(seed: u64, count: usize, deg_per_s: f64) -> Drive {
         let mut drive = Drive::turning(seed, count + 1, deg_per_s);
         drive.stand_still(19);
         drive
     }
 
-    /// Returns `count` scans of an LMS at half degrees, on a robot that turns on the spot in a furnished room by `deg_per_s`.
+    /// Returns `count` scans of an LMS at half degrees, on a robot that turns on the spot in a furnished room by
+    /// `deg_per_s`.
     pub(crate) fn turning(seed: u64, count: usize, deg_per_s: f64) -> Drive {
         let mut drive = Drive::new_room(seed, 361, 0.01);
         drive.furnish();
@@ -267,7 +271,7 @@ impl Drive {
             legs: Vec::new(),
             walkers: Vec::new(),
             head: match beams {
-                // The same scan rate as an LMS.
+                // Scans with this number of beams have the times of an LMS.
                 361 => ScanHead::lms(361, -90_000, 500, 1, 15),
                 _ => beams_at(beams, -PI / 2.0, PI / (beams - 1) as f64),
             },
@@ -276,7 +280,7 @@ impl Drive {
         }
     }
 
-    /// Adds `count` scans, while the robot drives around by `speed` meters per scan.
+    /// Adds `count` scans while the robot drives around by `speed` meters per scan.
     pub(crate) fn drive_on(&mut self, count: usize, speed: f64) {
         let mut yaw_sum = 0.0;
         let yaw = TAU * self.random.f64();
@@ -290,7 +294,7 @@ impl Drive {
         }
     }
 
-    /// Adds `count` scans, while the robot turns on the spot by `deg_per_s`.
+    /// Adds `count` scans while the robot turns on the spot by `deg_per_s`.
     pub(crate) fn turn(&mut self, count: usize, deg_per_s: f64) {
         let step = Pose2::new(0.0, 0.0, (deg_per_s * SCAN_PERIOD_S).to_radians());
         for _ in 0..count {
@@ -299,7 +303,7 @@ impl Drive {
         }
     }
 
-    /// Adds a scan. The robot has moved by `by` since the previous scan, and turns by `deg_per_s` during this one.
+    /// Adds a scan. The robot has moved by `by` since the previous scan, and turns by `deg_per_s` during the new scan.
     pub(crate) fn move_by(&mut self, by: Pose2, deg_per_s: f64) {
         let before = self.poses.last().copied().unwrap_or_default().then(&by);
         self.scan_between(
@@ -308,13 +312,13 @@ impl Drive {
         );
     }
 
-    /// Adds `count` scans, while the robot stands.
+    /// Adds `count` scans while the robot stands.
     pub(crate) fn stand_still(&mut self, count: usize) {
         let pose = self.poses.last().copied().unwrap_or_default();
         (0..count).for_each(|_| self.scan_from(pose));
     }
 
-    /// Adds a scan that ends at `pose`. The robot moves there from its last position during the scan.
+    /// Adds a scan. During the scan, the robot moves from its last position to `pose`.
     fn scan_from(&mut self, pose: Pose2) {
         self.scan_between(self.poses.last().copied().unwrap_or(pose), pose);
     }
@@ -325,7 +329,7 @@ impl Drive {
         let times = Scan::of(*head, &[]);
         for walker in walkers.iter_mut() {
             walker.at = (walker.at.0 + walker.by_scan.0, walker.at.1 + walker.by_scan.1);
-            // Walkers turn back near the robot and far away from it.
+            // A walker turns back when it comes too near to the robot or too far away from the robot.
             let (dx, dy) = (walker.at.0 - pose.x, walker.at.1 - pose.y);
             let far = dx.hypot(dy);
             let outwards = dx * walker.by_scan.0 + dy * walker.by_scan.1;

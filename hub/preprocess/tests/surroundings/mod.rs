@@ -1,5 +1,6 @@
-//! Scans of random surroundings: beams that flip between one to three surfaces, a moving object, codes, zeroes, and
-//! noise with outliers. They are harder than real rooms, and not a simulation.
+//! Scans of random surroundings. Each beam flips between one to three surfaces. There are a moving object, codes,
+//! ranges of 0, and noise with outliers. Such scans are harder for a background model than scans of real rooms, which
+//! they do not simulate.
 #![allow(dead_code)] // each test takes what it needs
 
 use std::fmt;
@@ -21,7 +22,7 @@ pub(crate) struct Shape {
 }
 
 impl Shape {
-    /// Returns a random shape that a sensor has.
+    /// Returns one of the shapes that scans of real sensors have.
     pub(crate) fn any(random: &mut fastrand::Rng) -> Shape {
         let (count, first_angle_mdeg, step_mdeg) = [
             (181, -90_000, 1000),
@@ -82,7 +83,7 @@ impl RandomSurroundings {
                 0..10 => max - random.u16(..9),
                 10..16 => 0,
                 16..40 => (range_mm / f64::from(shape.unit_mm)) as u16 + random.u16(..90),
-                // These beams go through a window.
+                // These beams pass through a window, so they have no return or a range beyond the maximum.
                 _ if i % 40 < 3 => max - 8 * u16::from(i % 3 == 0),
                 _ => ((range_mm + noise_mm) / f64::from(shape.unit_mm)).max(0.0) as u16,
             };
@@ -128,8 +129,8 @@ pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
     model.ranges().iter().map(mm).collect()
 }
 
-/// Passes `scan` to `model`, and compares the whole result with `classes` and `generation`. The payload contains `dirt`
-/// before. A failure prints `description`.
+/// Passes `scan` to `model`, and compares the whole result with `classes` and `generation`. Before, every byte of the
+/// payload is `dirt`. If the comparison fails, `description` is printed.
 pub(crate) fn check_scan(
     model: &mut BackgroundModel,
     scan: &Scan,
@@ -145,7 +146,7 @@ pub(crate) fn check_scan(
     assert_eq!(out, foreground(scan, classes, generation, dirty()), "{description}");
 }
 
-/// Returns the foreground for `classes`. Its segments are the segments in `expected`.
+/// Returns the foreground for `classes`. Its segments are taken from `expected`.
 fn foreground(
     scan: &Scan,
     classes: &[Class],
@@ -169,13 +170,13 @@ fn foreground(
     expected
 }
 
-/// Returns the millimeters per device unit.
+/// Converts a device unit from micrometers to millimeters.
 pub(crate) fn unit_mm(unit_um: u32) -> f64 {
     f64::from(unit_um) / 1000.0
 }
 
-/// Returns the maximum difference between readings of one surface, in mm. It is the set value, or the default for the
-/// unit, and at least one unit.
+/// Returns the maximum difference between two readings of one surface, in mm. It is `set_mm`, or the default for the
+/// scan's unit. If this is less than one unit, the difference is one unit.
 pub(crate) fn max_difference_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
     let default_mm = match scan.unit_um {
         1_000 => 30,
@@ -185,7 +186,7 @@ pub(crate) fn max_difference_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
     f64::from(set_mm.unwrap_or(default_mm)).max(unit_mm(scan.unit_um))
 }
 
-/// Returns a random choice: true, false, or the default.
+/// Returns a random value for an optional setting: true, false, or `None` for the default.
 pub(crate) fn any_choice(random: &mut fastrand::Rng) -> Option<bool> {
     [None, Some(false), Some(true)][random.usize(..3)]
 }
