@@ -1,5 +1,5 @@
-//! The program `scanhub-bridge`: the search for it, the check of its version, and its own check whether a bridge could
-//! connect. Zenoh is linked into that program, not into this one.
+//! The program `scanhub-bridge`. This module finds the program, checks its version, and runs its check whether a bridge
+//! could connect. Zenoh is linked into that program, not into this one.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -14,15 +14,15 @@ pub const PROGRAM: &str = "scanhub-bridge";
 /// Remedy if the program is missing.
 const INSTALL_REMEDY: &str = "in the directory of scanhub's source: cargo install --path clients/bridge";
 
-/// Returns the directories in which the program may be, in the order of the search: that of this program, and those of
-/// PATH.
+/// Returns the directories in which the program may be, in the order of the search: the directory of this program, and
+/// the directories of PATH.
 pub fn search_directories() -> Vec<PathBuf> {
     let own = std::env::current_exe().ok().and_then(|path| path.parent().map(Path::to_owned));
     let path = std::env::var_os("PATH").unwrap_or_default();
     own.into_iter().chain(std::env::split_paths(&path)).collect()
 }
 
-/// Returns the first program in `directories`. It has the version of this program.
+/// Returns the path of the first `scanhub-bridge` in `directories`, which has the version of this program.
 ///
 /// # Errors
 ///
@@ -64,13 +64,14 @@ pub struct Bridge {
     pub connect: Vec<String>,
     /// A file of Zenoh's own configuration.
     pub config: Option<PathBuf>,
-    /// Directories in which the program may be, in the order of the search. If it is empty, those of
+    /// Directories in which the program may be, in the order of the search. If the list is empty, the directories of
     /// [`search_directories`].
     pub directories: Vec<PathBuf>,
 }
 
 impl Bridge {
-    /// Returns the findings of the check `bridge`: those of the program, if the user named a router.
+    /// Returns the findings of the check `bridge`. If the user named a router or a configuration, these are the
+    /// findings of the program.
     pub(crate) fn check(&self) -> Vec<Finding> {
         if self.connect.is_empty() && self.config.is_none() {
             return vec![Finding::skipped(CHECK, "no router is named; --bridge tcp/HOST:7447 does")];
@@ -83,7 +84,7 @@ impl Bridge {
         }
     }
 
-    /// Returns the findings of `program` when it connects.
+    /// Runs the check of `program`, which tries to connect, and returns its findings.
     fn check_with(&self, program: &Path) -> Vec<Finding> {
         let mut command = Command::new(program);
         command.args(["--check", "--json"]).stdin(Stdio::null());

@@ -131,14 +131,14 @@ impl ConfigureArgs {
             }
         }
         let consent = request_consent(plan, stop)?;
-        // A scanner that streams has filled the input buffer in the meantime.
+        // A scanner that streams has filled the input buffer while the person decided.
         port.discard_input(plan.baud.rate()).map_err(|error| lost_before_writing(&name, &error))?;
         let mut change = Change::new(consent, clock::now());
         if let PortSpec::Tcp { .. } = source {
             change = change.with_server();
         }
         let mut shown = None;
-        // An interrupt would leave the change incomplete. It takes seconds, and ends in any case.
+        // An interrupt would leave the change incomplete. The change takes only seconds, and always ends.
         let never_stop = AtomicBool::new(false);
         let mut procedure = Procedure::new(|change: &Change| {
             if shown != Some(change.step()) {
@@ -162,7 +162,7 @@ pub struct Difference {
     class: &'static str,
     port: String,
     item: &'static str,
-    /// Index of its first byte in the configuration; `None` if the scanner keeps it elsewhere.
+    /// Index of the value's first byte in the configuration; `None` if the scanner stores the value elsewhere.
     offset: Option<usize>,
     before: String,
     after: String,
@@ -178,7 +178,8 @@ impl fmt::Display for Difference {
 impl Difference {
     /// Returns everything that `plan` changes in the scanner at `port`.
     ///
-    /// `was_permanent` states whether the scanner has started at another rate than 9600 Bd so far, if it reported that.
+    /// `was_permanent` states whether the scanner has so far used another rate than 9600 Bd after power-on. `None` if
+    /// the scanner did not report it.
     fn all(
         port: &str,
         plan: &Plan,
@@ -349,7 +350,7 @@ fn describe_step(step: Step) -> &'static str {
     }
 }
 
-/// Returns the value of `item` in hex, with its meaning if it has one.
+/// Returns the value of `item` in hex, with its meaning if that is known.
 fn describe_value(item: Item, bytes: &[u8], family: Option<LmsModel>) -> String {
     let value = bytes.get(item.at..item.at + item.len).unwrap_or_default();
     let byte = value.first().copied().unwrap_or_default();
@@ -436,7 +437,7 @@ impl SettingsRequest {
     /// # Errors
     ///
     /// Returns [`Kind::Configuration`] with key, value and the valid values if a setting is invalid, and
-    /// [`Kind::Usage`] if there is none.
+    /// [`Kind::Usage`] if `settings` is empty.
     pub(crate) fn parse(settings: &[String]) -> Result<SettingsRequest, Failure> {
         if settings.is_empty() {
             let keys: Vec<String> = KEYS.iter().map(|(key, values, _)| format!("{key}={values}")).collect();
@@ -475,7 +476,8 @@ impl SettingsRequest {
                 }
                 Setting::PowerOn(power_on) => {
                     let is_set = report.status().is_some_and(|status| status.has_permanent_baud());
-                    // The scanner does not report which rate it keeps, so keeping the present one is always a change.
+                    // The scanner does not report which rate it uses after power-on, so a request to keep the present
+                    // rate always counts as a change.
                     let needed = power_on == PowerOn::KeepBaud || is_set;
                     plan.power_on = needed.then_some(power_on);
                 }

@@ -1,8 +1,8 @@
 //! `scanhub doctor`: checks every condition of a working setup, and reports findings and remedies.
 //!
 //! It changes no scanner, no file and no process, unless the user requests the removal of files that dead processes
-//! left. It opens a port that was named and that no process holds, as the hub would: the port stays raw at the rate of
-//! the last request, and its driver returns bytes at once.
+//! left. If a port was named and no process holds it, `doctor` opens the port in the same way as the hub. Afterwards,
+//! the port remains in raw mode at the rate of the last request, and its driver still returns bytes at once.
 
 mod hub;
 mod installation;
@@ -52,7 +52,7 @@ pub struct DoctorArgs {
 
 impl DoctorArgs {
     /// Makes all checks, and prints each finding as soon as it is known. The configuration is that of `sources`. A hub
-    /// would create `domain`, and a client would search for it in `locations`.
+    /// would create `domain`, and a client would search for the domain in `locations`.
     ///
     /// # Errors
     ///
@@ -104,10 +104,10 @@ impl DoctorArgs {
 /// The ports, the configuration and the machine to check.
 #[derive(Clone, Debug)]
 pub struct CheckTargets {
-    /// Ports as the user named them, or names of links of the running hub. If it is empty, those of the configuration
-    /// and of the running hub.
+    /// Ports as the user named them, or names of links of the running hub. If the list is empty, the ports of the
+    /// configuration and of the running hub.
     pub ports: Vec<PortSpec>,
-    /// The configuration, or the reason why it is invalid; `None` if there is none.
+    /// The configuration, or the reason why it is invalid; `None` if no configuration exists.
     pub config: Option<Result<Config, Failure>>,
     /// The gateway's section of the configuration.
     pub gateway: Gateway,
@@ -225,7 +225,7 @@ impl Finding {
         Finding::new(name, State::Skipped, why, "")
     }
 
-    /// Returns this finding as one of a port and its link.
+    /// Returns this finding, assigned to `port` and its `link`.
     pub(crate) fn at(self, port: &str, link: Option<&str>) -> Finding {
         Finding { port: Some(port.to_owned()), link: link.map(str::to_owned), ..self }
     }
@@ -332,8 +332,8 @@ pub fn run_checks(
     }
 }
 
-/// Returns the ports that the user named. If there are none, those of the configuration, or all ports of the machine,
-/// with the ports of the running hub.
+/// Returns the ports that the user named. If the user named none, returns the ports of the configuration, or all ports
+/// of the machine if the configuration has none, and in addition the ports of the running hub.
 fn select_ports(
     targets: &CheckTargets,
     serial_ports: &[SerialPortInfo],
@@ -363,7 +363,7 @@ fn select_ports(
             .collect();
     }
     // The hub may have other links than this configuration, and ports that are not lines of this machine. A port that
-    // it waits for stays unopened.
+    // the hub waits for is not opened.
     let add_links_of_hub = |mut ports: Vec<PortTarget>| {
         for source in hub.map(Hub::ports).unwrap_or_default() {
             if !ports.iter().any(|subject| subject.source.is_same_port(&source)) {

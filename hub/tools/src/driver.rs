@@ -1,6 +1,6 @@
-//! Driver of protocol state machines on an open port, for a user at a terminal: [`run_protocol`] runs any of them. With
-//! it, [`search`] finds the scanner, and [`detect`] identifies one that rotates. A thread of the hub does the same for
-//! a link, without an end.
+//! Driver of protocol state machines on an open port, for a user at a terminal: [`run_protocol`] runs any state machine
+//! until it is done. [`search`] uses it to find the scanner, and [`detect`] to identify a rotating scanner. In the hub,
+//! the thread of a link does the same, but without an end.
 
 use std::fmt;
 use std::io;
@@ -55,12 +55,12 @@ impl DetectedScanner {
         self.stats.damaged as f64 / (self.stats.in_telegrams + self.stats.damaged).max(1) as f64
     }
 
-    /// Returns whether the line damages most bytes, which makes every conclusion from the others unreliable.
+    /// Returns whether the line damages most bytes, which makes every conclusion from the undamaged bytes unreliable.
     pub(crate) fn is_unreliable(&self) -> bool {
         self.damaged() > UNRELIABLE_DAMAGE
     }
 
-    /// Returns what the line does to the bytes and what to do about it, if it damages more than one in a hundred.
+    /// Returns the share of damaged bytes and the remedy, as text, if the line damages more than one byte in a hundred.
     pub(crate) fn line_problem(&self) -> Option<String> {
         let damaged = self.damaged();
         (damaged > MAX_DAMAGED)
@@ -80,7 +80,7 @@ impl fmt::Display for DetectedScanner {
 pub(crate) struct NotFound {
     /// Number of bytes received.
     pub(crate) bytes: u64,
-    /// Families and rates that it has looked for.
+    /// Families and rates that the search has tried.
     pub(crate) coverage: Vec<Coverage>,
 }
 
@@ -115,8 +115,8 @@ pub(crate) fn search(
     Ok(search.found().ok_or_else(not_found))
 }
 
-/// Identifies the rotating scanner that a search has found at `port`. Returns it, if more packets arrived than could
-/// match by chance; otherwise the number of bytes received.
+/// Identifies the rotating scanner that a search has found at `port`. Returns the scanner if more packets arrived than
+/// could match by chance; otherwise the number of bytes received.
 ///
 /// Sends nothing to a scanner that streams without a request. From other scanners it requests identity and health, lets
 /// them measure for a second, and stops them as a hub does.
@@ -211,8 +211,9 @@ struct Detection {
 }
 
 impl Task<Session> for Detection {
-    /// Takes over what the scanner has reported of itself. From then on its motor is controlled. If it reports an
-    /// error, the session would restart it next.
+    /// Takes over the scanner's identity and health once the session has received them. From then on, the session may
+    /// control the scanner's motor. Returns false if the scanner reports an error, because the session would restart
+    /// the scanner next.
     fn may_continue(&mut self, port: &Port, session: &Session) -> io::Result<bool> {
         if self.introduction.is_some() {
             return Ok(true);
@@ -226,7 +227,7 @@ impl Task<Session> for Detection {
         }
     }
 
-    /// Before the scanner has replied, its motor stays as it is.
+    /// Sets the line DTR, which controls the motor, but leaves the motor as it is before the scanner has replied.
     fn set_dtr(&mut self, port: &Port, on: bool) -> io::Result<()> {
         self.dtr = Some(on);
         if self.introduction.is_some() { port.set_dtr(on) } else { Ok(()) }
@@ -270,8 +271,9 @@ struct EndTask;
 
 impl Task<Session> for EndTask {}
 
-/// Procedure with an end, such as requests to an LMS. Calls `progress` before each wait, and ends early if it returns
-/// false. Logs each rate once that the port cannot have; a search leaves it out.
+/// Task for a protocol that ends by itself, such as requests to an LMS. Calls `progress` before each wait, and ends
+/// early if `progress` returns false. If the port rejects a rate, logs the rate once, and the protocol continues
+/// without it.
 pub(crate) struct Procedure<F> {
     progress: F,
     refused: Vec<u32>,
@@ -305,20 +307,23 @@ pub(crate) const LINE_REMEDY: &str =
     "a shorter or shielded cable, ground next to the signal, 3.3 V levels; another adapter";
 /// Maximum share of damaged bytes on a good line.
 const MAX_DAMAGED: f64 = 0.01;
-/// Share of damaged bytes that makes conclusions from the others unreliable.
+/// Share of damaged bytes above which conclusions from the undamaged bytes are unreliable.
 pub(crate) const UNRELIABLE_DAMAGE: f64 = 0.5;
 
-/// Number of rounds of a search on a silent line.
+/// Maximum number of rounds of a search on a silent line.
 const MAX_SILENT_ROUNDS: usize = 2;
-/// Number of rounds of a search if bytes have arrived. A scanner may miss a request, and the line may damage the reply.
+/// Maximum number of rounds of a search if bytes have arrived. A scanner may miss a request, and the line may damage
+/// the reply.
 const MAX_ROUNDS: usize = 4;
-/// Minimum time of a search. Rounds are short if the family is known.
+/// Minimum time of a search. It matters if the family is known, because the rounds are then short.
 const MIN_SEARCH_TIME: Nanos = 1_000 * MILLIS;
-/// Minimum number of packets of a scanner. Other bytes pass a checksum of 8 bits now and then, but not that often.
+/// Minimum number of packets that identify a scanner. Other bytes match a checksum of 8 bits now and then, but not that
+/// often.
 const MIN_PACKETS: u64 = 20;
 /// Minimum number of complete revolutions for a measurement of the head's speed.
 const MIN_REVOLUTIONS: u32 = 5;
-/// Timeout for the first packets or the first reply of a scanner that was found. Replies may be damaged.
+/// Timeout for the first packets or the first reply of a scanner that was found. It allows for repeated requests,
+/// because replies may be damaged.
 const FIRST_TIMEOUT: Nanos = 2_000 * MILLIS;
 /// Minimum time for which measured data are received.
 const MEASURING_TIME: Nanos = 1_000 * MILLIS;
@@ -327,7 +332,7 @@ const SPIN_UP_TIMEOUT: Nanos = 7_000 * MILLIS;
 /// Timeout for [`MIN_REVOLUTIONS`]. It is long enough for a head that makes two revolutions per second.
 const REVOLUTIONS_TIMEOUT: Nanos = 4_000 * MILLIS;
 
-/// Reactions of a program to a protocol that [`run_protocol`] does the I/O for.
+/// Callbacks of a program to which [`run_protocol`] passes the events and requests of a protocol.
 pub(crate) trait Task<P> {
     /// Called before each action. Returns whether to carry it out; if not, the driver waits.
     fn may_continue(&mut self, port: &Port, protocol: &P) -> io::Result<bool> {
@@ -345,12 +350,12 @@ pub(crate) trait Task<P> {
         let _ = event;
     }
 
-    /// Handles that the port cannot have `rate`.
+    /// Handles that the port rejects `rate`.
     fn on_refused(&mut self, port: &Port, rate: u32, error: &io::Error) {
         let _ = (port, rate, error);
     }
 
-    /// Called before each wait. Returns its latest end, or `None` to end.
+    /// Called before each wait. Returns the time at which the wait ends at the latest, or `None` to end the protocol.
     fn deadline(&mut self, protocol: &P, now: Nanos) -> Option<Nanos> {
         let _ = (protocol, now);
         None
@@ -379,7 +384,7 @@ pub(crate) fn run_protocol<P: Protocol>(
         }
         let (now, until) = (clock::now(), until.min(limit));
         let mut fds = [PollFd::new(port, PollFlags::IN)];
-        // An interrupted wait only ends early.
+        // A signal that interrupts the wait only ends it early.
         let _ = poll(&mut fds, Some(&clock::poll_timeout(now, until.min(now + STOP_CHECK_INTERVAL))));
         let len = port.read(protocol.read_buffer()).map_err(|error| port_lost(port, &error))?;
         let now = clock::now();

@@ -1,6 +1,6 @@
-//! `scanhub probe`: finds the scanner at a port, whatever its family, by the search of the hub, and then requests what
-//! it reports of itself. Changes no settings. `SuggestedLink` is the link that a configuration needs for the scanner,
-//! as a command for the shell and as a section of a file.
+//! `scanhub probe`: finds the scanner at a port with the search of the hub, for scanners of any family. Then requests
+//! the identity, settings and state that the scanner reports. Changes no settings. `SuggestedLink` is the link that a
+//! configuration needs for the scanner, as a command for the shell and as a section of a file.
 
 mod description;
 
@@ -51,7 +51,7 @@ impl ProbeArgs {
     ///
     /// # Errors
     ///
-    /// Returns the kinds of a port that cannot be used, including [`Kind::PortBusy`] if another process has it open.
+    /// Returns the failures of a port that cannot be used, including [`Kind::PortBusy`] if another process has it open.
     /// Returns [`Kind::PortMissing`] if there is no port to list, [`Kind::Timeout`] if no scanner replies, and
     /// [`Kind::Interrupted`] if `stop` is set.
     pub fn run(
@@ -78,7 +78,7 @@ impl ProbeArgs {
     }
 }
 
-/// Prints the serial lines of this machine, and the adapters that have none.
+/// Prints the serial lines of this machine, and the adapters that have no serial line.
 fn list_ports(json: bool, out: &mut dyn Write) -> Result<(), Failure> {
     const PLUG_IN: &str =
         "plug in an adapter for RS-422 (500 kBd) or RS-232; `dmesg` shows whether the kernel saw it";
@@ -109,7 +109,7 @@ struct CandidateLine<'a> {
     /// ID of the process that has the port open.
     holder: Option<u32>,
     program: Option<&'a str>,
-    /// Name below by-id that another adapter has too.
+    /// Name in /dev/serial/by-id that another adapter has, too.
     shared_name: Option<String>,
     caution: Option<String>,
     remedy: Option<String>,
@@ -160,7 +160,7 @@ impl<'a> AdapterLine<'a> {
     }
 }
 
-/// Returns the caution about a port, including one about the name that it shares.
+/// Returns the caution about a port and its remedy, including the caution that another adapter shares the port's name.
 fn caution(candidate: &SerialPortInfo) -> Option<(String, String)> {
     candidate.caution(candidate.shared_name.as_ref().unwrap_or(&candidate.name))
 }
@@ -212,8 +212,8 @@ impl fmt::Display for ProbeResult {
     }
 }
 
-/// Finds the scanner at `source`. Until its family is known, it gets only the requests of the search. Calls `on_rate`
-/// with each rate at which it searches.
+/// Finds the scanner at `source`. Until the family is known, the scanner gets only the requests of the search. Calls
+/// `on_rate` with each rate at which it searches.
 fn probe(
     source: &PortSpec,
     locations: &[Domain],
@@ -234,7 +234,8 @@ fn probe(
         })?;
     Ok(match found_scanner {
         FoundScanner::Reported(report) => {
-            // The rate of a serial server is set there.
+            // The rate of a serial server is set at the server, so the link needs the rate at which the scanner
+            // replied.
             let rate = if is_server(source) { report.baud.map(|baud| baud.rate()) } else { None };
             let settings = link_settings(&report, rate.unwrap_or(first));
             let found = FoundDescription::Reported(Box::new(Description::new(source.name(), &report)));
@@ -273,7 +274,7 @@ pub(crate) fn find(
     stop: &AtomicBool,
     mut on_rate: impl FnMut(u32),
 ) -> Result<FoundScanner, Failure> {
-    // A probe finds the rate, too.
+    // A family with a probe needs no search, because its probe also finds the rate.
     let known = only.filter(|&family| features(family).has_probe);
     let found = match known {
         Some(family) => search::FoundScanner { family, model: None, rate: None },
@@ -291,8 +292,8 @@ pub(crate) fn find(
 }
 
 /// Returns the failure for a port at which a search has found no scanner. The message lists the families and rates of
-/// the search, and the hint what to check at a scanner of each family. If a family was named, the scanner may belong to
-/// another one.
+/// the search, and the hint states what to check at a scanner of each family. If the user named a family (`is_named`),
+/// the hint adds that the scanner may belong to another one.
 fn nothing_found(source: &PortSpec, is_named: bool, NotFound { bytes, coverage }: &NotFound) -> Failure {
     let (possible, impossible): (Vec<_>, Vec<_>) = coverage.iter().partition(|it| !it.rates.is_empty());
     let at_rates = |it: &&Coverage| format!("{} at {} Bd", it.family.name(), or_list(&it.rates));
@@ -355,18 +356,21 @@ pub(crate) fn source(text: &str) -> Result<PortSpec, Failure> {
     })
 }
 
-/// Checks that no other process has `source` open, whether or not it has locked it. Otherwise, each of the two would
+/// Checks that no other process has `source` open, even without a lock. Otherwise, that process and this one would each
 /// get only a part of the bytes. `locations` are the locations in which a client would search for the domain of a hub.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::PortBusy`] with the process. If it is a hub, the failure states what the hub reports about its link.
+/// Returns [`Kind::PortBusy`] with the process. If this process is a hub, the failure contains the hub's report about
+/// its link.
 pub(crate) fn check_unused(source: &PortSpec, locations: &[Domain]) -> Result<(), Failure> {
     let holders = match source {
-        // Many processes have a device such as /dev/null open. The failure to open it is the reason.
+        // The path is not a tty. It may be a device such as /dev/null, which many processes have open. Opening the port
+        // will fail with a better reason.
         PortSpec::Tty(path) if check_tty(path).is_err() => return Ok(()),
         PortSpec::Tty(path) => all_holders(path),
-        // Another process may be connected to the server from anywhere. Only a hub of this machine reports it.
+        // Another process may be connected to the server from anywhere. Only a hub of this machine reports that it is
+        // connected.
         PortSpec::Tcp { .. } | PortSpec::File { .. } => Vec::new(),
     };
     match Hub::at(source, &holders, locations) {
@@ -389,8 +393,8 @@ pub(crate) fn open(source: &PortSpec, stop: &AtomicBool) -> Result<(Port, u32), 
     Ok((port, rate))
 }
 
-/// Requests identity, settings and state of the scanner at `port` by `probe`. The highest rate of the port is
-/// `first`, in bits per second. If the family was named, the scanner may belong to another one.
+/// Requests identity, settings and state of the scanner at `port` by `probe`. The highest rate of the port is `first`,
+/// in bits per second. If the user named the family, the failure adds that the scanner may belong to another one.
 ///
 /// # Errors
 ///
@@ -428,8 +432,8 @@ fn is_server(source: &PortSpec) -> bool {
     matches!(source, PortSpec::Tcp { .. })
 }
 
-/// Returns the failure for a scanner that did not reply to a probe, with possible reasons, after `bytes` bytes
-/// arrived. It may stream at `streams_at`. The highest rate of the port is `first`. Rates are in bits per second.
+/// Returns the failure for a scanner that did not reply to a probe, with possible reasons, after `bytes` bytes arrived.
+/// The scanner may stream at `streams_at`. The highest rate of the port is `first`. Rates are in bits per second.
 fn no_reply(source: &PortSpec, first: u32, streams_at: Option<u32>, bytes: u64) -> Failure {
     let name = source.name();
     let received_text = match bytes {
@@ -475,7 +479,7 @@ struct SuggestedLink {
 }
 
 impl SuggestedLink {
-    /// Creates the link for a scanner at `source`, with keys and values besides name and port.
+    /// Creates the link for a scanner at `source`, with the keys and values in `settings` besides name and port.
     pub(crate) fn new(
         source: &PortSpec,
         serial_ports: &[SerialPortInfo],
@@ -513,19 +517,20 @@ fn candidate_of<'a>(source: &PortSpec, serial_ports: &'a [SerialPortInfo]) -> Op
     serial_ports.iter().find(|candidate| candidate.device == device)
 }
 
-/// Returns the name by which a configuration should name `source`: the one that stays, whatever is plugged in next.
+/// Returns the name by which a configuration should name `source`: the name that stays when other devices are plugged
+/// in.
 fn permanent_name(source: &PortSpec, serial_ports: &[SerialPortInfo]) -> String {
     let PortSpec::Tty(path) = source else { return source.name() };
     let path: PathBuf = std::path::absolute(path).unwrap_or_else(|_| path.clone());
     let name = match candidate_of(source, serial_ports) {
-        // A symlink elsewhere was created by the user, so keep it.
+        // The user created a symlink in another directory, so keep its name.
         Some(candidate) if path == candidate.device || is_by_udev(&path) => &candidate.name,
         _ => &path,
     };
     name.display().to_string()
 }
 
-/// Returns whether udev's own rules made the name.
+/// Returns whether udev's own rules created the name `path`.
 fn is_by_udev(path: &Path) -> bool {
     path.parent().is_some_and(|parent| parent.ends_with("serial/by-id") || parent.ends_with("serial/by-path"))
 }
@@ -547,7 +552,7 @@ fn toml_string(text: &str) -> String {
 pub(crate) const HIGHEST_RATE: u32 = IdentityProbe::RATES[IdentityProbe::RATES.len() - 1];
 /// Highest rate of a probe that every serial port supports, in bits per second.
 const COMMON_RATE: u32 = IdentityProbe::RATES[IdentityProbe::RATES.len() - 2];
-/// Name of the sensor; the user may choose another one.
+/// Name of the sensor in the suggested link; the user may choose another name.
 const SENSOR_NAME: &str = "front";
 
 #[cfg(test)]
@@ -583,7 +588,7 @@ mod tests {
         assert!(noisy.message.contains("7 bytes arrived that scanhub does not recognize"), "{noisy}");
         let server = failure("tcp:box:4001", 0, &[]);
         assert!(server.hint.starts_with("set the serial server to the scanner's rate"), "{server}");
-        // The port has no rate of one family, and lacks one rate of another.
+        // The port supports no rate of one family, and lacks one rate of another family.
         let slow = failure("/dev/ttyS0", 0, &[230_400, 921_600, 500_000]);
         let cannot =
             "; this port cannot have 230400 or 921600 Bd, so scanners of family ld cannot be found here";

@@ -24,7 +24,7 @@ use serde::Serialize;
 
 use parser::{Item, StreamParser};
 
-/// Explain telegrams field by field, or write them
+/// Explain telegrams field by field
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct TelegramArgs {
@@ -66,7 +66,8 @@ impl TelegramArgs {
     /// # Errors
     ///
     /// Returns [`Kind::Check`] if there is no telegram, [`Kind::Input`] if the input cannot be read, [`Kind::NoTopic`]
-    /// if the recording does not have this sensor, and [`Kind::Usage`] if it has several sensors and none is selected.
+    /// if the recording does not have this sensor, and [`Kind::Usage`] if the recording has several sensors and the
+    /// user has selected none.
     pub fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
         let Action::Decode(args) = &self.action;
         decode(args, json, out)
@@ -148,7 +149,7 @@ fn unreadable(name: &str, error: &io::Error) -> Failure {
     Failure::new(Kind::Input, format!("{name}: {error}"), hint)
 }
 
-/// Reads bytes in pieces, and converts hexadecimal text.
+/// Input that is read in pieces. Hexadecimal text is converted to bytes.
 pub(crate) struct Input {
     reader: Box<dyn Read>,
     buffer: Vec<u8>,
@@ -261,8 +262,9 @@ fn is_framed(path: &Path) -> bool {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if the file cannot be read or has no telegrams, [`Kind::NoTopic`] if it does not have this
-/// sensor, and [`Kind::Usage`] if a name is missing, or is given although the file has none.
+/// Returns [`Kind::Input`] if the file cannot be read or has no telegrams, and [`Kind::NoTopic`] if it does not have
+/// this sensor. Returns [`Kind::Usage`] if the file has several sensors and `sensor` is `None`, or if the file has no
+/// sensor names and `sensor` is given.
 fn open_recording(path: &Path, sensor: Option<&str>) -> Result<RecordingInput, Failure> {
     let mut recording = Recording::open_as(path, Some(Family::Lms))?;
     if let Some(sensor) = sensor {
@@ -325,12 +327,12 @@ pub(crate) enum OutputForm {
     Json,
 }
 
-/// Writes items with one call each, and counts them.
+/// Printer of items. It writes each item with one call, and counts the items.
 pub(crate) struct ItemPrinter<'o> {
     out: &'o mut dyn Write,
     form: OutputForm,
     mode: Option<Mode>,
-    /// Whether the user chose the mode. Otherwise it is that of the telegrams.
+    /// Whether the user chose the mode. Otherwise, the mode is the one that the telegrams report.
     is_mode_chosen: bool,
     summary: Summary,
 }
@@ -387,7 +389,8 @@ struct FieldLine {
 }
 
 impl<'o> ItemPrinter<'o> {
-    /// Creates a printer to `out`. Values are split according to `mode`, or else to the mode in the telegrams.
+    /// Creates a printer to `out`. Values are split according to `mode`, or, without one, according to the mode that
+    /// the telegrams report.
     pub(crate) fn new(out: &'o mut dyn Write, form: OutputForm, mode: Option<Mode>) -> ItemPrinter<'o> {
         let summary = Summary { class: "summary", ..Summary::default() };
         ItemPrinter { out, form, mode, is_mode_chosen: mode.is_some(), summary }
@@ -545,7 +548,7 @@ fn text(field: &Field<'_>, all: bool) -> String {
     let mut text = format!("\n          {:>4}  {:<20}  {}", field.offset, hex(field.bytes, 6), field.name);
     let words = describe_field(field).map_or(String::new(), |words| format!(" ({words})"));
     let _ = match field.value {
-        // Show the meaning, because users do not know the number.
+        // Show only the meaning, because users do not know the numbers of these fields.
         Value::Number(_) if FRAME_FIELDS.contains(&field.name) => match describe_field(field) {
             Some(words) => write!(text, ": {words}"),
             None => Ok(()),
@@ -591,7 +594,7 @@ fn hex(bytes: &[u8], max: usize) -> String {
 
 /// Length of a piece that is read at once.
 const CHUNK_LEN: usize = 16 * 1024;
-/// Fields whose bytes or text people read, and not the number.
+/// Fields that are shown as bytes and meaning, but not as a number.
 const FRAME_FIELDS: [&str; 6] = ["STX", "address", "command", "error", "status", "checksum"];
 
 #[cfg(test)]

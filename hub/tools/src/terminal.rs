@@ -9,7 +9,7 @@ use serde::Serialize;
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] if it cannot be written, as on a full disk.
+/// Returns [`Kind::Failed`] if the line cannot be written, as on a full disk.
 pub(crate) fn print(
     out: &mut dyn Write,
     json: bool,

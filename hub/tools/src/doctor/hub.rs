@@ -1,5 +1,5 @@
-//! The links of a running hub, as it reports them. No other process can send a request to a scanner whose port the hub
-//! holds.
+//! The links of a running hub, as the hub reports them. No other process can send a request to a scanner whose port the
+//! hub holds.
 
 use std::path::Path;
 use std::time::Duration;
@@ -24,8 +24,9 @@ impl Hub {
         Some(Hub { pid, info: "scanhub info".to_owned(), statuses: statuses(domain).unwrap_or_default() })
     }
 
-    /// Returns the hub that uses the port `source`: one of its `holders`, in `locations` or in another domain of this
-    /// machine, or a hub in `locations` that is connected to this serial server.
+    /// Returns the hub that uses the port `source`. For a tty, this is a hub among the `holders` of the port, in
+    /// `locations` or in another domain of this machine. For a serial server, it is a hub in `locations` that is
+    /// connected to the server.
     pub(crate) fn at(source: &PortSpec, holders: &[Holder], locations: &[Domain]) -> Option<Hub> {
         if let PortSpec::Tcp { .. } = source {
             let is_connected = |(_, status): (&str, &Status)| status.state() != Some(State::Absent);
@@ -52,7 +53,8 @@ impl Hub {
         self.source_of(self.link_named(source)?.1.as_ref()?)
     }
 
-    /// Returns the port of the link with this `status`. The hub may have been started in another directory.
+    /// Returns the port of the link with this `status`. A relative path is relative to the hub's working directory,
+    /// which may differ from that of this process.
     fn source_of(&self, status: &Status) -> Option<PortSpec> {
         let source = PortSpec::parse(status.port()).ok()?;
         let PortSpec::Tty(path) = &source else { return Some(source) };
@@ -79,7 +81,8 @@ impl Hub {
         self.statuses.iter().filter(|(_, status)| status.is_none()).map(|(name, _)| name.clone()).collect()
     }
 
-    /// Returns name and status of the link with this port, even if its configuration has another name for it.
+    /// Returns name and status of the link with this port, even if the hub's configuration has another name for the
+    /// port.
     pub(crate) fn link(&self, port: &PortSpec) -> Option<(&str, &Status)> {
         let links =
             || self.statuses.iter().filter_map(|(name, status)| Some((name.as_str(), status.as_ref()?)));
@@ -98,7 +101,8 @@ impl Hub {
         }
     }
 
-    /// Returns the next commands for a link of this hub that has a problem. `holders` have its port open.
+    /// Returns the commands that a user can run next if link `name` of this hub has a problem. `holders` have the port
+    /// of the link open.
     pub(crate) fn remedy(&self, name: &str, status: &Status, holders: &[Holder]) -> String {
         let info = format!("{} {name}", self.info);
         match status.state() {
@@ -138,7 +142,8 @@ impl Hub {
         Failure::new(Kind::PortBusy, message, remedies.join("; "))
     }
 
-    /// Returns the command that stops the hub. The service manager holds ports only for a service.
+    /// Returns the command that stops the hub. If the service manager is among the `holders` of its port, the hub is a
+    /// service.
     fn stop(&self, holders: &[Holder]) -> String {
         if holders.iter().any(|holder| holder.pid == SERVICE_MANAGER) {
             "sudo systemctl stop scanhub".to_owned()
@@ -195,7 +200,7 @@ fn statuses(domain: &Domain) -> Result<Vec<LinkStatus>, Failure> {
 
 /// Process ID of the service manager, which holds ports only for a service.
 const SERVICE_MANAGER: u32 = 1;
-/// Number of polls: a second and a half in total.
+/// Number of polls for the last statuses, one every 20 ms, so 1.5 s in total.
 const MAX_POLLS: u32 = 75;
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 

@@ -2,8 +2,8 @@
 //! are the service with its program and the udev rule, which `hub/dist/install.sh` installs, and the configuration of
 //! logind, which may remove shared memory at logout. A hub that is started by hand needs neither service nor rule.
 //!
-//! Hub and clients of different versions refuse each other. Programs are compared by their bytes, otherwise by the
-//! version that they report.
+//! Hub and clients of different versions refuse each other. Programs are compared by their bytes and, if these differ,
+//! by the version that the programs report.
 
 use std::fs::{self, File, Metadata};
 use std::io::{ErrorKind, Read};
@@ -20,8 +20,8 @@ use scanhub_shm::LIBRARY_VERSION;
 
 use crate::doctor::Finding;
 
-/// The files of a machine, and the user that reads them. They are below a directory that need not be the root of this
-/// machine, so that tests can provide files of an administrator.
+/// The files of a machine, and the user that reads them. The files are below a directory that need not be the root of
+/// this machine, so that tests can provide files of an administrator.
 #[derive(Clone, Debug)]
 pub struct System {
     root: PathBuf,
@@ -62,7 +62,7 @@ impl System {
     }
 
     /// Returns the files of `directories` whose names end with `.conf`, in the order of their names. If several files
-    /// have the same name, only that of the first directory counts (as systemd reads drop-in files).
+    /// have the same name, only the file of the first directory counts, as systemd reads drop-in files.
     fn drop_ins(&self, directories: &[String]) -> Vec<PathBuf> {
         let mut found: Vec<PathBuf> = Vec::new();
         for directory in directories {
@@ -92,7 +92,8 @@ impl System {
 pub(crate) enum VersionMatch {
     /// A program with the same bytes.
     Same,
-    /// Another build, and the version that it reports; `None` if it must not be started, or reports none.
+    /// Another build, and the version that it reports; `None` if the program must not be started, or reports no
+    /// version.
     Other(Option<String>),
 }
 
@@ -100,11 +101,11 @@ pub(crate) enum VersionMatch {
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct RunningProgram {
     build: VersionMatch,
-    /// Whether its file was replaced or removed after the start.
+    /// Whether the program's file was replaced or removed after the start of the process.
     is_replaced: bool,
 }
 
-/// Reports the versions, and compares this program with that of the `hub`, if one runs.
+/// Reports the versions, and compares this program with the program of the `hub`, if a hub runs.
 pub(crate) fn version(system: &System, hub: Option<u32>) -> Finding {
     let kernel = system.text("proc/sys/kernel/osrelease").unwrap_or_default();
     let own = match kernel.trim() {
@@ -173,7 +174,8 @@ fn compare(program: &Path, trusted: bool) -> std::io::Result<VersionMatch> {
     Ok(VersionMatch::Other(if trusted && is_ours(&their) { reported_version(program) } else { None }))
 }
 
-/// Returns the user that process `pid` runs as. The owner of its directory may be root instead.
+/// Returns the user that process `pid` runs as. The owner of its directory in /proc would not be reliable, because it
+/// may be root.
 pub(crate) fn user_of(pid: u32) -> Option<u32> {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
     status.lines().find_map(|line| line.strip_prefix("Uid:"))?.split_whitespace().next()?.parse().ok()
@@ -310,7 +312,7 @@ pub(crate) fn rules(system: &System, serial_ports: &[SerialPortInfo]) -> Finding
     )
 }
 
-/// Returns the program that `unit` starts, with respect to its drop-in files.
+/// Returns the program that `unit` starts, according to the unit and its drop-in files.
 fn program(system: &System, unit: &Path) -> Option<PathBuf> {
     let directories: Vec<String> =
         UNIT_DIRECTORIES.iter().map(|directory| format!("{directory}/{UNIT_NAME}.d")).collect();
@@ -338,7 +340,7 @@ fn is_enabled(system: &System) -> bool {
     })
 }
 
-/// Returns whether the service has processes, by the kernel's list of its control group.
+/// Returns whether the service has processes, according to the kernel's list of the service's control group.
 fn is_running(system: &System) -> bool {
     let groups = ["", "unified/", "systemd/"]
         .map(|kind| format!("sys/fs/cgroup/{kind}system.slice/{UNIT_NAME}/cgroup.procs"));
@@ -425,14 +427,14 @@ const VERSION: &str = env!("CARGO_PKG_VERSION");
 const BLOCK_LEN: usize = 1 << 16;
 /// Maximum length of the output of `--version`, in bytes.
 const MAX_OUTPUT: u64 = 1 << 10;
-/// Number of polls: two seconds in total.
+/// Number of polls for the end of `--version`, one every 10 ms, so two seconds in total.
 const MAX_POLLS: u32 = 200;
 const POLL_INTERVAL: Duration = Duration::from_millis(10);
 const UNIT_NAME: &str = "scanhub.service";
 const RULE_NAME: &str = "60-scanhub.rules";
 /// The rule of this version.
 const RULE_TEXT: &str = include_str!("../../../dist/60-scanhub.rules");
-/// Directories in which systemd searches for units, in its order.
+/// Directories in which systemd searches for units, in the order of its search.
 const UNIT_DIRECTORIES: [&str; 5] = [
     "etc/systemd/system",
     "run/systemd/system",
@@ -440,7 +442,7 @@ const UNIT_DIRECTORIES: [&str; 5] = [
     "usr/lib/systemd/system",
     "lib/systemd/system",
 ];
-/// Directories in which udev searches for rules, in its order.
+/// Directories in which udev searches for rules, in the order of its search.
 const RULE_DIRECTORIES: [&str; 5] = [
     "etc/udev/rules.d",
     "run/udev/rules.d",
@@ -449,7 +451,7 @@ const RULE_DIRECTORIES: [&str; 5] = [
     "lib/udev/rules.d",
 ];
 const INSTALL_REMEDY: &str = "sudo hub/dist/install.sh puts this version in place";
-/// Directories in which systemd searches for its configuration, in its order.
+/// Directories in which systemd searches for its configuration, in the order of its search.
 const CONFIG_DIRECTORIES: [&str; 4] =
     ["etc/systemd", "run/systemd", "usr/local/lib/systemd", "usr/lib/systemd"];
 /// Highest ID of a system user (systemd, SYSTEM_UID_MAX).

@@ -1,5 +1,5 @@
-//! Checks one port from the outside in: existence, holders, permissions and rates. Then follow the scanner at its other
-//! end, and the bytes that the line has damaged or lost.
+//! Checks one port: its existence, holders, permissions and rates. Then checks the scanner at the other end of the
+//! line, and counts the bytes that the line has damaged or lost.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -55,7 +55,7 @@ pub(crate) fn check_port(
     }
     let holders = all_holders(path);
     if !holders.is_empty() {
-        // Opening the port would change its settings under the process that has it.
+        // Opening the port would change its settings for the process that has it open.
         let own = hub.filter(|hub| holders.iter().any(|holder| holder.pid == hub.pid));
         let of_other_domain = if own.is_none() { Hub::at(&subject.source, &holders, &[]) } else { None };
         match own.or(of_other_domain.as_ref()) {
@@ -105,10 +105,10 @@ pub(crate) fn check_port(
         }
     };
     report(Finding::ok("access", format!("can be opened, is a serial line{}", describe_permissions(path))));
-    // The hub's settings of an open port make most adapters return bytes at once.
+    // Read the latency now: opening the port with the hub's settings makes most adapters return bytes at once.
     report(latency(path, latency_ms(path)));
     let answer = check_scanner(subject, &port, first, stop)?;
-    // Without an answer, bytes may have arrived at another rate.
+    // Without a reply, the bytes may have arrived at another rate, so their errors do not count.
     let reply_errors = if answer.is_ok() { port.line_errors() } else { 0 };
     let found = answer.as_ref().ok().and_then(|answer| answer.0);
     report(rate(subject, &port, first, found));
@@ -145,8 +145,8 @@ fn check_server(
     }
 }
 
-/// Rate at which a rotating scanner was found, and the findings about the scanner. Otherwise the reason why none
-/// replied.
+/// Rate at which the scanner was found if it is a rotating scanner, and the findings about the scanner. If no scanner
+/// replied, a finding with the reason.
 type ScannerCheck = Result<(Option<u32>, Vec<Finding>), Finding>;
 
 /// Checks the scanner at `port`, which is open at `first`, in bits per second.
@@ -174,7 +174,7 @@ fn scanner_findings(check: ScannerCheck) -> Vec<Finding> {
 }
 
 /// Checks the holders of a port that the hub has open. Another process takes bytes away from the hub. Only the service
-/// manager may hold the port, too, because it keeps the port for the next hub.
+/// manager may hold the port in addition to the hub, because it keeps the port for the next hub.
 fn holder_finding(holders: &[Holder], hub: u32) -> Finding {
     const NAME: &str = "holder";
     let names: Vec<String> = holders.iter().map(ToString::to_string).collect();
@@ -279,17 +279,17 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
     )
 }
 
-/// Checks whether the port supports the rate of the stream: the rate of the rotating scanner that was `found`, or that
-/// of the link.
+/// Checks whether the port supports the rate of the stream: the rate at which a rotating scanner was `found`, or the
+/// rate of the link.
 fn rate(subject: &PortTarget, port: &Port, first: u32, found: Option<u32>) -> Finding {
     const NAME: &str = "rate";
-    // The search for a scanner leaves out a rate that the port cannot have.
+    // If the family is unknown, the search for the scanner does without the rates that the port rejects.
     let link = subject.link.as_ref().filter(|link| link.family().is_some());
     let link_rate = link.map_or(probe::HIGHEST_RATE, scanhub_config::Link::rate);
     let required_rate = found.unwrap_or(link_rate);
     let outcome = port.set_baud(required_rate);
     let actual_rate = port.baud().filter(|&actual| actual != required_rate);
-    // The requests start at the rate at which the port was opened.
+    // Restore the rate at which the port was opened, because the requests start at this rate.
     let _ = port.set_baud(first);
     match (outcome, link) {
         (Ok(()), _) => {
@@ -374,7 +374,7 @@ fn line_loss(status: &Status) -> Finding {
     }
     let due = status.counters[Counter::DueOnLine];
     let all = match status.lost_on_line() {
-        // Damaged scans are lost, too, but too few arrive to count them.
+        // Damaged scans are lost, too, but too few undamaged scans arrive to count the lost ones.
         Some(0) if is_mostly_damaged(status) => {
             format!("the number of lost {} is unknown", status.transmission_name())
         }
@@ -392,12 +392,13 @@ fn line_loss(status: &Status) -> Finding {
     }
 }
 
-/// Returns whether the line damages most bytes, which makes every conclusion from the others unreliable.
+/// Returns whether the line damages most bytes, which makes every conclusion from the undamaged bytes unreliable.
 pub(crate) fn is_mostly_damaged(status: &Status) -> bool {
     status.damaged_share() > UNRELIABLE_DAMAGE
 }
 
-/// Returns whether `errors` in `bytes` are more than the search for a scanner causes, and cost scans.
+/// Returns whether `errors` in `bytes` bytes are more than the search for a scanner causes, and frequent enough to cost
+/// scans.
 fn is_large(errors: u64, bytes: u64) -> bool {
     errors > MAX_SEARCH_ERRORS && errors.saturating_mul(MIN_BYTES_PER_ERROR) > bytes
 }
@@ -414,9 +415,10 @@ fn errors_remedy(is_lost: bool) -> &'static str {
 /// Remedy for a line that loses bytes.
 pub(crate) const LOSS_REMEDY: &str = "the cable and its ground; the adapter: one with an FT232R or newer, in a socket of the \
      machine; of a UART its FIFO (setserial -g); 120 ohm of termination at the receiving end; docs/wiring.md";
-/// Maximum number of errors while a scanner replies: a byte that was cut when the rate changed, and one more.
+/// Maximum number of errors that are ignored while a scanner replies: a byte that was cut when the rate changed, and
+/// one more.
 const MAX_ERRORS_NOW: u64 = 2;
-/// Maximum number of errors that the search for the rates of scanners causes.
+/// Maximum number of errors that are ignored, because the search for the rates of scanners causes about as many.
 const MAX_SEARCH_ERRORS: u64 = 1000;
 /// Minimum number of bytes per error on a good line. One error in 7,000 bytes damages one of ten telegrams.
 const MIN_BYTES_PER_ERROR: u64 = 7000;
@@ -438,7 +440,7 @@ mod tests {
 
     #[test]
     fn warns_of_port_name_that_may_change() {
-        // Files that exist everywhere stand for the names.
+        // Devices that exist on every machine stand for the names of ports.
         let [device, by_path, shared] = ["/dev/null", "/dev/zero", "/dev/full"].map(Path::new);
         let twin = SerialPortInfo {
             name: by_path.to_owned(),

@@ -1,6 +1,6 @@
-//! Checks what a hub needs from the machine, whatever its sensors are: shared memory, its own domain, descriptors and
-//! file sizes, and the network interface of a gateway. Most checks use a [`MachineState`] that was gathered before, so
-//! that tests can provide any state.
+//! Checks the conditions that a hub needs on the machine with any sensors: shared memory, its own domain, descriptors
+//! and file sizes, and the network interface of a gateway. Most checks use a [`MachineState`] that was gathered before,
+//! so that tests can provide any state.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -50,11 +50,12 @@ pub(crate) struct MachineState {
     pub(crate) nodes: Result<NodeCounts, Failure>,
     /// Files in shared memory that may belong to the domain, and that no process holds.
     pub(crate) segments: Vec<SharedFile>,
-    /// The library's lock of the domain, which a hub leaves at its exit, and which the next one takes.
+    /// The lock file of iceoryx2 for the domain. A hub leaves this file at its exit, and the next hub takes it over.
     pub(crate) lock: Option<PathBuf>,
     /// Hard limit of open descriptors; `None` if there is no limit.
     pub(crate) descriptors: Option<u64>,
-    /// Number of descriptors that this process has open. A hub in its place would have the same number.
+    /// Number of descriptors that this process has open. A hub that is started in its place would begin with the same
+    /// number.
     pub(crate) open_descriptors: u64,
     /// Limit of the length of a file, in bytes; `None` if there is no limit.
     pub(crate) file_size: Option<u64>,
@@ -66,7 +67,7 @@ pub(crate) struct Memory {
     /// Size in bytes; 0 means no limit.
     pub(crate) size: u64,
     pub(crate) free: u64,
-    /// Number of files that it has room for; `None` if there is no limit.
+    /// Number of files that shared memory still has room for; `None` if there is no limit.
     pub(crate) free_files: Option<u64>,
     pub(crate) is_read_only: bool,
 }
@@ -103,10 +104,11 @@ impl MachineState {
             nodes.dead +=
                 free.filter_map(|location| Some(scanhub_shm::nodes(location).ok()?.dead)).sum::<usize>();
         }
-        // A process that runs at this location may be opening files, so they do not count as left.
+        // A process that runs at this location may be opening files, so files that no process holds do not count as
+        // left then.
         let is_empty = nodes.as_ref().is_ok_and(|nodes| nodes.alive == 0) && holder_of(domain).is_none();
         MachineState {
-            // Listing the descriptors needs one, too.
+            // Listing the descriptors needs a descriptor, too, which is subtracted.
             open_descriptors: fs::read_dir("/proc/self/fd").map_or(0, |entries| entries.count() as u64 - 1),
             links: limits.len(),
             limits,
@@ -173,7 +175,8 @@ impl ExistingDirectory {
     }
 }
 
-/// Checks whether shared memory has room for the links. `saving_remedy` is a remedy that reduces their need.
+/// Checks whether shared memory has room for the links. `saving_remedy` is a remedy that makes the links need less
+/// memory.
 pub(crate) fn memory(state: &MachineState, saving_remedy: Option<String>) -> Finding {
     const NAME: &str = "memory";
     let Some(Memory { size, free, free_files, is_read_only }) = state.memory else {
@@ -338,11 +341,11 @@ pub(crate) fn file_size(state: &MachineState) -> Finding {
     Finding::failed(NAME, text, "lift the limit: ulimit -f unlimited, LimitFSIZE= of a service")
 }
 
-/// Number of descriptors that a hub has open when it counts them: five for the signals, and its lock.
+/// Number of descriptors that a hub has open when it checks their number: five for the signals, and one for its lock.
 const DESCRIPTORS_AT_START: u64 = 6;
 /// Number of descriptors for each subscriber to a topic.
 const DESCRIPTORS_PER_SUBSCRIBER: u64 = 4;
-/// Number of subscribers that a robot hardly exceeds.
+/// Number of subscribers for which the descriptors must suffice. A robot hardly ever has more.
 const MIN_SUBSCRIBERS: u64 = 50;
 
 /// Checks whether the interface that the configuration names for a gateway can send multicast datagrams. Sends nothing.
@@ -352,7 +355,8 @@ pub(crate) fn multicast(system: &System, interface: Option<&str>) -> Finding {
     let Some(name) = interface else {
         return Finding::skipped(NAME, "no gateway.interface is named, so nothing is sent to groups");
     };
-    // This list has the interfaces of this process's network. /sys may show those of another one.
+    // This list has the interfaces of the network namespace of this process. /sys may show the interfaces of another
+    // namespace.
     let list = system.text("proc/net/dev").unwrap_or_default();
     let names: Vec<&str> = list.lines().filter_map(|line| Some(line.split_once(':')?.0.trim())).collect();
     if !names.contains(&name) {
@@ -389,7 +393,7 @@ pub(crate) fn multicast(system: &System, interface: Option<&str>) -> Finding {
     Finding::ok(NAME, format!("by {name}, as set in gateway.interface; it is up"))
 }
 
-/// Flag of an interface that is up (linux/if.h, as the next two).
+/// Flag of an interface that is up (linux/if.h, as the next two flags).
 const UP: u32 = 0x1;
 const LOOPBACK: u32 = 0x8;
 const MULTICAST: u32 = 0x1000;

@@ -1,5 +1,5 @@
-//! Checks whether the scanner at a port has the configured settings, and is healthy. An LMS comes first, then a link of
-//! the hub, and last a rotating scanner. `probe` sends the requests.
+//! Checks whether the scanner at a port has the configured settings, and is healthy. The checks of an LMS come first,
+//! then those of a link of the hub, and last those of a rotating scanner. `probe` sends the requests.
 
 use scanhub_config::Link;
 use scanhub_drivers::line::{DeviceInfo, HealthStatus as ReportedHealth};
@@ -28,7 +28,7 @@ pub(crate) fn check_report(port: &str, report: &Report, link: Option<&Link>) -> 
 
 /// Checks a link of `hub` by its status. `holders` have its port open.
 pub(crate) fn check_hub_link(hub: &Hub, (name, status): (&str, &Status), holders: &[Holder]) -> Vec<Finding> {
-    // `info` shows no more of a damaged line than this check.
+    // If the line damages most bytes, the remedy is not `info`, because `info` shows no more about it than this check.
     let remedy =
         if is_mostly_damaged(status) { LOSS_REMEDY.to_owned() } else { hub.remedy(name, status, holders) };
     let marks = marks(status, "stop the hub first: ");
@@ -36,7 +36,7 @@ pub(crate) fn check_hub_link(hub: &Hub, (name, status): (&str, &Status), holders
 }
 
 /// Checks whether the measuring mode of an LMS has bits for reflectors. Returns `None` if the mode is unknown, or if a
-/// scanner without these bits needs no remedy, like one of another family without a configured threshold.
+/// scanner of another family has no configured threshold, because this needs no remedy.
 fn marks(status: &Status, when: &str) -> Option<Finding> {
     const NAME: &str = "marks";
     let Some(mode) = status.missing_reflector_mode() else {
@@ -74,7 +74,7 @@ fn hub_link_finding(name: &str, status: &Status, remedy: String) -> Finding {
             Finding::warning(NAME, format!("{text}: {error}"), remedy)
         }
         (_, error) if status.is_replayed() => Finding::warning(NAME, format!("{text}: {error}"), remedy),
-        // It has just begun: a search reports its problem after some seconds.
+        // The link has just started, and a search reports its problem only after some seconds.
         (Some(State::Absent) | None, "") => Finding::failed(NAME, text, remedy),
         (_, "") => Finding::warning(NAME, format!("{text}; the hub has not found a problem yet"), remedy),
         (_, error) => Finding::failed(NAME, format!("{text}: {error}"), remedy),
@@ -303,7 +303,7 @@ fn loss(scanner: &DetectedScanner) -> Finding {
         return Finding::skipped(NAME, "it does not measure");
     }
     let packets = match lost {
-        // Damaged packets are lost, too, but too few arrive to count them.
+        // Damaged packets are lost, too, but too few undamaged packets arrive to count the lost ones.
         0 if scanner.is_unreliable() => "the number of lost packets is unknown".to_owned(),
         lost => format!("{lost} of {} packets lost", scanner.stats.due),
     };
@@ -317,7 +317,7 @@ fn loss(scanner: &DetectedScanner) -> Finding {
     Finding::ok(NAME, text)
 }
 
-/// A line that loses more than one packet out of this number needs a remedy.
+/// A line that loses more than one packet out of this number of packets needs a remedy.
 const PACKETS_PER_LOSS: u64 = 100;
 
 #[cfg(test)]
@@ -411,7 +411,7 @@ mod tests {
         assert!(state == Verdict::Failed && text.contains("telegrams say error"), "{text}");
         let (state, text) = verdict("health", 8, 0, 0x10, &[0x83, 18]);
         assert!(state == Verdict::Ok && text.contains("1 in its memory"), "{text}");
-        // A clean channel reported 100, the first one reports 20.
+        // A channel of the window reported 100 when the window was clean, and the first channel reports 20.
         let mut dim = healthy();
         dim[42] = 100;
         dim[18] = 20;
@@ -590,7 +590,7 @@ mod tests {
             model(detected, Some(&link(&[&[family.as_str()], set].concat())))
         };
         let models = features(streaming()).models;
-        // A model with the same protocol counts as the same.
+        // A model with the same protocol counts as the configured model.
         let (like, other) = (format!("model={}", models[0].name), format!("model={}", models[3].name));
         assert_eq!(judged(&detected(), &[&like]).state, Verdict::Ok);
         let wrong = judged(&detected(), &[&other]);

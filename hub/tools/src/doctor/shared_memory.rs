@@ -1,9 +1,10 @@
-//! Checks the files of a domain in shared memory, and removes those that dead processes left. The next hub does that,
-//! too, for files that are certainly its own. If no hub starts at this location again, only this module removes them.
+//! Checks the files of a domain in shared memory, and removes those that dead processes left. The next hub also removes
+//! such files, if they are certainly its own. If no hub starts at this location again, only this module removes the
+//! files.
 //!
-//! The names of the files contain only the name of the domain, which a hub at another location may have, too. Files
-//! that a process still holds are therefore never counted as left. Files of other users under these names are never
-//! opened, but they can prevent the start of the hub.
+//! The names of the files contain the name of the domain but not its location. A hub at another location may use the
+//! same name. Files that a process still holds are therefore never counted as left. Files of other users under these
+//! names are never opened, but they can prevent the start of the hub.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -63,7 +64,7 @@ pub(crate) fn leftovers(state: &MachineState) -> Finding {
 }
 
 /// Removes everything that dead processes of `user` left in this domain, at all of its `locations`, and reports it. Has
-/// no effect while a hub or a listener runs at one of them.
+/// no effect while a hub or a listener runs at one of these locations.
 pub(crate) fn clean(locations: &[&Domain], user: u32) -> Finding {
     const NAME: &str = "clean";
     let Some(prefix) = locations.first().map(|location| location.prefix()) else {
@@ -154,9 +155,9 @@ fn files(prefix: &str, user: u32) -> Vec<SharedFile> {
     files
 }
 
-/// Returns those of the [`files`] that no process has open or mapped. No process keeps the library's lock open. The
-/// lock counts as held if a process holds another file whose name begins in the same way, because a domain of this name
-/// at another location uses it.
+/// Returns those of the [`files`] that no process has open or mapped. The lock file of iceoryx2 is an exception,
+/// because no process keeps it open. It counts as held if a process holds another file whose name begins in the same
+/// way: then a domain of this name at another location uses the lock file.
 fn unused_files(prefix: &str, user: u32) -> Vec<SharedFile> {
     let files = files(prefix, user);
     let (free, held_files): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| is_unused(&file.path));
@@ -168,15 +169,16 @@ fn unused_files(prefix: &str, user: u32) -> Vec<SharedFile> {
     free.into_iter().filter(|file| file.bytes > LOCK_LEN || !is_used(file)).collect()
 }
 
-/// Returns those of the [`files`] that no process holds, without the very short one that each hub leaves at its exit.
+/// Returns those of the [`files`] that no process holds, without the lock file of iceoryx2, a very short file that each
+/// hub leaves at its exit.
 pub(crate) fn abandoned_files(prefix: &str, user: u32) -> Vec<SharedFile> {
     let mut files = files(prefix, user);
     files.retain(|file| file.bytes > LOCK_LEN && is_unused(&file.path));
     files
 }
 
-/// Returns the library's lock if it is the only file. No process keeps it open, so next to other files it may belong to
-/// a hub that runs.
+/// Returns the lock file of iceoryx2, if no other file has this `prefix`. No process keeps the lock file open, so it
+/// may belong to a running hub if other files exist.
 pub(crate) fn lock(prefix: &str, user: u32) -> Option<PathBuf> {
     let files = files(prefix, user);
     let is_alone = files.iter().all(|file| file.bytes <= LOCK_LEN);
@@ -185,7 +187,7 @@ pub(crate) fn lock(prefix: &str, user: u32) -> Option<PathBuf> {
 
 /// Number of letters that follow the name of a domain in its file names (docs/topics.md, "Domain").
 const SUFFIX_LEN: usize = 6;
-/// Length of the library's lock in bytes. The library never removes it.
+/// Length of the lock file of iceoryx2 in bytes. The library never removes this file.
 const LOCK_LEN: u64 = 16;
 /// Maximum number of files that a finding names.
 const MAX_NAMED: usize = 4;

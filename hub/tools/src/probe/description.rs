@@ -38,7 +38,8 @@ impl fmt::Display for FoundDescription {
 /// Returns the settings of a link for the LMS that sent `report`, at a line of `rate` bits per second.
 pub(crate) fn link_settings(report: &Report, rate: u32) -> Vec<(&'static str, String)> {
     let kind = report.kind().and_then(Type::of_type);
-    // No link can be configured for a type that has no variant, but the hub streams what such a sensor sends.
+    // A configuration cannot name a type that has no factory variant, but the hub also streams from such a scanner if
+    // the type is not configured.
     let kind = kind.filter(|kind| kind.factory_variant().is_some());
     let mut settings = vec![("family", Family::Lms.name().to_owned())];
     settings.extend(kind.map(|kind| ("type", kind.name().to_owned())));
@@ -46,7 +47,7 @@ pub(crate) fn link_settings(report: &Report, rate: u32) -> Vec<(&'static str, St
     settings
 }
 
-/// Description of an LMS. A value that it did not report is null.
+/// Description of an LMS. A value that the scanner did not report is null.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Description {
     class: &'static str,
@@ -64,7 +65,7 @@ pub(super) struct Description {
     unit_mm: Option<u8>,
     angle_deg: Option<u16>,
     step_deg: Option<f64>,
-    /// Whether it starts at another rate than 9600 Bd.
+    /// Whether the scanner uses another rate than 9600 Bd after power-on.
     permanent_rate: Option<bool>,
     defective: Option<bool>,
     condition: Option<String>,
@@ -260,7 +261,8 @@ impl RotatingDescription {
         }
     }
 
-    /// Returns the models that a scanner cannot be distinguished from, unless it has identified itself.
+    /// Returns the models that cannot be distinguished from this scanner. Returns an empty string if the scanner has
+    /// identified itself.
     fn similar_models(&self) -> String {
         let features = Family::parse(self.family).map(features);
         let models = features.map_or(&[][..], |features| features.models);

@@ -19,10 +19,10 @@ pub(crate) enum Item<'a> {
     Broken {
         /// The whole telegram.
         bytes: &'a [u8],
-        /// The checksum of its bytes.
+        /// The checksum that was computed from its bytes.
         expected: u16,
     },
-    /// The start of a telegram that continues as something else.
+    /// The start of a telegram. Other bytes follow before the announced length is reached.
     Cut {
         /// The bytes of the telegram.
         bytes: &'a [u8],
@@ -37,21 +37,21 @@ pub(crate) enum Item<'a> {
     Other(&'a [u8]),
 }
 
-/// Receives each item with its position in the stream.
+/// Function that receives each item with its position in the stream.
 pub(crate) type Sink<'s> = dyn FnMut(u64, Item<'_>) -> io::Result<()> + 's;
 
-/// Splits bytes that arrive in pieces into items.
+/// Parser that splits bytes into items. The bytes may arrive in pieces.
 #[derive(Default)]
 pub(crate) struct StreamParser {
     framer: Framer,
     /// Bytes whose items were not reported yet.
     pending: Vec<u8>,
-    /// Position of the first of them in the stream.
+    /// Position of the first of the pending bytes in the stream.
     base: u64,
 }
 
 impl StreamParser {
-    /// Adds bytes.
+    /// Adds `bytes` of the stream, and passes the items that are complete to `sink`.
     pub(crate) fn feed(&mut self, mut bytes: &[u8], sink: &mut Sink<'_>) -> io::Result<()> {
         while !bytes.is_empty() {
             let buffer = self.framer.read_buffer();
@@ -68,7 +68,7 @@ impl StreamParser {
         Ok(())
     }
 
-    /// Ends the stream.
+    /// Ends the stream, and passes the remaining items to `sink`.
     pub(crate) fn end(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
         self.framer.release(VETO_HOLD_TIME);
         self.drain(sink)?;
@@ -131,7 +131,7 @@ fn whole_telegrams(bytes: &[u8]) -> impl Iterator<Item = (usize, Telegram<'_>)> 
 }
 
 /// Reports bytes without a complete telegram. A byte counts as an acknowledgement directly after a request, directly
-/// before a reply, or alone. `neighbors` are whether a request is before the bytes, and a reply after them.
+/// before a reply, or alone. `neighbors` states whether a request precedes the bytes, and whether a reply follows them.
 fn report_fragments(bytes: &[u8], base: u64, neighbors: (bool, bool), sink: &mut Sink<'_>) -> io::Result<()> {
     let (after_request, before_reply) = neighbors;
     let mut other = 0;
@@ -176,14 +176,14 @@ fn announced_len(bytes: &[u8]) -> Option<usize> {
     (1..=MAX_LENGTH).contains(&length).then_some(length + FRAME_LEN)
 }
 
-/// Returns the same length, if the command exists in the direction of the address.
+/// Returns the [`announced_len`], if the command byte exists in the direction that the address byte states.
 fn plausible_len(bytes: &[u8]) -> Option<usize> {
     let len = announced_len(bytes)?;
     let is_reply = bytes[1] & REPLY != 0;
     name(*bytes.get(4)?, is_reply).is_some().then_some(len)
 }
 
-/// Maximum number of bytes whose items were not reported.
+/// Maximum number of pending bytes, whose items were not reported yet.
 const MAX_PENDING: usize = 64 * 1024;
 
 #[cfg(test)]
