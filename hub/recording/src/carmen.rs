@@ -37,7 +37,7 @@ pub(crate) struct LogScan {
     pub(crate) has_remissions: bool,
 }
 
-/// Counts of data in a log that no other format holds, so that a conversion loses it.
+/// Counts of data that a conversion loses, because only a log can contain it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UnreadLines {
     /// Number of scans with a pose other than 0.
@@ -46,18 +46,18 @@ pub struct UnreadLines {
     pub odometry: u64,
     /// Number of scans with remissions.
     pub remissions: u64,
-    /// Number of other lines, except comments and empty ones.
+    /// Number of other lines, except comments and empty lines.
     pub lines: u64,
 }
 
-/// Kind of line that contains a scan. A log may have each scan in two kinds of lines.
+/// Kind of line that contains a scan. A log may contain each scan twice, in two kinds of lines.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LineForm {
     /// `FLASER`: ranges, two poses, time.
     Flaser,
     /// `ROBOTLASER1`: seven fields of the sensor, ranges, remissions, two poses and five fields of the robot, time.
     RobotLaser,
-    /// `RAWLASER1`: the same without the fields of the robot.
+    /// `RAWLASER1`: seven fields of the sensor, ranges, remissions, time.
     RawLaser,
 }
 
@@ -91,7 +91,7 @@ impl LineForm {
 }
 
 impl LogScan {
-    /// Parses `line`; `Ok(None)` if it is another kind of line.
+    /// Parses `line`. Returns `Ok(None)` if the line is not a scan.
     ///
     /// # Errors
     ///
@@ -99,8 +99,8 @@ impl LogScan {
     pub(crate) fn parse(line: &str) -> Result<Option<LogScan>, String> {
         let mut fields = line.split_ascii_whitespace();
         let Some(form) = fields.next().and_then(LineForm::of) else { return Ok(None) };
-        // The fields are type, start angle, field of view in radians, resolution, maximum range, accuracy, and
-        // remission mode.
+        // The seven fields of the sensor are type, start angle, field of view in radians, resolution, maximum range,
+        // accuracy, and remission mode.
         let view = match form {
             LineForm::Flaser => None,
             LineForm::RobotLaser | LineForm::RawLaser => {
@@ -124,7 +124,8 @@ impl LogScan {
                 field.parse().map_err(|_| format!("range {field:?} is not a number"))
             })
             .collect::<Result<Vec<f64>, String>>()?;
-        // These fields are before the time: two poses; or remissions, two poses and five numbers; or remissions.
+        // Between the ranges and the time, `FLASER` has two poses; `ROBOTLASER1` has remissions, two poses and five
+        // numbers; and `RAWLASER1` has remissions.
         let (remissions, numbers) = match form {
             LineForm::Flaser => (Some(0), 6),
             LineForm::RobotLaser => (remissions(fields.next()), 11),
@@ -145,10 +146,10 @@ impl LogScan {
         variant(self.ranges_m.len())
     }
 
-    /// Returns the value words in `encoding`, for a log whose ranges are encoded as `own`. Codes stay the same codes. A
-    /// range that does not fit into `encoding` is rounded, or becomes the code of a range beyond it. NaN, infinite and
-    /// negative ranges become "no return". Logs of 180 and 360 beams lack the last beam, which becomes the code at
-    /// [`MISSING_BEAM_OFFSET`].
+    /// Returns the ranges as value words in `encoding`. `own` is the encoding of the log. Codes keep their meaning. A
+    /// range that is not a whole number of units is rounded, and a range that is too far for `encoding` becomes the
+    /// code for a range beyond the maximum. NaN, infinite and negative ranges become "no return". Logs of 180 and 360
+    /// beams lack the last beam, which becomes the code at [`MISSING_BEAM_OFFSET`].
     pub(crate) fn words(&self, own: Encoding, encoding: Encoding) -> Vec<u16> {
         let greatest = encoding.mode.max_value();
         let word = |&range_m: &f64| {
@@ -173,8 +174,9 @@ impl LogScan {
     }
 }
 
-/// Returns the nanoseconds in `text`, a number of seconds; `None` if it is not positive. At today's times, a double
-/// resolves only a quarter of a microsecond, so the decimals are parsed as integers.
+/// Converts `text`, a number of seconds, to nanoseconds. Returns `None` if the number is not positive. For today's time
+/// since 1970, a double has a resolution of only a quarter of a microsecond, so the digits before and after the point
+/// are parsed as integers.
 fn nanoseconds(text: &str) -> Option<u64> {
     let (integer, fraction) = text.split_once('.').unwrap_or((text, ""));
     let is_digits = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
@@ -184,13 +186,14 @@ fn nanoseconds(text: &str) -> Option<u64> {
         let seconds: u64 = integer.parse().ok()?;
         seconds.checked_mul(1_000_000_000)?.checked_add(decimals + u64::from(rounded_up))?
     } else {
-        // The text has another form, such as 1.07e9.
+        // The number is written in another form, such as 1.07e9.
         text.parse().ok().map(|seconds: f64| (seconds * 1e9).round() as u64)?
     };
     (ns > 0).then_some(ns)
 }
 
-/// Returns whether `telegram` is the [`configuration`] reply that represents the encoding of a log. No scanner sent it.
+/// Returns whether `telegram` is the [`configuration`] reply that represents the encoding of a log. No scanner sent
+/// this reply.
 #[cfg(feature = "mcap")]
 pub(crate) fn is_synthetic(telegram: &[u8]) -> bool {
     let reply = Telegram::check(telegram).and_then(Reply::decode);
@@ -209,7 +212,7 @@ fn units(range_m: f64, unit: Unit) -> f64 {
     (range_m * 1000.0 / f64::from(unit.mm())).round()
 }
 
-/// Returns the offset of a range from the maximum value, if it is small enough for a code.
+/// Returns the offset of a range from the maximum value, if the offset is small enough for a code.
 fn code(range_m: f64, encoding: Encoding) -> Option<u16> {
     let below = f64::from(encoding.mode.max_value()) - units(range_m, encoding.unit);
     (0.0..=f64::from(BEYOND_RANGE_OFFSET)).contains(&below).then_some(below as u16)
@@ -220,7 +223,7 @@ fn count(field: Option<&str>) -> Result<usize, String> {
     field.parse().map_err(|_| format!("{field:?} is not a number of beams"))
 }
 
-/// Parses the number of remissions that follow.
+/// Parses the field with the number of the remissions that follow.
 fn remissions(field: Option<&str>) -> Option<usize> {
     field?.parse().ok().filter(|count| *count < 10_000)
 }
@@ -231,15 +234,15 @@ fn variant(beams: usize) -> Option<Variant> {
     Variant::of_beams(beam_count)
 }
 
-/// Reads the scans of a log in their order. If the log has each scan in several kinds of lines, only those of the first kind are
-/// used.
+/// Reads the scans of a log in their order. If the log contains each scan in several kinds of lines, only the lines of
+/// the first kind are used.
 pub(crate) struct LogReader<R> {
     reader: R,
     /// Number of the last line that was read, from 1.
     pub(crate) line: u64,
     /// Kind of line of the first scan.
     form: Option<LineForm>,
-    /// Encoding that the log states itself.
+    /// Encoding that a line of the log states, if any.
     pub(crate) stated_encoding: Option<Encoding>,
     /// Counts of the data so far that the scans do not contain.
     pub(crate) unread: UnreadLines,
@@ -301,8 +304,8 @@ impl<R: BufRead> LogReader<R> {
         }
     }
 
-    /// Returns the next scan of a log that was read before. Skips invalid lines, and returns `None` where the file
-    /// cannot be read.
+    /// Returns the next scan of a log that was read before. Skips invalid lines. Returns `None` at the end, or if the
+    /// file cannot be read.
     pub(crate) fn next_valid(&mut self) -> Option<LogScan> {
         loop {
             match self.next() {
@@ -314,7 +317,7 @@ impl<R: BufRead> LogReader<R> {
     }
 }
 
-/// Returns the line in which a log states the encoding of its ranges. Other programs ignore it.
+/// Returns the line in which a log states the encoding of its ranges. Other programs ignore this line.
 #[cfg(feature = "mcap")]
 pub(crate) fn encoding_line(encoding: Encoding) -> String {
     format!("{ENCODING_PREFIX} {} mm, {} bits\n", encoding.unit.mm(), encoding.mode.range_bits())
@@ -332,7 +335,7 @@ fn parse_encoding_line(line: &str) -> Option<Encoding> {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if the file cannot be read, or if none of its lines is a valid scan.
+/// Returns [`Kind::Input`] if the file cannot be read, or if no line of the file is a valid scan.
 pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
     let mut contents = Contents { form: Form::Carmen, ..Contents::default() };
     let (mut log, mut stats, mut refusal) = (LogReader::new(reader), RangeStats::default(), None);
@@ -373,24 +376,24 @@ pub(crate) fn is_log(head: &[u8]) -> bool {
     head.split(|&byte| byte == b'\n').any(|line| FIRST_WORDS.iter().any(|word| line.starts_with(word)))
 }
 
-/// Statistics of the ranges of a log, from which their encoding is chosen. In a log, a code of the scanner is one of the
-/// largest ranges that the encoding can hold.
+/// Statistics of the ranges of a log, from which the encoding of the ranges is chosen. In a log, a code of the scanner
+/// is one of the largest ranges that the encoding can hold.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RangeStats {
-    /// Number of ranges that are not whole centimeters, and that are not whole millimeters.
+    /// Number of ranges that are not whole centimeters, and number of ranges that are not whole millimeters.
     inexact: [u64; 2],
-    /// Longest range that a value can hold.
+    /// Longest range of the log. Ranges that no value can hold are ignored.
     max_range_m: f64,
     /// Number of ranges that no value can hold.
     unencodable: u64,
 }
 
-/// Ranges of a log that no LMS 2xx could have sent together.
+/// Counts of the ranges of a log that do not fit into a single encoding of an LMS 2xx.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UnencodableRanges {
-    /// Ranges that are rounded.
+    /// Number of ranges that are rounded.
     pub rounded: u64,
-    /// Ranges that are too far for any value.
+    /// Number of ranges that are too far for any value.
     pub beyond: u64,
 }
 
@@ -410,9 +413,10 @@ impl RangeStats {
         }
     }
 
-    /// Chooses the encoding, and counts the ranges that do not fit into it. The encoding is the one that the log states
-    /// itself (`stated`) if all ranges fit into it. Otherwise it is centimeters if all ranges are whole centimeters, or
-    /// millimeters, with as few bits as the longest range needs.
+    /// Chooses the encoding of the log, and counts the ranges that do not fit into this encoding. If all ranges fit
+    /// into the encoding that the log states itself (`stated`), that encoding is chosen. Otherwise, the unit is
+    /// centimeters if all ranges are whole centimeters, and millimeters if not. The encoding has as few bits as the
+    /// longest range needs.
     pub(crate) fn encoding(&self, stated: Option<Encoding>) -> (Encoding, UnencodableRanges) {
         let order = if self.inexact[0] == 0 { [Unit::Cm, Unit::Mm] } else { [Unit::Mm, Unit::Cm] };
         let of_unit = |unit: Unit| MODES.map(|mode| Encoding { unit, mode });
@@ -432,7 +436,7 @@ impl RangeStats {
         match unit {
             Unit::Cm => self.inexact[0] == 0,
             Unit::Mm => self.inexact[1] == 0,
-            // Only a log that states decimeters itself has them, so they are not counted.
+            // Only a log that itself states the unit has ranges in decimeters, so inexact decimeters are not counted.
             Unit::Dm => true,
         }
     }
@@ -459,7 +463,7 @@ impl fmt::Display for UnencodableRanges {
 
 #[cfg(feature = "mcap")]
 /// Returns the line of a scan at `at_ns` since 1970, in a log that begins at `first_ns`; `None` if `telegram` is not a
-/// whole scan. A code is written as the range that its value would be, as in logs of the scanner. Reflector levels,
+/// whole scan. A code is written as the range that its value would mean, as in logs of the scanner. Reflector levels,
 /// field bits, address and status are lost.
 pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Option<String> {
     let measured = MeasuredValues::decode(Telegram::check(telegram)?)?;
@@ -474,7 +478,7 @@ pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) 
     };
     let ranges: Vec<u16> = measured.words().map(|word| word & greatest).collect();
     let ranges = match &ranges[..] {
-        // A scan of a log without the last beam has no last beam in the new log either.
+        // The scan comes from a log that lacked the last beam, so the new log omits the beam, too.
         [ranges @ .., last]
             if *last == greatest - MISSING_BEAM_OFFSET && matches!(ranges.len(), 180 | 360) =>
         {
@@ -486,7 +490,7 @@ pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) 
     for &range in ranges {
         line += &format!(" {:.decimals$}", f64::from(range) * f64::from(unit.mm()) / 1000.0);
     }
-    // Subtract rounded times, so that a log that is converted and written again has the same difference.
+    // Subtract the rounded times, so that the difference stays the same if the new log is converted and written again.
     let micros = |ns: u64| ns.saturating_add(500) / 1000;
     let seconds = |micros: u64| format!("{}.{:06}", micros / 1_000_000, micros % 1_000_000);
     let (at, since) = (micros(at_ns), micros(at_ns).saturating_sub(micros(first_ns)));
@@ -505,16 +509,18 @@ const MAX_LINE_LEN: u64 = 1 << 20;
 const MODES: [Mode; 3] = [Mode(0x00), Mode(0x04), Mode(0x06)];
 /// Encoding with the longest maximum range.
 const COARSEST_ENCODING: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0x06) };
-/// Tolerance for a whole number of units. The text has the exact value, and the error of a double is smaller than this.
+/// Tolerance for a whole number of units. The text has the exact value, and the error of a double is smaller than this
+/// tolerance.
 const UNIT_TOLERANCE: f64 = 1e-6;
 /// Number of fields of two poses.
 const POSE_FIELDS: usize = 6;
-/// Offset from the maximum value of the code for a range beyond that of the mode (Telegram listing 10.8).
+/// Offset of a code from the maximum value: the code means that the range is beyond the maximum of the mode (Telegram
+/// listing 10.8).
 pub const BEYOND_RANGE_OFFSET: u16 = 8;
-/// Offset from the maximum value of the code for a last beam that the log lacks. The code has no meaning, and no
-/// scanner sends it.
+/// Offset of a code from the maximum value: the code stands for a last beam that the log lacks. For a scanner, this
+/// code has no meaning, and no scanner sends it.
 pub(crate) const MISSING_BEAM_OFFSET: u16 = 7;
-/// Tolerance of the field of view, in degrees: logs round it to a step more or less.
+/// Tolerance of the field of view, in degrees. Logs round the field of view to a step more or less.
 const VIEW_TOLERANCE_DEG: f64 = 1.5;
 /// Status byte of a healthy LMS type 6 (Telegram listing 8).
 const HEALTHY_STATUS: u8 = 0x10;
@@ -549,7 +555,7 @@ mod tests {
 
     #[test]
     fn rounds_ranges_and_encodes_too_far_ones_as_codes() {
-        // The encoding of the log holds all of these ranges.
+        // The encoding of the log can hold all of these ranges.
         let word = |range: &str, unit, mode| {
             let log_scan = LogScan::parse(&line(361, range)).unwrap().unwrap();
             log_scan.words(encoding(Unit::Cm, 6), encoding(unit, mode))[0]
@@ -705,7 +711,7 @@ mod tests {
         let line = scan_line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_789, 1_071_078_720_000_000_000)
             .unwrap();
         assert!(line.ends_with(" 12.34 0 0 0 0 0 0 1071078720.123457 scanhub 0.123457\n"), "{line}");
-        // The log has rounded times: 123 457 - 100 000.
+        // The log has the difference of the rounded times: 123 457 - 100 000 microseconds.
         let first = 1_071_078_720_000_000_000 + 100_000_400;
         let again = scan_line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_500, first).unwrap();
         assert!(again.ends_with(" scanhub 0.023457\n"), "{again}");

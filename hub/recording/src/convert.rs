@@ -1,5 +1,5 @@
-//! Conversion of a recording to the same format or another one. A damaged file becomes an intact one with everything
-//! that can be read from it.
+//! Conversion of a recording to the same format or to another one. A damaged file becomes an intact file with
+//! everything that can be read from the damaged one.
 
 mod scans;
 mod writers;
@@ -24,9 +24,9 @@ use writers::{Csv, Ros2};
 pub struct ConvertOptions {
     /// Path of the recording, which may have any format.
     pub input: PathBuf,
-    /// Family of a stream file; `None` if it is recognized by the bytes.
+    /// Family of a stream file. With `None`, the family is recognized by the bytes.
     pub family: Option<Family>,
-    /// Path of the output, whose ending selects the format; `-` is a telegram stream on stdout.
+    /// Path of the output. The ending of the path selects the format, and `-` means a telegram stream on stdout.
     pub output: PathBuf,
     /// Name of the sensor to convert; for a stream or a log, the name that the sensor gets in an MCAP file.
     pub sensor: Option<String>,
@@ -36,7 +36,7 @@ pub struct ConvertOptions {
     pub ros2: bool,
     /// Whether ROS 2 output has each scan also as a PointCloud2.
     pub points: bool,
-    /// Measuring mode for scans of a recording that does not contain it.
+    /// Measuring mode for scans of a recording that does not contain the mode.
     pub mode: Option<Mode>,
     /// Topic to write as CSV: `SENSOR/scan` or `SENSOR/marks`.
     pub topic: Option<String>,
@@ -53,34 +53,35 @@ pub struct ConvertOptions {
 pub struct ConversionResult {
     /// Formats of the input and of the output.
     pub forms: (Form, Target),
-    /// Encoding of the ranges of a log as values; `None` for other formats.
+    /// Encoding into which the ranges of a log were converted; `None` for other formats.
     pub encoding: Option<Encoding>,
-    /// Names of the recording's sensors; if it names none, the name in an MCAP file.
+    /// Names of the recording's sensors. If the recording names no sensor, the name that its sensor gets in an MCAP
+    /// file.
     pub sensors: Vec<String>,
     /// Number of telegrams that were written.
     pub telegrams: u64,
-    /// Number of scans that were written; for marks, of scans whose marks were written.
+    /// Number of scans that were written; for CSV of marks, number of scans whose marks were written.
     pub scans: u64,
-    /// Number of marks that were written; `None` if they were not requested.
+    /// Number of marks that were written; `None` if marks were not requested.
     pub marks: Option<u64>,
-    /// Number of telegrams that the format cannot hold: in a CARMEN log all except complete scans, for ROS 2 and CSV
-    /// all except scans. The reply that contains the encoding of a log does not count.
+    /// Number of telegrams that the output format cannot hold. A CARMEN log holds only complete scans, and ROS 2 and
+    /// CSV hold only scans. The reply that contains the encoding of a log is not counted.
     pub dropped: u64,
     /// Data of a log that no telegram holds.
     pub unread: UnreadLines,
-    /// Time from the first telegram to the last one in ns, by the stamps of the recording or by generated ones; `None`
-    /// without stamps.
+    /// Time from the first telegram to the last one in ns, by the stamps of the recording or by generated stamps;
+    /// `None` if the output has no stamps.
     pub duration_ns: Option<u64>,
     /// Data that could not be read.
     pub damage: Damage,
-    /// Whether the reader of stdout closed it before the end.
+    /// Whether the program that read from stdout closed the pipe before the end.
     pub is_closed: bool,
 }
 
 /// Format that a recording is converted to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Target {
-    /// Recording of this format.
+    /// A recording of this format.
     Recording(Form),
     /// An MCAP file with only messages of ROS 2.
     Ros2,
@@ -106,8 +107,8 @@ impl Target {
 ///
 /// # Errors
 ///
-/// - [`Kind::Input`] if the recording cannot be read, or cannot be converted without loss.
-/// - [`Kind::NoTopic`] if it has no such sensor.
+/// - [`Kind::Input`] if the recording cannot be read, or cannot be converted to the output format.
+/// - [`Kind::NoTopic`] if the recording does not have the sensor that the options name.
 /// - [`Kind::Usage`] if the output format is unknown, or options contradict each other.
 /// - [`Kind::Output`] if the output exists or cannot be written.
 /// - [`Kind::Interrupted`] if the conversion was stopped.
@@ -128,14 +129,14 @@ pub fn convert(
         None => whole,
     };
     let contents = recording.contents();
-    // Marks are copied as they are, so the encoding does not matter.
+    // Recorded marks are written without decoding values, so the encoding does not matter.
     let encoding = match target {
         Target::MarksCsv => Encoding { unit: Unit::Cm, mode: Mode(0) },
         _ => encoding(&recording, target)?,
     };
     let is_of_all = matches!(target, Target::Recording(Form::Mcap) | Target::Ros2);
     if !(contents.form == Form::Mcap && is_of_all) {
-        // Fail before anything is written if the file has several sensors and none was chosen.
+        // If the file has several sensors and no sensor was chosen, fail before anything is written.
         drop(recording.telegrams(encoding)?);
     }
     let mut conversion = Conversion {
@@ -198,12 +199,12 @@ impl From<Failure> for ConversionError {
 struct Conversion<'a> {
     recording: &'a Recording,
     options: &'a ConvertOptions,
-    /// Sensor of a recording that names none.
+    /// Name of the sensor, for a recording that names no sensor.
     sensor: &'a str,
     encoding: Encoding,
     stop: &'a AtomicBool,
     progress: &'a mut dyn FnMut(u64, u64),
-    /// Number of telegrams so far, written or not.
+    /// Number of telegrams so far, including those that were not written.
     telegram_count: u64,
     /// Time of the first telegram.
     first_ns: Option<u64>,
@@ -272,7 +273,7 @@ enum WrittenItem {
     Other,
     /// The marks of a scan.
     Marks,
-    /// A reply that the recording itself does not contain, such as one with the encoding of a log's values.
+    /// A reply that the recording itself does not contain, such as the reply with the encoding of a log's values.
     Added,
     Dropped,
 }
@@ -282,8 +283,8 @@ impl WrittenItem {
         if is_scan { WrittenItem::Scan } else { WrittenItem::Other }
     }
 
-    /// Returns the result of `frame`, which has the index `number` among those that [`writers::frames`] returns for a
-    /// recording of `form`.
+    /// Returns the result of `frame`, which has the index `number` among the frames that [`writers::frames`] returns
+    /// for a recording of `form`.
     fn of_frame(form: Form, number: usize, frame: &Frame) -> WrittenItem {
         if form == Form::Carmen && number == 0 {
             WrittenItem::Added
@@ -297,8 +298,8 @@ impl WrittenItem {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] for a log with ranges that no scanner could have sent, and if a log cannot be written because the
-/// measuring mode is unknown.
+/// Returns [`Kind::Input`] if the input is a log with ranges that no scanner could have sent, if `target` cannot hold
+/// the telegrams of the scanner, or if `target` needs a family or a measuring mode that is unknown.
 fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> {
     let contents = recording.contents();
     let unencodable = contents.unencodable;
@@ -351,7 +352,7 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Usage`] if the format is unknown, or an option does not fit it.
+/// Returns [`Kind::Usage`] if the format is unknown, or if an option does not fit the format.
 fn target_of(options: &ConvertOptions) -> Result<(Target, Option<&str>), Failure> {
     let (target, sensor) = match (format_of(options)?, options.topic.as_deref()) {
         (target, None) => (target, options.sensor.as_deref()),
@@ -387,7 +388,7 @@ fn target_of(options: &ConvertOptions) -> Result<(Target, Option<&str>), Failure
     }
 }
 
-/// Returns the format of `topic` as CSV, and its sensor.
+/// Returns the CSV format for `topic`, and the sensor that `topic` names.
 fn of_topic(topic: &str) -> Result<(Target, &str), Failure> {
     let (sensor, name) = topic.rsplit_once('/').unwrap_or((topic, ""));
     match Topic::parse(name) {
@@ -461,7 +462,8 @@ enum Output {
 }
 
 impl Output {
-    /// Creates the output at `path`. With `force`, it may replace a file, but not `input`. `-` is stdout.
+    /// Creates the output at `path`. With `force`, the output may replace a file, but not `input`. The path `-` means
+    /// stdout.
     ///
     /// # Errors
     ///
@@ -479,7 +481,7 @@ impl Output {
         OutputFile::create(path, force).map(Output::File)
     }
 
-    /// Returns whether `error` means that the reader of stdout closed it.
+    /// Returns whether `error` means that the program that read from stdout closed the pipe.
     fn is_closed(path: &Path, error: &io::Error) -> bool {
         path == Path::new("-") && error.kind() == io::ErrorKind::BrokenPipe
     }
@@ -544,9 +546,9 @@ impl<W: Write> OutputEncoder<W> {
     }
 }
 
-/// Sensor of a stream or a log, unless an option names it.
+/// Name of the sensor of a stream or a log, unless an option names the sensor.
 const DEFAULT_SENSOR: &str = "front";
-/// Size of the buffer before the output, in bytes.
+/// Size of the buffer in which output is collected, in bytes.
 const BUFFER_LEN: usize = 1 << 20;
 /// Number of telegrams between two reports of progress.
 const PROGRESS_INTERVAL: u64 = 512;

@@ -1,7 +1,7 @@
 //! Reader and converter of recordings: MCAP files of the hub (feature `mcap`), streams of telegrams as they arrived on
 //! a line, and CARMEN logs, each plain or gzipped.
 //!
-//! All of them yield complete telegrams as [`Frame`]s, which the simulator can send and a hub can read. [`Contents`]
+//! All formats yield complete telegrams as [`Frame`]s, which the simulator can send and a hub can read. [`Contents`]
 //! describes the sensors and the encoding of the values, if the file contains them. This crate reads no clock and opens
 //! no port.
 
@@ -25,17 +25,18 @@ pub use carmen::{BEYOND_RANGE_OFFSET, UnencodableRanges, UnreadLines};
 pub use open::Recording;
 pub use stream::VirtualTime;
 
-/// Telegram of a recording, or packets that arrived together.
+/// Telegram of a recording, or the packets that a hub received together.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Frame {
-    /// Complete telegram, from STX to checksum; for families other than LMS, complete packets. Those of a stream file
-    /// have every bit as it was received.
+    /// Complete telegram, from STX to checksum; for families other than LMS, complete packets. From a stream file, the
+    /// bytes are exactly those that were received.
     pub telegram: Vec<u8>,
     /// Number of the scanner's [`Family`].
     pub family: u8,
     /// Time of the measurement, in nanoseconds since 1970, if the recording contains it.
     pub wall_ns: Option<u64>,
-    /// Time of the measurement by the scanner's clock, in nanoseconds since the first frame, if the recording has no other time.
+    /// Time of the measurement on the scanner's clock, in nanoseconds since the first frame, if the recording has no
+    /// other time.
     pub scanner_ns: Option<u64>,
     /// Reasons why the telegram is suspect, as bits of [`scanhub_drivers::line::suspect`].
     pub reasons: u8,
@@ -43,12 +44,13 @@ pub struct Frame {
     pub header: Option<scanhub_schema::Header>,
 }
 
-/// Record of a file that is needed to replay the angles of a mount.
+/// Record of an MCAP file that is needed to replay the angles of a mount.
 #[derive(Clone, Copy, Debug)]
 pub enum MountRecord {
     /// Angle of the mount.
     Angle(scanhub_schema::Header, scanhub_schema::Tilt),
-    /// Header of a telegram from a sensor of the mount's machine. Its stamps are from the same clock as the mount's.
+    /// Header of a telegram from a sensor of the mount's machine. Its stamps are from the same clock as the stamps of
+    /// the mount.
     Telegram(scanhub_schema::Header),
 }
 
@@ -69,7 +71,7 @@ pub(crate) fn is_scan(family: u8, telegram: &[u8]) -> bool {
     family == Family::Lms as u8 && telegram.get(4) == Some(&MEASURED)
 }
 
-/// Encoding of ranges as value words. The ranges of a log are in meters, so a log has no encoding of its own.
+/// Encoding of ranges as value words. The ranges of a log are text in meters, so an encoding must be chosen for a log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Encoding {
     /// Unit of the ranges.
@@ -103,18 +105,18 @@ pub enum Form {
     Mcap,
 }
 
-/// Contents of a recording, including its description of the sensor.
+/// Contents of a recording, including what it reports about the sensor.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Contents {
     /// Format of the file.
     pub form: Form,
-    /// Number of the first sensor's [`Family`]; that of an LMS for a log.
+    /// Number of the first sensor's [`Family`]. For a log, it is the number of family LMS.
     pub family: u8,
-    /// Number of another family that telegrams belong to. `None` if all have the same.
+    /// Number of another family to which some telegrams belong. `None` if all telegrams belong to `family`.
     pub other_family: Option<u8>,
-    /// Names of the sensors, in order of appearance; a stream and a log name none.
+    /// Names of the sensors, in order of appearance; a stream and a log name no sensor.
     pub sensors: Vec<String>,
-    /// Number of whole telegrams; for a log, of scans.
+    /// Number of complete telegrams; for a log, number of scans.
     pub telegrams: u64,
     /// Number of unpacked bytes of a stream; 0 for other forms.
     pub bytes: u64,
@@ -122,7 +124,7 @@ pub struct Contents {
     pub scans: u64,
     /// Times of the first and the last telegram, in ns since 1970, if there are stamps.
     pub span: Option<(u64, u64)>,
-    /// Duration by the scanner's clock, in ns, if there is no other time.
+    /// Duration on the scanner's clock, in ns, if the recording has no other time.
     pub scanner_ns: Option<u64>,
     /// Number of beams in the recorded scans of a rotating scanner.
     pub beams: Option<u16>,
@@ -139,28 +141,29 @@ pub struct Contents {
     /// Unit of the first scan; for a log the unit in which its ranges are whole values.
     pub unit: Option<Unit>,
     /// Measuring mode, if a configuration reply (F4h) or a status contains it; for a log, a mode whose values can hold
-    /// its ranges.
+    /// the ranges of the log.
     pub mode: Option<Mode>,
-    /// Bits that are set in any value of the scans; 0 for a log.
+    /// All bits that are set in at least one value of the scans; 0 for a log.
     pub bits: u16,
     /// Ranges of a log that its unit and mode cannot encode.
     pub unencodable: UnencodableRanges,
     /// Data of a log that its scans do not contain.
     pub unread: UnreadLines,
-    /// Data that could not be read. [`telegrams`](Recording::telegrams) returns the rest.
+    /// Counts of data that could not be read. [`telegrams`](Recording::telegrams) returns all readable telegrams.
     pub damage: Damage,
 }
 
 impl Contents {
-    /// Returns the measuring mode for reading the values: the one in the recording, or the mode of 13 bits if no value
-    /// has a higher bit set, because then all modes agree. Returns `None` if the values have several possible meanings.
+    /// Returns the measuring mode for reading the values. If the recording contains no mode, and no value has more than
+    /// 13 bits, this is the mode of 13 bits, because such values mean the same in all modes. Returns `None` if the
+    /// values have several possible meanings.
     pub fn readable_mode(&self) -> Option<Mode> {
         let plain = Mode(0x00);
         self.mode.or((self.bits <= plain.max_value()).then_some(plain))
     }
 
-    /// Returns the number of the measuring mode for reading the values: the one in the recording, otherwise
-    /// `configured`, otherwise the [readable](Self::readable_mode) one.
+    /// Returns the number of the measuring mode for reading the values: the mode in the recording, otherwise
+    /// `configured`, otherwise the [readable](Self::readable_mode) mode.
     pub fn mode_or(&self, configured: Option<u8>) -> Option<u8> {
         self.mode.map(|mode| mode.0).or(configured).or(self.readable_mode().map(|mode| mode.0))
     }
@@ -171,8 +174,8 @@ impl Contents {
         Encoding { unit: self.unit.unwrap_or(default.unit), mode: mode.map_or(default.mode, Mode) }
     }
 
-    /// Returns the time from a scan of `beams` beams to the next one, for a recording without stamps. A number of beams
-    /// that is not in the listing has the period of the first scan.
+    /// Returns the time from a scan of `beams` beams to the next one, for a recording without stamps. If no variant in
+    /// the telegram listing has this number of beams, the result is the period of the first scan.
     pub fn period(&self, beams: usize) -> Nanos {
         let variant = Variant::of_beams(beams).or(self.variant).unwrap_or(Variant::HALF);
         nominal_period(variant.beams(), Baud::B500000.rate())
@@ -226,15 +229,15 @@ impl Contents {
 /// Counts of data that could not be read; all zero if the file is intact.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Damage {
-    /// Number of telegrams whose sequence numbers are missing between others. Either the file or the recorder lost
-    /// them.
+    /// Number of sequence numbers that are missing between those of other telegrams. Either the file or the recorder
+    /// lost the telegrams with these numbers.
     pub telegrams: u64,
-    /// Number of bytes that were not read: those of damaged chunks and records, those after a position at which the
-    /// structure of the file is lost, and those outside the telegrams of a stream.
+    /// Number of bytes that were not used: bytes of damaged chunks and records, bytes after a position at which the
+    /// structure of the file is lost, and bytes outside the telegrams of a stream.
     pub bytes: u64,
     /// Number of chunks that were skipped because they are damaged.
     pub chunks: u64,
-    /// Number of chunks that were skipped because the file contains them twice.
+    /// Number of chunks that were skipped because the same chunk had been read before.
     pub repeats: u64,
     /// Whether the file ends without its index, for example because the recorder was killed.
     pub is_truncated: bool,
@@ -243,14 +246,14 @@ pub struct Damage {
 }
 
 impl Damage {
-    /// Returns whether nothing is missing.
+    /// Returns whether nothing is missing or damaged.
     pub fn is_none(&self) -> bool {
         *self == Damage::default()
     }
 }
 
 impl fmt::Display for Damage {
-    /// Writes the counts as one line, or `nothing` if they are all 0.
+    /// Writes the counts as one line, or `nothing` if all counts are 0.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let counted = |count: u64, one: &str, more: &str| match count {
             0 => None,

@@ -1,5 +1,6 @@
 //! MCAP files that the hub recorded. [`Reader`] yields the telegrams of all sensors and all other records, [`Catalog`]
-//! has the channels, and [`FileSummary`] has the contents of the whole file, which is read once before it is used.
+//! has the channels, and [`FileSummary`] has the contents of the whole file, which is read to its end once before its
+//! telegrams are used.
 
 mod records;
 
@@ -46,7 +47,7 @@ pub(crate) struct Reader<R> {
 }
 
 impl<R: Read> Reader<R> {
-    /// Creates a reader of `input`, whose channels in `catalog` are already known.
+    /// Creates a reader of `input`. `catalog` has the channels that are already known.
     fn new(input: R, catalog: Catalog) -> Self {
         Reader { records: Records::new(input), catalog, has_unknown: false }
     }
@@ -72,8 +73,8 @@ impl<R: Read> Reader<R> {
         }
     }
 
-    /// Returns whether a record outside chunks, which no checksum covers, contradicts itself: a message of the hub with
-    /// a header that does not fit, or a telegram of an LMS with a wrong CRC.
+    /// Returns whether `record`, which is outside chunks and has no checksum, contradicts itself. This is a message of
+    /// the hub whose header does not fit the message, or a telegram of an LMS with a wrong CRC.
     fn is_damaged(&self, record: &Record, sample: Option<&Sample>) -> bool {
         if let Some(Sample { header, telegram, .. }) = sample {
             return header.family == Family::Lms as u8 && Telegram::check(telegram).is_none();
@@ -92,7 +93,7 @@ impl<R: Read> Reader<R> {
                     channel_topic.filter(|channel_topic| channel_topic.topic == Topic::Telegram)?;
                 (channel_topic.sensor.clone(), split_sample(&message, data)?)
             }
-            // The channel's record is lost. A telegram of an LMS can still be recognized by its CRC.
+            // The record of the channel is lost. A telegram of an LMS can still be recognized by its CRC.
             None => {
                 self.has_unknown = true;
                 let sample = split_sample(&message, data)?;
@@ -112,15 +113,16 @@ pub(crate) struct FileSummary {
     catalog: Catalog,
     /// Header of each sensor's last telegram.
     last: BTreeMap<String, Header>,
-    /// Sequence number of the first telegram that the hub processed further, by sensor and run of the hub.
+    /// Sequence number of the first telegram from which the hub computed another sample, by sensor and boot ID of the
+    /// hub.
     first_understood: BTreeMap<String, BTreeMap<u64, u64>>,
-    /// Number of pairs of sensor and run in `first_understood`.
+    /// Number of pairs of sensor and boot ID in `first_understood`.
     runs: usize,
 }
 
 impl FileSummary {
-    /// Reads the file that `open` opens. A damaged file may be read twice, because its index can name channels whose first
-    /// chunk is lost.
+    /// Reads the file that `open` opens. A damaged file may be read twice: if the chunk with a channel is lost, the
+    /// index at the end can still name the channel.
     ///
     /// # Errors
     ///
@@ -173,7 +175,8 @@ impl FileSummary {
         Reader::new(input, self.catalog.clone())
     }
 
-    /// Reads the file again, and returns the telegrams of `sensor` in the order of the file. They end at an error.
+    /// Reads the file again, and returns the telegrams of `sensor` in the order of the file. The telegrams end at the
+    /// first error.
     pub(crate) fn frames<R: Read>(&self, input: R, sensor: String) -> impl Iterator<Item = Frame> + use<R> {
         let mut reader = self.reader(input);
         std::iter::from_fn(move || {
@@ -195,8 +198,9 @@ impl FileSummary {
         })
     }
 
-    /// Reads the file again, and returns the angles of `mount` and the telegrams of its machine, in the order of the file.
-    /// They end at an error. If the file has no sensor of that machine, it returns the telegrams of all machines.
+    /// Reads the file again, and returns the angles of `mount` and the telegrams of the mount's machine, in the order
+    /// of the file. The records end at the first error. If the file has no sensor of that machine, the telegrams of all
+    /// machines are returned.
     pub(crate) fn angles<R: Read>(
         &self,
         input: R,
@@ -228,8 +232,8 @@ impl FileSummary {
         &self.catalog
     }
 
-    /// Returns the sequence number of the first telegram of `sensor` that the hub with this `boot` processed further;
-    /// `None` if the file does not contain it, or is damaged.
+    /// Returns the sequence number of the first telegram of `sensor` from which the hub with the ID `boot` computed
+    /// another sample. Returns `None` if the file has no such sample, or is damaged.
     pub(crate) fn first_understood(&self, sensor: &str, boot: u64) -> Option<u64> {
         self.first_understood.get(sensor)?.get(&boot).copied().filter(|_| !self.whole.damage.is_damaged)
     }
@@ -257,7 +261,8 @@ impl FileSummary {
         }
     }
 
-    /// Stores what a status reports about the scanner, and which telegrams the hub processed further.
+    /// Stores what a status reports about the scanner, and the first telegram from which the hub computed another
+    /// sample.
     fn note_record(&mut self, catalog: &Catalog, record: &Record) {
         let Some((channel_topic, header, payload)) = catalog.message(record) else { return };
         let is_of_scan = channel_topic.topic.spec().publish_rate == PublishRate::Scan
@@ -304,8 +309,8 @@ impl FileSummary {
     }
 }
 
-/// Returns the number of beams of the scan in `payload`, or of the scan from which `payload` was computed. `None` for
-/// other topics.
+/// Returns the number of beams of the scan in `payload`, or of the scan from which `payload` was computed. Returns
+/// `None` for other topics.
 fn beams_of(channel_topic: &ChannelTopic, payload: &[u8]) -> Option<u16> {
     match channel_topic.topic {
         _ if channel_topic.is_old => None,
@@ -313,7 +318,7 @@ fn beams_of(channel_topic: &ChannelTopic, payload: &[u8]) -> Option<u16> {
             let mut scan = Box::<Scan>::default();
             Scan::unpack_into(&mut scan, payload).then(|| scan.beams() as u16)
         }
-        // The default topics of a recording contain no scans.
+        // By default, a recording contains no scans, but foregrounds.
         Topic::Foreground => {
             let mut foreground = Box::<Foreground>::default();
             Foreground::unpack_into(&mut foreground, payload).then_some(foreground.count)
@@ -323,8 +328,8 @@ fn beams_of(channel_topic: &ChannelTopic, payload: &[u8]) -> Option<u16> {
     .filter(|beams| *beams > 0)
 }
 
-/// Returns the model and the scan mode that `status` names, if the scanner is a rotating one. Each is `None` if this
-/// version does not support it.
+/// Returns the model and the scan mode that `status` names, if the scanner is a rotating one. A model or mode that this
+/// version does not support is `None`.
 fn rotating(status: &Status) -> Option<(Option<&'static str>, Option<&'static str>)> {
     let features = features(Family::of_number(status.family)?);
     let name = status.model().filter(|_| !features.has_whole_telegrams)?;
@@ -342,12 +347,12 @@ fn machine(sensor: &str) -> Option<&str> {
     sensor.split_once('.').map(|(machine, _)| machine)
 }
 
-/// Topic of a sensor to which a channel belongs.
+/// Sensor and topic to which a channel belongs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct ChannelTopic {
     pub(crate) sensor: String,
     pub(crate) topic: Topic,
-    /// Whether its messages have the format of version 1.
+    /// Whether the messages of the channel have the format of version 1.
     is_old: bool,
 }
 
@@ -369,30 +374,32 @@ impl ChannelTopic {
     }
 }
 
-/// Name, language and text of a type.
+/// Name, language and text of a schema.
 type Schema = (String, String, Vec<u8>);
 
-/// Schemas and channels of a file. Its index repeats them, so they are known even if the chunk that had them first is lost.
+/// Schemas and channels of a file. The index of the file repeats them, so they are known even if the first chunk that
+/// contains them is lost.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Catalog {
     /// Profile of the file, such as `ros2`.
     pub(crate) profile: String,
-    /// Description of the recording: domain, host, version ([`METADATA`]).
+    /// Description of the recording, such as domain, host and version ([`METADATA`]).
     pub(crate) metadata: BTreeMap<String, String>,
     schemas: BTreeMap<u16, Schema>,
     channels: BTreeMap<u16, (Channel, Option<ChannelTopic>)>,
     sensors: HashSet<String>,
-    /// Approximate memory of schemas and channels.
+    /// Approximate memory of schemas and channels, in bytes.
     bytes: usize,
 }
 
 impl Catalog {
-    /// Stores the schema, the channel or the metadata in `record`. The first schema or channel with an ID counts.
+    /// Stores the schema, the channel or the metadata in `record`. If the same ID occurs again, the first schema or
+    /// channel with this ID is kept.
     ///
     /// # Errors
     ///
-    /// Returns [`io::ErrorKind::FileTooLarge`] if the file has more channels, schemas or sensors than are kept in
-    /// memory.
+    /// Returns [`io::ErrorKind::FileTooLarge`] if the file has more channels, schemas or sensors than the limits
+    /// permit.
     pub(crate) fn note(&mut self, record: &Record) -> io::Result<()> {
         if !matches!(record.opcode, op::HEADER | op::METADATA | op::SCHEMA | op::CHANNEL) {
             return Ok(());
@@ -430,13 +437,13 @@ impl Catalog {
         Some((channel, self.schemas.get(&channel.schema_id)))
     }
 
-    /// Returns the topic of the channel with this ID: `Some(None)` if it belongs to another program, `None` if the
-    /// channel is unknown.
+    /// Returns the topic of the channel with this ID. Returns `Some(None)` if the channel belongs to another program,
+    /// and `None` if the channel is unknown.
     pub(crate) fn channel_topic(&self, id: u16) -> Option<Option<&ChannelTopic>> {
         self.channels.get(&id).map(|(_, channel_topic)| channel_topic.as_ref())
     }
 
-    /// Returns the topic of a message of the hub, its header and its payload; `None` for any other record.
+    /// Returns the topic, the header and the payload if `record` is a message of the hub; `None` for any other record.
     pub(crate) fn message<'a>(&self, record: &'a Record) -> Option<(&ChannelTopic, Header, &'a [u8])> {
         let (message, data) = record.message()?;
         let channel_topic = self.channel_topic(message.channel_id)??;
@@ -444,7 +451,7 @@ impl Catalog {
         Some((channel_topic, header, payload))
     }
 
-    /// Returns the sensors that channels name, in the order of the channels' IDs.
+    /// Returns the sensors that channels of the hub name, in the order of the channels' IDs.
     pub(crate) fn sensors(&self) -> Vec<String> {
         let mut known = HashSet::new();
         let channel_topics = self.channels.values().filter_map(|(_, channel_topic)| channel_topic.as_ref());
@@ -489,7 +496,8 @@ fn mount_of(channel: &Channel) -> Option<&str> {
     (is_ours && Topic::parse(topic) == Some(Topic::Tilt)).then_some(mount)
 }
 
-/// Returns header and payload of a message of the hub; `None` if the header contradicts the message that contains it.
+/// Returns header and payload of a message of the hub. Returns `None` if the sequence number or the time in the header
+/// differs from that of the message.
 pub(crate) fn split_sample<'a>(message: &MessageHeader, data: &'a [u8]) -> Option<(Header, &'a [u8])> {
     let (header, payload) = file::split_message(data)?;
     let is_same = (header.topic_seq as u32, header.wall_ns) == (message.sequence, message.log_time);
@@ -498,9 +506,10 @@ pub(crate) fn split_sample<'a>(message: &MessageHeader, data: &'a [u8]) -> Optio
 
 /// Maximum number of stored runs of a hub: one per minute for a month.
 const MAX_RUNS: usize = 50_000;
-/// Maximum number of sensors: those of sixteen hubs, each with the maximum that a hub can have.
+/// Maximum number of sensors: sixteen hubs with 256 links each, which is the maximum for a hub.
 const MAX_SENSORS: usize = 4096;
-/// Maximum memory of channels and schemas. Files of many sensors have some hundred channels, and a megabyte of schemas.
+/// Maximum memory of channels and schemas, in bytes. Files of many sensors have some hundred channels, and a megabyte
+/// of schemas.
 const MAX_CATALOG_BYTES: usize = 20 << 20;
-/// Memory that a record takes in addition to its text.
+/// Number of bytes of memory that a stored schema or channel takes in addition to its text.
 const RECORD_OVERHEAD: usize = 128;

@@ -1,5 +1,5 @@
-//! An open recording, whose format is detected by its content and not by its name. The file is read to its end once, so
-//! that its contents and its damage are known before it is used. No telegram is kept in memory.
+//! An open recording. Its format is detected by the bytes of the file and not by the name. The file is read to its end
+//! once, so that its contents and its damage are known before it is used. No telegram is kept in memory.
 
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -22,7 +22,7 @@ use crate::{Contents, Encoding, Form, Frame, MountRecord, VirtualTime};
 pub struct Recording {
     path: PathBuf,
     contents: Contents,
-    /// Contents of an MCAP file, by sensor.
+    /// Summary of an MCAP file, with the contents of each sensor.
     #[cfg(feature = "mcap")]
     summary: std::sync::Arc<crate::mcap::FileSummary>,
     /// Sensor that [`of`](Self::of) selected.
@@ -35,14 +35,15 @@ impl Recording {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Input`] if the file is neither an MCAP file nor a CARMEN log, and has no telegram. The same
-    /// holds for a stream file if no family takes at least half of the [first
+    /// Returns [`Kind::Input`] if the file is neither an MCAP file nor a CARMEN log, and has no telegram. Also returns
+    /// [`Kind::Input`] for a stream file if no family accepts at least half of the [first
     /// bytes](scanhub_drivers::recognize::EXAMINED_BYTES).
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         Recording::open_as(path, None)
     }
 
-    /// Opens a file like [`open`](Self::open). If it is a stream file, its bytes belong to `family`, if that is given.
+    /// Opens a file like [`open`](Self::open). If the file is a stream file and `family` is given, its bytes belong to
+    /// this family.
     ///
     /// # Errors
     ///
@@ -56,8 +57,8 @@ impl Recording {
         Ok(recording)
     }
 
-    /// Opens a file like [`open_as`](Self::open_as). A stream file of a named `family` may also be without telegrams,
-    /// such as the bytes of a line with only noise.
+    /// Opens a file like [`open_as`](Self::open_as). If `family` is given, a stream file may contain no telegram, such
+    /// as the bytes of a line with only noise.
     ///
     /// # Errors
     ///
@@ -112,7 +113,7 @@ impl Recording {
         Err(Failure::new(Kind::Input, message, "build it with feature mcap of scanhub-recording"))
     }
 
-    /// Returns whether a file that starts with `head` is a container with telegrams inside: MCAP or gzip.
+    /// Returns whether a file that starts with `head` is a container with telegrams inside, which is MCAP or gzip.
     pub fn is_framed(head: &[u8]) -> bool {
         head.starts_with(MCAP_MAGIC) || head.starts_with(GZIP_MAGIC)
     }
@@ -121,7 +122,7 @@ impl Recording {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NoTopic`] with the existing sensors if there is no such sensor, and [`Kind::Usage`] if the
+    /// Returns [`Kind::NoTopic`] with the existing sensors if `sensor` is not one of them, and [`Kind::Usage`] if the
     /// recording names no sensor.
     pub fn of(&self, sensor: &str) -> Result<Recording, Failure> {
         let path = self.path.display();
@@ -142,9 +143,9 @@ impl Recording {
         Ok(chosen)
     }
 
-    /// Returns the sequence number of the first telegram of the only sensor that the hub with this `boot` processed
-    /// further. From there on, the hub knew the meaning of the values. Returns `None` if the recording does not contain
-    /// it; only MCAP files do.
+    /// Returns the sequence number of the first telegram of the only sensor from which the hub with the ID `boot`
+    /// computed another sample. From this telegram on, the hub knew the meaning of the values. Returns `None` if the
+    /// recording has no such sample. Only MCAP files have one.
     pub fn first_understood(&self, boot: u64) -> Option<u64> {
         #[cfg(feature = "mcap")]
         return self.summary.first_understood(self.contents.sensors.first()?, boot);
@@ -160,7 +161,7 @@ impl Recording {
         Family::of_number(self.contents.family)
     }
 
-    /// Returns the model of a rotating scanner, from a status or the first packets.
+    /// Returns the model of a rotating scanner, from a status or from the first packets.
     ///
     /// # Errors
     ///
@@ -196,7 +197,7 @@ impl Recording {
         Ok(model)
     }
 
-    /// Returns the number of beams in the scans of a rotating scanner, from the scans or a status.
+    /// Returns the number of beams in the scans of a rotating scanner, from the recorded scans or from a status.
     pub fn beams(&self) -> Option<usize> {
         let scans = self.contents.beams.map(usize::from);
         scans.or_else(|| {
@@ -210,7 +211,8 @@ impl Recording {
         })
     }
 
-    /// Returns the settings of a session that reads the packets: model, mode and number of beams, if they are known.
+    /// Returns the settings of a session that reads the packets of this recording: model, mode and number of beams, if
+    /// they are known.
     ///
     /// # Errors
     ///
@@ -226,12 +228,13 @@ impl Recording {
         &self.path
     }
 
-    /// Returns the contents; after [`of`](Self::of), those of that sensor.
+    /// Returns the contents of the recording, or of one sensor if [`of`](Self::of) selected a sensor.
     pub fn contents(&self) -> &Contents {
         &self.contents
     }
 
-    /// Returns the unpacked bytes of the file. A hub would read those of a stream file from the line.
+    /// Returns the unpacked bytes of the file. In a stream file, they are the bytes that a hub would read from the
+    /// line.
     ///
     /// # Errors
     ///
@@ -240,14 +243,15 @@ impl Recording {
         Ok(reader(&self.path)?)
     }
 
-    /// Returns the encoding of the values, if the recording contains it. For a log, it is the encoding in which the ranges are
-    /// whole values.
+    /// Returns the encoding of the values, if the recording contains this encoding. For a log, it is the encoding in
+    /// which the ranges are whole values.
     pub fn encoding(&self) -> Option<Encoding> {
         Some(Encoding { unit: self.contents.unit?, mode: self.contents.mode? })
     }
 
     /// Returns the telegrams in order, including replies. The scans of a log are encoded as `encoding`, without loss if
-    /// it is the log's own. If the file becomes unreadable in the meantime, the telegrams end there.
+    /// `encoding` is the one that [`encoding`](Self::encoding) returns. If the file becomes unreadable in the meantime,
+    /// the telegrams end at that position.
     ///
     /// # Errors
     ///
@@ -309,8 +313,8 @@ impl Recording {
         Vec::new()
     }
 
-    /// Returns the angles of a mount and the telegrams of its machine in the order of the file. If the file becomes
-    /// unreadable in the meantime, they end there.
+    /// Returns the angles of a mount and the telegrams of the mount's machine in the order of the file. If the file
+    /// becomes unreadable in the meantime, the records end at that position.
     ///
     /// # Errors
     ///
@@ -332,7 +336,7 @@ impl Recording {
         self.sensor.as_ref()
     }
 
-    /// Returns the time at which the file was last written, in ns since 1970, or 0 if it is unknown.
+    /// Returns the time at which the file was last written, in ns since 1970, or 0 if the time is unknown.
     #[cfg(feature = "mcap")]
     pub(crate) fn modified_ns(&self) -> u64 {
         let modified = std::fs::metadata(&self.path).and_then(|metadata| metadata.modified()).ok();
@@ -340,7 +344,7 @@ impl Recording {
         since.map_or(0, |since| since.as_nanos() as u64)
     }
 
-    /// Returns the failure of a file that has become unreadable.
+    /// Returns the failure for a file that has become unreadable.
     #[cfg(feature = "mcap")]
     pub(crate) fn read_failure(&self, error: &io::Error) -> Failure {
         unreadable(&self.path, error)
@@ -356,12 +360,12 @@ impl Recording {
     }
 }
 
-/// Reads the stream file at `path`, whose bytes belong to `named`. If that is not given, or if the file has no telegram of that
-/// family, the family is recognized by the bytes.
+/// Reads the stream file at `path`, whose bytes belong to the family `named`. If `named` is `None`, or if the file has
+/// no telegram of this family, the family is recognized by the bytes.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if it cannot be read, or if its family is neither named nor recognized.
+/// Returns [`Kind::Input`] if the file cannot be read, or if its family is neither named nor recognized.
 fn survey_stream(path: &Path, named: Option<Family>) -> Result<Contents, Failure> {
     let head = head(path, EXAMINED_BYTES).map_err(|error| unreadable(path, &error))?;
     let survey = |family| stream::survey(path, family, &head);
@@ -386,7 +390,7 @@ fn head(path: &Path, len: usize) -> io::Result<Vec<u8>> {
     }
 }
 
-/// Returns the failure of a stream file that starts with `head`, in which no family has enough bytes.
+/// Returns the failure for a stream file that starts with `head`, because no family accepts enough of these bytes.
 fn unrecognized(path: &Path, head: &[u8]) -> Failure {
     let percent = |len: usize| 100 * len / head.len().max(1);
     let counts = bytes_by_family(head).map(|(family, len)| format!("{} {} %", family.name(), percent(len)));
@@ -403,7 +407,7 @@ fn unrecognized(path: &Path, head: &[u8]) -> Failure {
     Failure::new(Kind::Input, message, hint)
 }
 
-/// Returns the failure of a file that is not a recording.
+/// Returns the failure for a file that is not a recording.
 fn without_telegram(path: &Path) -> Failure {
     let message = format!(
         "recording {} is neither an MCAP file nor a CARMEN log, and there is no telegram in it",
@@ -412,7 +416,7 @@ fn without_telegram(path: &Path) -> Failure {
     Failure::new(Kind::Input, message, format!("{FORMS_REMEDY}; a link to a file of noise needs family=NAME"))
 }
 
-/// Returns whether `error` means that a packed file ends early or is damaged, and not that the disk failed.
+/// Returns whether `error` means that a packed file ends early or is damaged, in contrast to an error of the disk.
 pub(crate) fn is_truncation(error: &io::Error) -> bool {
     use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
     matches!(error.kind(), InvalidData | InvalidInput | UnexpectedEof)
@@ -430,8 +434,8 @@ fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
     Ok(Box::new(file))
 }
 
-/// Returns a description of the piece of an MCAP file that the file at `path` is; `None` if it is something else. Its
-/// telegrams would otherwise look like a stream.
+/// Returns a description if the file at `path` is a piece of an MCAP file, and `None` for any other file. Without this
+/// check, the telegrams in such a piece would look like a stream file.
 fn mcap_fragment(path: &Path) -> io::Result<Option<&'static str>> {
     let mut file = regular_file::open(path)?;
     let end = file.metadata()?.len().saturating_sub(MCAP_MAGIC.len() as u64);
@@ -467,15 +471,15 @@ fn unusable(path: &Path, what: &str) -> Failure {
     Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS_REMEDY)
 }
 
-/// Reader of a gzip file with a limit. A kilobyte can unpack to a megabyte of equal bytes, so a file that cannot be a
-/// recording is rejected early.
+/// Reader of a gzip file that limits the ratio of unpacked to packed bytes. A kilobyte can unpack to a megabyte of
+/// equal bytes, so a file whose ratio is too large for a recording is rejected early.
 struct GzipReader<R> {
     decoder: MultiGzDecoder<CountingReader<R>>,
     /// Number of unpacked bytes.
     unpacked: u64,
 }
 
-/// Reader that counts the bytes that are read.
+/// Reader that counts the bytes that it reads from `input`.
 struct CountingReader<R> {
     input: R,
     read: u64,
@@ -488,8 +492,8 @@ impl<R: BufRead> GzipReader<R> {
 }
 
 impl<R: BufRead> Read for GzipReader<R> {
-    /// Reads unpacked bytes. Returns [`ErrorKind::FileTooLarge`] if the file unpacks to more than [`MAX_RATIO`] times
-    /// its length.
+    /// Reads unpacked bytes. Returns [`ErrorKind::FileTooLarge`] if the unpacked bytes are more than [`MAX_RATIO`]
+    /// times the packed bytes so far.
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let len = self.decoder.read(buffer)?;
         self.unpacked += len as u64;
@@ -530,16 +534,17 @@ const FORMS_REMEDY: &str =
 const GZIP_MAGIC: &[u8] = &[0x1F, 0x8B];
 /// First bytes of an MCAP file.
 const MCAP_MAGIC: &[u8] = b"\x89MCAP0\r\n";
-/// Number of bytes at the beginning of a file that are searched for records of MCAP: several samples of any topic.
+/// Number of bytes at the beginning of a file that are searched for records of MCAP. They hold several samples of any
+/// topic.
 #[cfg(feature = "mcap")]
 const SEARCH_LEN: usize = 256 * 1024;
-/// Size of a read buffer in bytes. A CARMEN log is detected by the lines in the first one.
+/// Size of a read buffer in bytes. A CARMEN log is detected by the lines in the first buffer.
 const BUFFER_LEN: usize = 64 * 1024;
-/// Number of frames after which the model is known from the packets.
+/// Maximum number of frames that are read to detect the model by the packets.
 const MODEL_FRAMES: usize = 500;
 /// Maximum ratio of unpacked to packed bytes. A stream of equal telegrams has a ratio of 100; the format allows 1,000.
 const MAX_RATIO: u64 = 400;
-/// Number of unpacked bytes up to which there is no limit.
+/// Number of unpacked bytes up to which the ratio is not limited.
 const MIN_LIMITED_LEN: u64 = 32 << 20;
 
 #[cfg(test)]
@@ -560,7 +565,7 @@ mod tests {
         encoder.finish().unwrap()
     }
 
-    /// Returns the number of unpacked bytes, and the error that ended them.
+    /// Returns the number of unpacked bytes, and the error at which the reader ended, if any.
     fn unpacked(packed: &[u8]) -> (usize, Result<(), ErrorKind>) {
         let (mut input, mut buffer, mut len) = (GzipReader::new(packed), vec![0; 1 << 16], 0);
         loop {

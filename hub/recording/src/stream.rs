@@ -1,5 +1,6 @@
-//! Sessions and framers that read recorded bytes. [`StreamReader`] reads a stream file: bytes as they arrived on a
-//! line, without stamps. [`VirtualTime`] passes telegrams to a session at the times at which the hub received them.
+//! Readers of recorded bytes, with the sessions and framers of the hub. [`StreamReader`] reads a stream file: bytes as
+//! they arrived on a line, without stamps. [`VirtualTime`] passes telegrams to a session at the times at which the hub
+//! received them.
 
 use std::io::{self, Read};
 use std::path::Path;
@@ -13,8 +14,8 @@ use scanhub_schema::{Failure, Family, MILLIS, Nanos, line_time};
 use crate::open::{is_truncation, reader, unreadable};
 use crate::{Contents, Form, Frame};
 
-/// Reader of the telegrams of an LMS or the packets of a rotating scanner from a stream. It counts the bytes outside
-/// them.
+/// Reader of the telegrams of an LMS or the packets of a rotating scanner from a stream. The reader counts the bytes
+/// outside telegrams and packets.
 pub(crate) struct StreamReader<R> {
     reader: R,
     framing: Framing,
@@ -32,7 +33,7 @@ enum Framing {
 struct PacketReader {
     session: Session,
     family: Family,
-    /// Scanner's clock at the last packets.
+    /// Time on the scanner's clock at the last packets.
     last: Option<Nanos>,
     /// Time since the first packets.
     elapsed: Nanos,
@@ -53,7 +54,8 @@ impl<R: Read> StreamReader<R> {
         StreamReader { reader, framing, read_len: 0, is_ended: false }
     }
 
-    /// Returns the number of bytes so far outside telegrams and packets. It is complete at the end.
+    /// Returns the number of bytes so far that are outside telegrams and packets. At the end of the stream, the number
+    /// is complete.
     fn discarded(&self) -> u64 {
         let (discarded, buffered) = match &self.framing {
             Framing::Telegrams(framer) => (framer.counters().discarded, framer.buffered() as u64),
@@ -65,7 +67,7 @@ impl<R: Read> StreamReader<R> {
         discarded + if self.is_ended { buffered } else { 0 }
     }
 
-    /// Returns the next telegram or packets; `None` at the end.
+    /// Returns the next telegram or the next packets; `None` at the end.
     ///
     /// # Errors
     ///
@@ -96,7 +98,8 @@ impl<R: Read> StreamReader<R> {
                 Framing::Packets(packets) => {
                     packets.session.commit(0, len);
                     if self.is_ended {
-                        // No more bytes can refute packets that are held back.
+                        // The session holds packets back until the following bytes confirm them. No bytes follow any
+                        // more, so let the session release the packets.
                         packets.session.handle_timeout(IDLE_TIME);
                     }
                 }
@@ -130,8 +133,8 @@ impl PacketReader {
         Some(Frame { telegram, family: self.family as u8, scanner_ns, reasons, ..Frame::default() })
     }
 
-    /// Returns the time of the last packets since the first ones. `duration` is their time on the line. The result
-    /// never decreases.
+    /// Returns the time from the first packets to the last packets. `duration` is the time that the last packets spent
+    /// on the line. The result never decreases.
     fn advance_clock(&mut self, duration: Nanos) -> Nanos {
         let Some(at) = self.session.scanner_time() else {
             self.elapsed += duration;
@@ -139,7 +142,7 @@ impl PacketReader {
         };
         self.elapsed += match self.last {
             None => 0,
-            // The clock goes back if the scanner has restarted.
+            // If the scanner has restarted, its clock has gone back.
             Some(last) => at.checked_sub(last).unwrap_or(duration),
         };
         self.last = Some(at);
@@ -147,11 +150,12 @@ impl PacketReader {
     }
 }
 
-/// Reads the stream of `family` at `path` to its end, and returns its contents. `head` has its first bytes.
+/// Reads the stream of `family` at `path` to its end, and returns the contents. `head` has the first bytes of the
+/// stream.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`](scanhub_schema::Kind::Input) if it cannot be read.
+/// Returns [`Kind::Input`](scanhub_schema::Kind::Input) if the stream cannot be read.
 pub(crate) fn survey(path: &Path, family: Family, head: &[u8]) -> Result<Contents, Failure> {
     let mut stream = StreamReader::new(family, head, reader(path)?);
     let mut contents = Contents { form: Form::Telegrams, family: family as u8, ..Contents::default() };
@@ -174,8 +178,8 @@ pub(crate) fn survey(path: &Path, family: Family, head: &[u8]) -> Result<Content
     Ok(contents)
 }
 
-/// Session in the time of a recording. It receives each packet at the time at which the recording hub received it, and
-/// its timers expire in between. The packets therefore have the same results as in that hub.
+/// Session in the time of a recording. The session receives each packet at the time at which the recorded hub received
+/// it, and the timers of the session expire in between. The session therefore returns the same results as in that hub.
 pub struct VirtualTime<S> {
     session: S,
     now: Nanos,
@@ -184,7 +188,7 @@ pub struct VirtualTime<S> {
 }
 
 impl<S: Protocol> VirtualTime<S> {
-    /// Creates the virtual time of `session`, which started at `now`.
+    /// Creates the virtual time for `session`, which started at `now`.
     pub fn new(session: S, now: Nanos) -> VirtualTime<S> {
         VirtualTime { session, now, until: now }
     }
@@ -200,7 +204,8 @@ impl<S: Protocol> VirtualTime<S> {
     }
 
     /// Advances the time to `now`, and then passes `bytes` to the session. `handle` receives the events. Time never
-    /// goes back: an earlier `now` counts as the last one. A silence of more than an hour counts as an hour.
+    /// goes back: if `now` is earlier than in the last call, the time stays the same. In a silence of more than an
+    /// hour, timers expire only during the last hour.
     pub fn take(&mut self, now: Nanos, bytes: &[u8], mut handle: impl FnMut(Event<'_>)) {
         let now = now.max(self.now);
         // A wrong stamp in a file may be centuries ahead.
@@ -211,7 +216,7 @@ impl<S: Protocol> VirtualTime<S> {
             self.session.commit(self.now, 0);
             self.session.handle_timeout(self.now);
             self.drain(&mut handle);
-            // The next timeout is later, or time would stand still.
+            // The next timeout must be later than the current time, because otherwise this loop would never end.
             self.until = self.until.max(self.now + 1);
         }
         self.now = now;
@@ -237,7 +242,7 @@ impl<S: Protocol> VirtualTime<S> {
                 Action::SetRate(_) | Action::SetDtr(_) => false,
                 Action::SleepUntil(until) | Action::Wait { until, .. } => break until,
             };
-            // A recording does not reply to a request, so report it as sent.
+            // A recording cannot receive a request, so only report the request as sent.
             if is_sent {
                 self.session.handle_transmitted(self.now);
             }
@@ -245,9 +250,10 @@ impl<S: Protocol> VirtualTime<S> {
     }
 }
 
-/// Maximum silence in which the timers of a session run. Afterwards, the session has nothing new to do.
+/// Maximum duration of a silence in which the timers of a session expire. During a longer silence, the session only
+/// repeats what it did before.
 const MAX_SILENCE: Nanos = 3_600_000 * MILLIS;
-/// Time after which a session no longer holds packets back.
+/// Time without bytes after which a session no longer holds packets back.
 const IDLE_TIME: Nanos = 100 * MILLIS;
 
 #[cfg(test)]

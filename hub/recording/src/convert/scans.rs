@@ -1,11 +1,11 @@
 //! Decoded scans of a recording, and the poses of their sensors.
 //!
 //! The scans of an LMS are decoded from its telegrams, as in the hub. If its telegrams were not recorded, its published
-//! scans are used. For a rotating scanner, published scans are preferred. Otherwise, the session that the hub uses
-//! builds scans from its packets.
+//! scans are used. For a rotating scanner, published scans are used first. If they were not recorded, the same session
+//! as in the hub builds scans from the packets.
 //!
 //! A recording may begin after a rotating scanner has sent the responses that define how to read its packets.
-//! [`stream_heads`] returns them, with the positions at which a stream file needs them.
+//! [`stream_heads`] returns these responses, with the positions at which a stream file needs them.
 
 use std::collections::BTreeMap;
 
@@ -29,7 +29,7 @@ use crate::{Encoding, Form, Frame, Recording, VirtualTime};
 pub(super) enum DecodedItem<'a> {
     /// A scan of a sensor.
     Scan(&'a str, Header, &'a Scan),
-    /// Pose of a sensor from this time on, in ns since 1970.
+    /// Pose of a sensor, and the time from which the pose is valid, in ns since 1970.
     Pose(&'a str, u64, Pose),
     /// A telegram that is not a scan.
     Other,
@@ -40,14 +40,14 @@ struct Sensor {
     mode: Option<Mode>,
     /// Whether the sensor's scans are decoded from its telegrams.
     is_decoded: bool,
-    /// Builder of scans from packets; `None` for an LMS.
+    /// Builder of scans from packets; `None` for an LMS, and if published scans are used.
     revolutions: Option<Revolutions>,
-    /// Whether none of the sensor's telegrams has been read.
+    /// Whether no telegram of the sensor has been read yet.
     is_first: bool,
 }
 
 /// Calls `take_item` for each item of `recording`, in the order of the file. If the recording does not name its sensor,
-/// the items belong to `name`. `mode` is used if the recording does not contain the measuring mode.
+/// `name` is the name of the sensor. `mode` is used if the recording does not contain the measuring mode.
 ///
 /// # Errors
 ///
@@ -148,7 +148,7 @@ fn for_each_mcap_item(
 }
 
 impl Sensor {
-    /// Checks that values can be decoded to ranges.
+    /// Checks that values can be decoded to ranges, which requires a measuring mode.
     fn check(&self, recording: &Recording, name: &str) -> Result<(), Failure> {
         if self.mode.is_some() || !self.is_decoded {
             return Ok(());
@@ -159,7 +159,8 @@ impl Sensor {
         Err(Failure::new(Kind::Configuration, message, hint))
     }
 
-    /// Decodes a telegram into `scan`. Returns `false` if it is not a scan, or if its measuring mode is unknown.
+    /// Decodes a telegram into `scan`. Returns `false` if the telegram is not a scan, or if its measuring mode is
+    /// unknown.
     fn decode(&mut self, telegram: &[u8], scan: &mut Box<Scan>) -> bool {
         let Some(telegram) = Telegram::check(telegram) else { return false };
         if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
@@ -181,13 +182,13 @@ impl Sensor {
 pub(super) struct Revolutions {
     family: Family,
     settings: Settings,
-    /// The session, and the run of the hub that it belongs to.
+    /// The session, and the boot ID of the hub whose packets it handles.
     session: Option<(u64, VirtualTime<Session>)>,
     scan: Box<Scan>,
 }
 
 impl Revolutions {
-    /// Creates the builder for the only sensor of `recording`; `None` if it is not a rotating scanner.
+    /// Creates the builder for the only sensor of `recording`. Returns `None` if the scanner is not a rotating one.
     pub(super) fn of(recording: &Recording) -> Result<Option<Revolutions>, Failure> {
         let Some(family) = recording.family().filter(|family| !features(*family).has_whole_telegrams) else {
             return Ok(None);
@@ -196,8 +197,8 @@ impl Revolutions {
         Ok(Some(Revolutions { family, settings, session: None, scan: Box::default() }))
     }
 
-    /// Handles the packets of a sample with this `header`. Calls `take_item` for each scan that they complete, with its
-    /// header.
+    /// Handles the packets of a sample with this `header`. Calls `take_item` for each scan that these packets complete,
+    /// with the header of the scan.
     pub(super) fn for_each_revolution(
         &mut self,
         header: &Header,
@@ -205,7 +206,7 @@ impl Revolutions {
         mut take_item: impl FnMut(Header, &Scan) -> Result<(), ConversionError>,
     ) -> Result<(), ConversionError> {
         let Revolutions { family, settings, session, scan } = self;
-        // Another run of the hub has another clock.
+        // Another run of the hub may have another clock, so it needs a new session.
         if session.as_ref().is_none_or(|(boot, _)| *boot != header.boot) {
             let new_session = Session::begin(*family, settings, header.stamp_first_ns);
             *session = Some((header.boot, VirtualTime::new(new_session, header.stamp_first_ns)));
@@ -238,8 +239,8 @@ impl Revolutions {
     }
 }
 
-/// Generator of stamps for telegrams that have none. The stamps are one scan period apart, and the last telegram ends
-/// when the file was last written.
+/// Generator of stamps for telegrams that have no stamps. The stamps of scans are one scan period apart, and the last
+/// telegram ends at the time at which the file was last written.
 pub(super) struct SyntheticClock {
     wall_ns: u64,
     begin_ns: u64,
@@ -257,7 +258,7 @@ impl SyntheticClock {
             Some((first_ns, _)) => first_ns,
             None => recording.modified_ns().saturating_sub(took_ns),
         };
-        // The run's ID can be any number that differs between recordings.
+        // The boot ID can be any number that differs between recordings.
         let boot = begin_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
         SyntheticClock { wall_ns: begin_ns, begin_ns, boot, variant }
     }
@@ -271,8 +272,9 @@ impl SyntheticClock {
         at_ns
     }
 
-    /// Returns the header that a hub might have published with the next frame, `frame`, which has this `number`. The
-    /// period ends with the frame at `next_ns`, because logs omit scans, and no newer scan exists until then.
+    /// Returns the header that a hub might have published with the next frame, `frame`, which has the index `number`.
+    /// The period lasts until the following frame at `next_ns`, because logs may omit scans, and no newer scan exists
+    /// in between.
     pub(super) fn header(&mut self, frame: &Frame, number: u64, next_ns: Option<u64>) -> Header {
         let wall_ns = self.wall_ns(frame);
         let first_ns = wall_ns.saturating_add(START_NS).saturating_sub(self.begin_ns);
@@ -289,7 +291,7 @@ impl SyntheticClock {
             family: frame.family,
             quality: u8::from(frame.reasons != 0),
             reasons: frame.reasons,
-            // Packets have no scan period.
+            // A frame of packets has no scan period.
             period_us: if frame.scanner_ns.is_some() { 0 } else { (period_ns / 1000) as u32 },
             ..Header::default()
         }
@@ -305,7 +307,7 @@ fn line_ns(frame: &Frame) -> u64 {
     scanhub_schema::line_time(frame.telegram.len(), Baud::B500000.rate())
 }
 
-/// Returns the missing responses, each with the index of the frame before which it belongs.
+/// Returns the responses that are missing before the packets, each with the index of the frame before which it belongs.
 ///
 /// # Errors
 ///
@@ -327,7 +329,7 @@ pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)
         let session = stream.session.session();
         let head = session.stream_responses(reported, recording.beams());
         if !head.is_empty() {
-            // Without a model, neither a status nor the scanner has confirmed the time per point.
+            // If the model is unknown, neither a status nor the scanner has confirmed the time per point.
             is_guess |= status.is_none() && session.model_text().is_none();
             heads.push((stream.at, head));
         }
@@ -349,7 +351,7 @@ pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)
     Ok(heads)
 }
 
-/// Returns the failure of a recording whose packets can be read in several ways.
+/// Returns the failure for a recording whose packets can be read in several ways.
 fn without_status(recording: &Recording) -> Failure {
     let message = format!(
         "recording {} has neither the topic status nor the scanner's responses, without which its packets cannot be read",
@@ -360,10 +362,10 @@ fn without_status(recording: &Recording) -> Failure {
 
 /// A stream of packets, and the responses before it.
 struct Stream {
-    /// ID of the hub's run.
+    /// Boot ID of the hub.
     boot: u64,
     /// Index of the frame before which missing responses belong: the last response before the packets, or the first
-    /// frame without such a response.
+    /// frame if there is no such response.
     at: usize,
     /// Stamp of the first packets. `None` before they have arrived.
     packets_since: Option<Nanos>,
@@ -372,7 +374,8 @@ struct Stream {
 
 impl Stream {
     /// Creates the stream that begins with frame `number`, which has this `header`. The mode in `settings` is that of
-    /// the recording's first status. A scanner that reports its modes does not use it.
+    /// the recording's first status. It is ignored if the stream begins with a response, because then the scanner
+    /// reports its modes itself.
     fn begin(family: Family, settings: Settings, number: usize, header: &Header, is_reply: bool) -> Stream {
         let (start, mode) = (header.stamp_first_ns, settings.mode.filter(|_| !is_reply));
         let session = Session::begin(family, &Settings { mode, ..settings }, start);
@@ -384,8 +387,8 @@ impl Stream {
         }
     }
 
-    /// Returns whether the frame with this `header` belongs to the stream. A frame of another run of the hub and a
-    /// response after packets do not.
+    /// Returns whether the frame with this `header` belongs to the stream. A frame of another run of the hub does not
+    /// belong to the stream, nor does a response after packets.
     fn continues_with(&self, header: &Header, is_reply: bool) -> bool {
         header.boot == self.boot && !(is_reply && self.packets_since.is_some())
     }
@@ -400,17 +403,17 @@ impl Stream {
                 return;
             }
         }
-        // As in the hub, an error of the line affects only the packets.
+        // As in the hub, the flag for an error of the line is not passed to the session.
         self.session.session_mut().mark_suspect(header.reasons & !suspect::LINE_ERROR);
         self.session.take(header.stamp_last_ns, telegram, |_| {});
     }
 }
 
-/// Maximum period, which fits into a header.
+/// Maximum period that the clock generates, in ns. It fits into a header.
 const MAX_PERIOD_NS: u64 = 3_600_000_000_000;
-/// Monotonic clock at the first telegram, as on a machine that has just started.
+/// Time on the monotonic clock at the first telegram, in ns, as on a machine that has just started.
 const START_NS: u64 = 10_000_000_000;
 /// Kind of a telegram that is a response.
 const REPLY_KIND: &str = "reply";
-/// Time for which the packets of a stream are measured.
+/// Maximum time for which the session reads packets of a stream to measure the time per point.
 const MEASURING_TIME: Nanos = 4_000 * MILLIS;

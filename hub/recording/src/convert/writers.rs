@@ -82,7 +82,7 @@ pub(super) fn write_mcap(conversion: &mut Conversion, file: &mut impl Write) -> 
     Ok(())
 }
 
-/// Adds `len` to the `bytes` in the open chunk of `writer`, and ends the chunk if it is large enough.
+/// Adds `len` to `bytes`, the number of bytes in the open chunk of `writer`. Ends the chunk if it is large enough.
 fn close_chunk<W: Write>(writer: &mut Writer<W>, bytes: &mut usize, len: usize) -> io::Result<()> {
     *bytes += len;
     if *bytes >= CHUNK_LEN {
@@ -92,7 +92,8 @@ fn close_chunk<W: Write>(writer: &mut Writer<W>, bytes: &mut usize, len: usize) 
     Ok(())
 }
 
-/// Returns the telegrams of `recording`. Those of a log begin with the reply that contains the encoding of the values.
+/// Returns the telegrams of `recording`. For a log, the first telegram is the reply that contains the encoding of the
+/// values.
 fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Item = Frame> + use<>, Failure> {
     let contents = recording.contents();
     let first = (contents.form == Form::Carmen).then(|| {
@@ -105,7 +106,7 @@ fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Ite
 }
 
 /// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] adds to a log. No scanner sent
-/// it, so it is not lost if it is omitted.
+/// this reply, so it does not count as dropped if it is omitted.
 pub(super) fn is_synthetic(telegram: &[u8], header: Option<&Header>) -> bool {
     let is_estimated = header.is_none_or(|header| header.flags & Flags::STAMP_ESTIMATED != 0);
     is_estimated && carmen::is_synthetic(telegram)
@@ -148,9 +149,9 @@ pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result
 struct Copy<'a, W: Write> {
     writer: Writer<W>,
     catalog: &'a Catalog,
-    /// IDs of channels in the new file, by those in the old file.
+    /// IDs of channels in the new file, by their IDs in the old file.
     channels: BTreeMap<u16, u16>,
-    /// Whether the metadata of the old file was read. The new file begins with it.
+    /// Whether the metadata of the old file was read. The new file begins with this metadata.
     has_metadata: bool,
     /// Number of bytes in the open chunk.
     bytes: usize,
@@ -201,12 +202,12 @@ impl<W: Write> Copy<'_, W> {
     }
 }
 
-/// Writer of a format that holds decoded scans.
+/// Writer of a format that contains decoded scans.
 pub(super) trait ScanSink {
-    /// Writes `item`, and returns its result. Returns `None` if it is not a telegram.
+    /// Writes `item`, and returns its result. Returns `None` if `item` is not a telegram.
     fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<WrittenItem>>;
 
-    /// Returns whether intensities were requested, and no scan had any.
+    /// Returns whether intensities were requested, but no scan had intensities.
     fn lacks_intensities(&self) -> bool {
         false
     }
@@ -341,7 +342,7 @@ impl<W: Write> ScanSink for Csv<W> {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::NoTopic`] if none were recorded.
+/// Returns [`Kind::NoTopic`] if no marks were recorded.
 pub(super) fn write_marks(
     conversion: &mut Conversion,
     columns: MarkColumns,

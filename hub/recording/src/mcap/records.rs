@@ -3,10 +3,10 @@
 //! Rules for a damaged file:
 //!
 //! - A chunk is used completely or not at all, because one CRC-32 covers all of its records. A chunk with a wrong
-//!   checksum or opcode is skipped, and so is a record whose fields do not fit into it.
+//!   checksum or opcode is skipped. A record whose fields are longer than the record is skipped, too.
 //! - A chunk that the file contains twice is read once.
 //! - After a record whose length or opcode is impossible, reading continues at the next chunk whose lengths agree. In a
-//!   file with messages outside chunks, it continues at the next message of the hub.
+//!   file with messages outside chunks, reading continues at the next message of the hub.
 //! - A truncated file is read to its last complete record.
 //!
 //! [`Damage`] counts all bytes that were not used. The format is described at <https://mcap.dev/spec>.
@@ -31,12 +31,12 @@ use crate::open::is_truncation;
 pub(crate) struct Record {
     pub(crate) opcode: u8,
     pub(crate) body: Vec<u8>,
-    /// Whether the checksum of a chunk covers it.
+    /// Whether the record is in a chunk, whose checksum covers it.
     pub(crate) is_in_chunk: bool,
 }
 
 impl Record {
-    /// Parses the record; `None` if its fields do not fit into it.
+    /// Parses the record. Returns `None` if the fields are longer than the record.
     pub(crate) fn parse(&self) -> Option<Parsed<'_>> {
         // The library panics at an attachment that ends before its checksum.
         if self.opcode == op::ATTACHMENT && !is_attachment(&self.body) {
@@ -45,7 +45,7 @@ impl Record {
         parse_record(self.opcode, &self.body).ok()
     }
 
-    /// Returns header and data of a message; `None` if the record is not one.
+    /// Returns header and data if the record is a message; `None` for any other record.
     pub(crate) fn message(&self) -> Option<(MessageHeader, &[u8])> {
         if self.opcode != op::MESSAGE {
             return None;
@@ -62,17 +62,17 @@ pub(crate) struct Records<R> {
     input: R,
     /// The open chunk, whose records are returned next.
     chunk: Chunk,
-    /// Hashes of the first [`MAX_CHUNKS`] chunks with messages.
+    /// Hashes of the first [`MAX_CHUNKS`] chunks with messages, to detect repeated chunks.
     chunks: HashSet<u64>,
-    /// Bytes to read again before those of `input`.
+    /// Bytes that are read again before further bytes of `input`.
     unread: Cursor<Vec<u8>>,
-    /// Number of positions at which the structure was lost.
+    /// Number of positions at which the structure of the file was lost.
     resyncs: u32,
     /// Whether a message was read outside chunks.
     has_messages: bool,
     /// Checksum of the current section: the data section, then the summary.
     section: Crc,
-    /// Last bytes that were read, at most as many as the magic bytes.
+    /// Last bytes that were read. At most as many bytes are stored as the magic bytes have.
     tail: Vec<u8>,
     damage: Damage,
     is_begun: bool,
@@ -96,7 +96,7 @@ impl<R: Read> Records<R> {
         }
     }
 
-    /// Returns the counts of data that was not used so far. They are complete after the last record.
+    /// Returns the counts of data that was not used so far. The counts are complete after the last record.
     pub(crate) fn damage(&self) -> Damage {
         self.damage
     }
@@ -105,8 +105,9 @@ impl<R: Read> Records<R> {
     ///
     /// # Errors
     ///
-    /// Returns the error of the input. Returns `FileTooLarge` at an intact chunk that is longer than [`MAX_RECORD_LEN`], compressed
-    /// or not, and `Unsupported` at a chunk whose compression this build lacks.
+    /// Returns the error of the input. Returns `FileTooLarge` at an intact chunk that is longer than
+    /// [`MAX_RECORD_LEN`], whether packed or unpacked. Returns `Unsupported` at a chunk with a compression that this
+    /// build does not support.
     pub(crate) fn next(&mut self) -> io::Result<Option<Record>> {
         loop {
             if let Some(record) = self.chunk.next() {
@@ -123,7 +124,8 @@ impl<R: Read> Records<R> {
                     self.end_here(magic.len())?;
                     continue;
                 }
-                // The magic bytes at the end of the file are equal, and must not be mistaken for these.
+                // The magic bytes at the end of the file are the same. Clear the tail, so that the magic bytes at the
+                // start do not look like those at the end.
                 self.tail.clear();
             }
             if let Some(record) = self.read_record()? {
@@ -132,7 +134,7 @@ impl<R: Read> Records<R> {
         }
     }
 
-    /// Reads the next record outside chunks; `None` if it was a chunk, or cannot be used.
+    /// Reads the next record outside chunks. Returns `None` if the record was a chunk, or cannot be used.
     fn read_record(&mut self) -> io::Result<Option<Record>> {
         let head = self.read(HEAD_LEN)?;
         let Some((opcode, length)) = split_head(&head) else {
@@ -153,7 +155,8 @@ impl<R: Read> Records<R> {
         if (body.len() as u64) < length {
             return self.end_or_resynchronize(head, body);
         }
-        // Damage has changed the opcode to that of a footer or data end, or to a reserved one.
+        // In these cases, damage has changed the opcode to that of a footer, to that of a data end, or to a reserved
+        // opcode.
         let is_no_footer = opcode == op::FOOTER && length != FOOTER_LEN;
         let is_no_end = opcode == op::DATA_END && length != DATA_END_LEN;
         let is_chunk = is_chunk(&body, length);
@@ -212,8 +215,8 @@ impl<R: Read> Records<R> {
         }
         self.section.update(&head);
         self.section.update(&body);
-        // The chunk starts with the time of its first message; 0 if there is none. Chunks whose messages have no times
-        // may be equal.
+        // The chunk starts with the time of its first message, or with 0 if it has no message. Chunks whose messages
+        // have no times may be equal, so they are not compared.
         let is_dated = body.iter().take(8).any(|byte| *byte != 0);
         let mut hasher = DefaultHasher::new();
         hasher.write(&body);
@@ -265,8 +268,9 @@ impl<R: Read> Records<R> {
         Ok(())
     }
 
-    /// Continues at the next chunk after the start of a record that cannot be right, or at the next message of the hub if the
-    /// file has messages outside chunks. `window` has the bytes from that start on that have been read. Always returns `None`.
+    /// Searches for the next chunk after the start of an impossible record. If the file has messages outside chunks,
+    /// the next message of the hub is found, too. Reading continues there. `window` has the bytes that were read since
+    /// the start of the record. Always returns `None`.
     fn resynchronize(&mut self, mut window: Vec<u8>) -> io::Result<Option<Record>> {
         self.resyncs += 1;
         let mut from = 1;
@@ -306,7 +310,7 @@ impl<R: Read> Records<R> {
         Ok(None)
     }
 
-    /// Reads the magic bytes at the end of the file, after which nothing may follow.
+    /// Reads the magic bytes at the end of the file. Nothing may follow them.
     fn end_file(&mut self) -> io::Result<()> {
         let magic = self.read(MAGIC.len())?;
         if MAGIC.starts_with(&magic) && magic.len() < MAGIC.len() {
@@ -326,13 +330,13 @@ impl<R: Read> Records<R> {
     fn end_in_record(&mut self, len: u64) {
         self.is_ended = true;
         self.damage.bytes += len;
-        // If the file ends with the magic bytes, it is not truncated, and the length is wrong.
+        // If the file ends with the magic bytes, it is not truncated, so the length of the record is wrong.
         let is_whole = self.tail == MAGIC;
         self.damage.is_truncated |= !is_whole;
         self.damage.is_damaged |= is_whole;
     }
 
-    /// Ends reading because the structure is lost. The last `len` bytes that were read cannot be used.
+    /// Ends reading because the structure of the file is lost. The last `len` bytes that were read cannot be used.
     fn end_here(&mut self, len: usize) -> io::Result<()> {
         self.is_ended = true;
         let rest = self.discard()?;
@@ -347,7 +351,7 @@ impl<R: Read> Records<R> {
         self.damage.is_damaged = true;
     }
 
-    /// Compares the checksum of the section with `saved`; 0 means that the writer did not compute it.
+    /// Compares the checksum of the section with `saved`. 0 means that the writer did not compute the checksum.
     fn check_section(&mut self, saved: Option<&[u8; 4]>) {
         let saved = saved.map_or(0, |saved| u32::from_le_bytes(*saved));
         self.damage.is_damaged |= saved != 0 && saved != self.section.sum();
@@ -364,7 +368,8 @@ impl<R: Read> Records<R> {
         }
     }
 
-    /// Reads `len` bytes; fewer only at the end of the file. A gzip file ends where it is truncated or damaged.
+    /// Reads `len` bytes, or fewer at the end of the file. The end of a gzip file is the position at which it is
+    /// truncated or damaged.
     fn read(&mut self, len: usize) -> io::Result<Vec<u8>> {
         // The length may be wrong, so allocate memory only for bytes that exist.
         let mut bytes = Vec::with_capacity(len.min(READ_LEN as usize));
@@ -392,14 +397,16 @@ impl Chunk {
     ///
     /// # Errors
     ///
-    /// Returns an error if the checksum is wrong, if its records do not fill it, or if it cannot be unpacked. Returns
-    /// [`McapError::ChunkTooLarge`] if it is intact, but unpacks to more than [`MAX_RECORD_LEN`].
+    /// Returns an error if the checksum is wrong, if the records do not fill the chunk exactly, or if the chunk cannot
+    /// be unpacked. Returns [`McapError::ChunkTooLarge`] if the chunk is intact, but longer than [`MAX_RECORD_LEN`]
+    /// when unpacked.
     fn open(body: Vec<u8>) -> Result<Chunk, McapError> {
         let Parsed::Chunk { header, data } = parse_record(op::CHUNK, &body)? else {
             return Err(McapError::UnexpectedEoc);
         };
         if header.uncompressed_size > MAX_RECORD_LEN {
-            // The length may be damaged. Only an intact chunk proves that the file has chunks that are too long.
+            // The length itself may be damaged. Only if the chunk is intact, the file really has a chunk that is too
+            // long.
             return Err(match unpacked_length(&body, header.uncompressed_size) {
                 Ok(len) if len == header.uncompressed_size => McapError::ChunkTooLarge(len),
                 Ok(_) => McapError::UnexpectedEoc,
@@ -432,7 +439,7 @@ impl Iterator for Chunk {
 
     fn next(&mut self) -> Option<Record> {
         let Some((record, _)) = split_record(&self.bytes[self.at..]) else {
-            // Free the memory now, not when the next chunk arrives.
+            // Free the memory now, and not only when the next chunk is opened.
             *self = Chunk::default();
             return None;
         };
@@ -457,8 +464,8 @@ fn unpack(body: &[u8]) -> Result<Vec<u8>, McapError> {
     Ok(records)
 }
 
-/// Returns the length of the records of a compressed chunk that may be too long to be held in memory. Stops when the
-/// length exceeds `max_len`, or that of any chunk that a recorder writes.
+/// Returns the unpacked length of a chunk that may be too long to be held in memory. Stops when the length exceeds
+/// `max_len` or [`MAX_CHUNK_LEN`].
 fn unpacked_length(body: &[u8], max_len: u64) -> Result<u64, McapError> {
     let (mut len, most) = (0, max_len.min(MAX_CHUNK_LEN));
     for_each_record(body, LinearReaderOptions::default().with_validate_chunk_crcs(true), |_, data| {
@@ -468,7 +475,7 @@ fn unpacked_length(body: &[u8], max_len: u64) -> Result<u64, McapError> {
     Ok(len)
 }
 
-/// Calls `take` with opcode and body of each record of a compressed chunk, until it returns false.
+/// Calls `take` with opcode and body of each record of a compressed chunk, until `take` returns false.
 fn for_each_record(
     body: &[u8],
     options: LinearReaderOptions,
@@ -507,7 +514,8 @@ fn too_long(len: u64) -> io::Error {
 }
 
 /// Returns whether `bytes` start with a chunk whose lengths agree, or, if `messages` is set, with a message of the hub.
-/// Neither occurs by chance, because both contain lengths or times twice.
+/// Other bytes do not look like this by chance, because a chunk contains lengths twice, and a message contains times
+/// twice.
 fn is_record_boundary(bytes: &[u8], messages: bool) -> bool {
     let Some((opcode, length)) = split_head(bytes) else { return false };
     match opcode {
@@ -518,8 +526,8 @@ fn is_record_boundary(bytes: &[u8], messages: bool) -> bool {
     }
 }
 
-/// Returns whether a chunk with messages or a message of the hub starts anywhere in `bytes`. An empty chunk does not
-/// count: the packets of a scanner without readings are zeros, and may look like one.
+/// Returns whether a chunk with messages or a message of the hub starts anywhere in `bytes`. An empty chunk is ignored,
+/// because the packets of a scanner without readings are zeros and may look like an empty chunk.
 pub(crate) fn has_record_boundary(bytes: &[u8]) -> bool {
     let is_dated = |bytes: &[u8]| match split_head(bytes) {
         Some((op::CHUNK, _)) => bytes[HEAD_LEN..].iter().take(8).any(|byte| *byte != 0),
@@ -590,7 +598,7 @@ fn chunk_length(body: &[u8]) -> Option<u64> {
 /// Returns whether the lengths inside an attachment add up to its length.
 fn is_attachment(body: &[u8]) -> bool {
     let fits = || {
-        // The fields are the times of the log and of the creation, then name and media type.
+        // The fields are the log time and the creation time, and then name and media type.
         let mut rest = body.get(8 + 8..)?;
         for _ in 0..2 {
             let (len, text) = rest.split_first_chunk()?;
@@ -602,12 +610,13 @@ fn is_attachment(body: &[u8]) -> bool {
     fits() == Some(true)
 }
 
-/// Returns whether the fields of records of this kind are used, so that they must be valid.
+/// Returns whether this reader uses the fields of records with this opcode, so that the fields must be valid.
 fn is_interpreted(opcode: u8) -> bool {
     matches!(opcode, op::HEADER | op::SCHEMA | op::CHANNEL | op::MESSAGE | op::METADATA | op::ATTACHMENT)
 }
 
-/// Returns the maximum length of a record that is held in memory. Parsed records of texts take many times their length.
+/// Returns the maximum length of a record that is held in memory. Records that consist of texts take many times their
+/// length when they are parsed, so their limit is lower.
 fn max_len(opcode: u8) -> u64 {
     match opcode {
         op::HEADER | op::CHANNEL | op::METADATA => 1 << 20,
@@ -615,35 +624,35 @@ fn max_len(opcode: u8) -> u64 {
     }
 }
 
-/// Length of opcode and length, with which every record begins.
+/// Length in bytes of the opcode and the length field, with which every record begins.
 const HEAD_LEN: usize = 1 + 8;
-/// Number of bytes of a chunk that surely include the length of its records, despite the variable name of its
-/// compression.
+/// Number of bytes at the beginning of a chunk that surely include the field with the length of its records. The name
+/// of the compression before this field has a variable length.
 const CHUNK_HEAD_LEN: usize = 1024;
-/// Position of the name of a chunk's compression: after the times of the first and the last message, the uncompressed size,
-/// and the CRC.
+/// Position, in the body of a chunk, of the name of the compression: after the times of the first and the last message,
+/// the uncompressed size, and the CRC.
 const COMPRESSION_OFFSET: usize = 8 + 8 + 8 + 4;
 /// Number of bytes of a message that include the header of a sample of the hub.
 const MESSAGE_HEAD_LEN: usize = 2 + 4 + 8 + 8 + size_of::<scanhub_schema::Header>();
-/// Length of a data end.
+/// Length of the body of a data end, in bytes.
 const DATA_END_LEN: u64 = 4;
 /// Position of the checksum in the footer.
 const FOOTER_CRC_OFFSET: usize = 8 + 8;
-/// Length of a footer.
+/// Length of the body of a footer, in bytes.
 const FOOTER_LEN: u64 = FOOTER_CRC_OFFSET as u64 + 4;
-/// Opcodes that no version of the format uses yet. Those from 80h are free for any program.
+/// Opcodes that no version of the format uses yet. Opcodes from 80h are free for any program.
 const RESERVED_OPCODES: RangeInclusive<u8> = 0x10..=0x7F;
-/// Maximum length of all other records. The reader holds a few times this length in memory. Recorders write chunks of
-/// less than half of it.
+/// Maximum length of a record that is held in memory, in bytes, except for the kinds in [`max_len`]. The reader needs a
+/// few times this length as memory. Recorders write chunks of less than half of this length.
 const MAX_RECORD_LEN: u64 = 8 << 20;
-/// Length that no file exceeds.
+/// Length that no file exceeds, in bytes.
 const MAX_FILE_LEN: u64 = 1 << 40;
-/// Maximum length of a chunk that is unpacked to check whether it is intact.
+/// Maximum length, in bytes, to which a chunk is unpacked to check whether it is intact.
 const MAX_CHUNK_LEN: u64 = 1 << 30;
-/// Maximum number of chunks that are compared with later ones: 14 hours of a recording of the hub.
+/// Maximum number of chunks whose hashes are stored and compared with later chunks: 14 hours of a recording of the hub.
 const MAX_CHUNKS: usize = 1 << 19;
-/// Maximum number of positions at which the structure of a file is found again. Each one may read the longest record
-/// twice.
+/// Maximum number of positions after which the reader searches for the structure of the file again. Each search may
+/// read the longest record twice.
 const MAX_RESYNCS: u32 = 256;
 /// Number of bytes that are read at a time.
 const READ_LEN: u64 = 64 * 1024;

@@ -38,7 +38,7 @@ fn telegrams(path: &Path) -> Vec<Vec<u8>> {
     frames(path, CM_ENCODING).into_iter().map(|frame| frame.telegram).collect()
 }
 
-/// Returns channel, sequence number, times and data of all messages, as read by the `mcap` library.
+/// Returns channel, sequence number, times and data of all messages. The `mcap` library reads them.
 fn messages(bytes: &[u8]) -> Vec<(String, u32, u64, u64, Vec<u8>)> {
     let all = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
     all.map(|m| (m.channel.topic.clone(), m.sequence, m.log_time, m.publish_time, m.data.to_vec())).collect()
@@ -105,7 +105,8 @@ fn stream_conversion_adds_times_and_keeps_telegrams() {
         (folder.path().join("a.mcap"), folder.path().join("b.bin.gz"), folder.path().join("a.log.gz"));
     let result = convert_file(&stream, &mcap, Some("left")).unwrap();
     assert_eq!((result.forms, result.telegrams), ((Form::Telegrams, Target::Recording(Form::Mcap)), 31));
-    // The duration is that of the generated stamps. The reply takes less time on the line than a scan period.
+    // The duration follows from the generated stamps. The reply at the beginning takes less time on the line than a
+    // scan period.
     assert!(
         result.duration_ns.is_some_and(|ns| (29 * 26_640_000..30 * 26_640_000).contains(&ns)),
         "{result:?}"
@@ -130,7 +131,7 @@ fn stream_conversion_adds_times_and_keeps_telegrams() {
     assert!(read.iter().map(|frame| &frame.telegram).eq(&scans[1..]));
 }
 
-/// Converts, and returns the lines of the output.
+/// Converts a recording according to `options`, and returns the result and the lines of the output.
 fn rows(options: &ConvertOptions) -> (ConversionResult, Vec<String>) {
     let result = convert(options, &AtomicBool::new(false), |_, _| {}).unwrap();
     let text = fs::read_to_string(&options.output).unwrap();

@@ -1,5 +1,5 @@
-//! Tests of damaged MCAP files. If a file was truncated or changed anywhere, its intact chunks are read, and no data
-//! that was never in the file.
+//! Tests of damaged MCAP files. If a file was truncated or changed anywhere, its intact chunks are read. Reading never
+//! returns data that was not in the original file.
 
 use std::io::Write as _;
 use std::ops::Range;
@@ -61,7 +61,7 @@ impl IntactRecording {
     }
 }
 
-/// Returns the telegrams that are read from `bytes`, one sensor after the other, and the reported damage.
+/// Reads the file `bytes`. Returns its telegrams, one sensor after the other, and the reported damage.
 fn read(folder: &TempDir, bytes: &[u8]) -> (Vec<WrittenTelegram>, Damage) {
     let recording = Recording::open(file(folder, "damaged.mcap", bytes)).unwrap();
     let contents = recording.contents();
@@ -112,7 +112,7 @@ fn flipped_byte_costs_one_chunk() {
                 let name = format!("{compression:?}, byte {at} of chunk {number}");
                 let (telegrams, damage) = read(&folder, &bytes);
                 assert!(telegrams == whole.telegrams(|other| other != number), "{name}: {damage}");
-                // Sequence numbers show a gap only between telegrams.
+                // Sequence numbers show missing telegrams only between other telegrams.
                 let is_inside = (1..whole.chunks.len() - 1).contains(&number);
                 let expected = Damage {
                     telegrams: if is_inside { MESSAGES_PER_CHUNK as u64 } else { 0 },
@@ -131,7 +131,7 @@ fn flipped_byte_costs_one_chunk() {
 fn chunk_with_another_opcode_costs_one_chunk() {
     let folder = TempDir::new().unwrap();
     let whole = IntactRecording::new(20, Compression::Zstd);
-    // Opcodes of a footer, and one that the format reserves.
+    // The opcode of a footer, and an opcode that the format reserves.
     for opcode in [0x02, 0x16] {
         for (number, chunk) in whole.chunks.iter().enumerate() {
             let mut bytes = whole.bytes.clone();
@@ -152,8 +152,8 @@ fn resumes_at_next_chunk_after_impossible_length() {
         let last = 1 + 7;
         for (number, chunk) in whole.chunks.iter().enumerate() {
             let next = whole.chunks.get(number + 1).map_or(whole.bytes.len(), |next| next.start);
-            // The length of the chunk contradicts its fields; the length of the next record leads beyond the end of the
-            // file; no record has opcode 0.
+            // There are three kinds of damage, at two positions each. The length of the chunk contradicts its fields.
+            // The length of the next record leads beyond the end of the file. An opcode is 0, which no record has.
             for (start, at, is_chunk) in [
                 (chunk.start, chunk.start + 1, true),
                 (chunk.start, chunk.start + last, true),
@@ -177,7 +177,7 @@ fn resumes_at_next_chunk_after_impossible_length() {
 fn flipped_opcode_bit_costs_at_most_one_chunk() {
     let folder = TempDir::new().unwrap();
     let whole = IntactRecording::new(20, Compression::Lz4);
-    // The last end is that of the footer.
+    // The last end is the end of the footer.
     for (index, start) in whole.ends.iter().enumerate().take(whole.ends.len() - 1) {
         for bit in 0..8 {
             let mut bytes = whole.bytes.clone();
@@ -221,7 +221,7 @@ fn unchunked_telegram_is_checked_by_own_checksum() {
     let folder = TempDir::new().unwrap();
     let whole = IntactRecording::new(8, Compression::None);
     let telegrams = whole.telegrams(|_| true);
-    // Write the records of the chunks without chunks, and section checksums of 0.
+    // Write the records of the chunks directly into the file, and set the checksums of the sections to 0.
     let (mut bytes, mut at) = (whole.bytes[..MAGIC_LEN].to_vec(), MAGIC_LEN);
     let mut messages = Vec::new();
     for end in &whole.ends[1..] {
@@ -253,7 +253,7 @@ fn unchunked_telegram_is_checked_by_own_checksum() {
     for known in &telegrams {
         let is_in = |range: &&Range<usize>| bytes[(*range).clone()].ends_with(&known.telegram);
         let hits: Vec<_> = messages.iter().filter(is_in).cloned().collect();
-        // Replies are sent repeatedly. Only the headers differ.
+        // The same reply is sent repeatedly, and only the headers differ.
         for hit in &hits {
             for at in [hit.end - 1, hit.end - known.telegram.len() / 2, hit.end - known.telegram.len()] {
                 let mut changed = bytes.clone();
@@ -266,7 +266,7 @@ fn unchunked_telegram_is_checked_by_own_checksum() {
         }
         assert!(!hits.is_empty());
     }
-    // After a length that is impossible, the next message of the hub is found.
+    // After an impossible length, reading continues at the next message of the hub.
     let hit = messages[telegrams.len()].clone();
     bytes[hit.start + 1 + 7] ^= 0x40;
     let (read, damage) = read(&folder, &bytes);
@@ -380,7 +380,7 @@ fn file_without_a_beginning_is_refused() {
         assert!(failure.message.ends_with("is the end of an MCAP file, without its beginning"), "{failure}");
         assert_eq!(failure.kind.exit_code(), 66);
     }
-    // A part from the middle of a file: messages, or a chunk that cannot be read.
+    // A part from the middle of a file. It contains messages, or a chunk that cannot be read.
     let packed = IntactRecording::new(20, Compression::Zstd);
     let middle =
         |whole: &IntactRecording| whole.bytes[whole.chunks[1].start + 40..whole.chunks[3].end].to_vec();
@@ -402,5 +402,5 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
 /// Number of telegrams in a chunk: four of each sensor.
 const MESSAGES_PER_CHUNK: usize = 8;
 const MAGIC_LEN: usize = mcap::MAGIC.len();
-/// Length of opcode and length of a record.
+/// Length of the opcode and the length field of a record, in bytes.
 const RECORD_HEAD_LEN: usize = 1 + 8;

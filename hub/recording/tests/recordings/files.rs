@@ -108,7 +108,7 @@ fn non_recording_is_refused_with_location_and_remedy() {
         let file = temporary(name, &bytes);
         let failure = Recording::open(file.path()).unwrap_err();
         assert!(failure.message.contains(message), "{failure}");
-        // A stream may have only noise, if its family is named.
+        // A stream may contain only noise if its family is named.
         let line = |family| Recording::open_stream(file.path(), family);
         let is_noise = message == "no telegram in it";
         let known = line(Some(Family::Lms)).ok();
@@ -138,8 +138,8 @@ fn mostly_unrecognized_stream_needs_the_family() {
 
 #[test]
 fn reads_the_intact_start_of_a_truncated_gzip_file() {
-    // Enough data that the rest of the file has telegrams, and different enough that it does not compress to almost
-    // nothing.
+    // There are enough telegrams that some remain after the truncation, and they differ enough that they do not
+    // compress to almost nothing.
     let telegrams: Vec<Vec<u8>> = (0..400).map(scan).collect();
     let packed = gzip(&telegrams.concat());
     let file = temporary("cut.bin.gz", &packed[..packed.len() * 2 / 3]);

@@ -1,5 +1,5 @@
 //! Tests of records with wrong lengths and contents. Whatever attachments, metadata and indices contain, all telegrams
-//! of the file are read and copied, without a panic.
+//! of the file are read and copied, and nothing panics.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -91,7 +91,7 @@ fn reports_and_drops_a_truncated_attachment() {
             .unwrap();
     assert!(sound.damage.is_none() && sound.telegrams == telegrams, "{sound:?}");
     assert_eq!(attachments(&copy(&folder)), 1);
-    // Try all shorter lengths. An attachment that is 1 to 4 bytes shorter lacks a part of its checksum.
+    // Try all shorter lengths. An attachment that is 1 to 4 bytes shorter lacks a part of its checksum or all of it.
     for data in [&b""[..], b"abc"] {
         let body = attachment(data);
         for len in 0..body.len() {
@@ -122,7 +122,7 @@ fn malformed_record_never_panics_or_costs_a_telegram() {
             match random.u8(..4) {
                 0 => body.truncate(at),
                 1 => body.insert(at, random.u8(..)),
-                // These bytes are usually a length.
+                // Four bytes of a record are often a length, so write a small number into them.
                 2 if at + 4 <= body.len() => {
                     body[at..at + 4].copy_from_slice(&random.u32(..64).to_le_bytes())
                 }

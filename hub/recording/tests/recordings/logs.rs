@@ -1,5 +1,5 @@
-//! Tests of conversions of CARMEN logs. Every range and every code survives the conversion to another format and back,
-//! or the log is refused.
+//! Tests of conversions of CARMEN logs. Every range and every code stays the same in a conversion to another format and
+//! back, or the log is refused.
 
 use std::fs;
 use std::io::Read;
@@ -37,7 +37,7 @@ fn log_round_trips_through_mcap() {
     assert_eq!(sweeps(&again), sweeps(&log));
 }
 
-/// Returns the ranges of each scan as they are written, in micrometers, and its time in microseconds.
+/// Returns the ranges of each scan in the log, in micrometers, and the time of the scan in microseconds.
 fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
     let mut text = String::new();
     flate2::read::MultiGzDecoder::new(fs::File::open(log).unwrap()).read_to_string(&mut text).unwrap_or_else(
@@ -49,7 +49,7 @@ fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
     let micros = |field: &str| (field.parse::<f64>().unwrap() * 1e6).round() as i64;
     let sweep = |line: &str| {
         let fields: Vec<&str> = line.split(' ').filter(|field| !field.is_empty()).collect();
-        // In other lines, the ranges follow after seven numbers of the sensor.
+        // In other kinds of lines, seven numbers of the sensor precede the ranges.
         let at = if fields[0] == "FLASER" { 1 } else { 8 };
         let count: usize = fields[at].parse().unwrap();
         (
@@ -61,7 +61,7 @@ fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
 }
 
 /// Converts `log` to MCAP and back, to a stream and back, and to a stream by way of MCAP. Asserts that ranges and codes
-/// stay the same, and also the times if the format has times.
+/// stay the same, and the times as well if the format has times.
 fn assert_round_trips(folder: &TempDir, name: &str, log: &Path) {
     let path = |ending: &str| folder.path().join(format!("{name}{ending}"));
     let (mcap, stream, both) = (path(".mcap"), path(".bin.gz"), path("-mcap.bin"));
@@ -80,7 +80,7 @@ fn assert_round_trips(folder: &TempDir, name: &str, log: &Path) {
             assert!(one.0 == other.0, "{}, scan {number}", file_name.display());
             assert!(!has_times || one.1 == 0 || one.1 == other.1, "{}, scan {number}", file_name.display());
         }
-        // The intermediate file has the same words and codes as the log itself.
+        // The intermediate file has the same value words and codes as the log itself.
         let recording = Recording::open(file_name).unwrap();
         assert_eq!(recording.encoding(), own.encoding());
         let words = |recording: &Recording| -> Vec<_> {
@@ -206,7 +206,7 @@ fn reply_with_the_encoding_is_not_counted_as_dropped() {
             assert_eq!((result.telegrams, result.scans, result.dropped), (3, 3, 0), "{file_name}, {output}");
         }
     }
-    // Replies that a scanner sent count as dropped.
+    // In contrast, replies that a scanner sent count as dropped.
     let recorded = file(&folder, "hub.mcap", &crate::written::recording(20, 14).bytes);
     for output in ["hub.log", "hub.csv"] {
         let result = convert_file(&recorded, &path(output), Some("front")).unwrap();
@@ -244,7 +244,7 @@ fn refuses_to_convert_unencodable_log_with_reason() {
             assert!(all.contains("cannot become telegrams without loss"), "{name}: {all}");
             assert!(all.contains(message), "{name}: {all}");
         }
-        // The recording can be played anyway.
+        // The log can be played anyway.
         let recording = Recording::open(&input).unwrap();
         assert_eq!(recording.telegrams(recording.encoding().unwrap()).unwrap().count(), 3);
     }

@@ -1,5 +1,5 @@
-//! Tests of recordings as files. They are one binary with several modules, so that the dependencies are linked only
-//! once.
+//! Tests of recordings as files. The tests are one binary with several modules, so that the dependencies are linked
+//! only once.
 
 #[cfg(feature = "mcap")]
 mod folder;

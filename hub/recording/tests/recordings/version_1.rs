@@ -1,5 +1,5 @@
-//! Tests of recordings of version 1. Their telegrams have the current format and are played and converted. Their scans
-//! have another format and are not read.
+//! Tests of recordings in the format of version 1. Their telegrams have the current format and are played and
+//! converted. Their scans have another format and are not read.
 
 use std::fs;
 use std::path::Path;
@@ -38,7 +38,7 @@ fn sorted_by_sensor(written: &WrittenRecording) -> Vec<WrittenTelegram> {
     SENSOR_NAMES.into_iter().flat_map(of_sensor).collect()
 }
 
-/// Returns the topic and the encoding of the channel, and the data, of all messages.
+/// Returns three parts of each message: the topic of its channel, the encoding of its channel, and its data.
 fn messages(bytes: &[u8]) -> Vec<(String, String, Vec<u8>)> {
     let all = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
     let message =
@@ -109,8 +109,8 @@ fn version_1_file_without_telegrams_is_refused() {
     assert!(failure.message.starts_with("there is no scan in "), "{failure}");
 }
 
-/// The values of the telegrams are ambiguous without the measuring mode. A published scan of the current version is
-/// used instead. A scan of version 1 is not read, so the conversion is refused.
+/// The values of the telegrams are ambiguous without the measuring mode. In a recording of the current version, the
+/// published scan is used instead. A scan of version 1 is not read, so the conversion is refused.
 #[test]
 fn version_1_scan_does_not_define_the_measuring_mode() {
     let folder = TempDir::new().unwrap();

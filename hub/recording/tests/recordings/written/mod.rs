@@ -13,7 +13,7 @@ use scanhub_schema::{
     Background, Early, Flags, Foreground, Header, Lines, Marks, Motion, Scan, Status, Topic, Zones,
 };
 
-/// Telegram that was written.
+/// A telegram that was written into a recording.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct WrittenTelegram {
     pub(crate) sensor: &'static str,
@@ -21,26 +21,26 @@ pub(crate) struct WrittenTelegram {
     pub(crate) telegram: Vec<u8>,
 }
 
-/// Bytes of the file, and its telegrams in order.
+/// Bytes of a recording, and its telegrams in order.
 pub(crate) struct WrittenRecording {
     pub(crate) bytes: Vec<u8>,
     pub(crate) telegrams: Vec<WrittenTelegram>,
 }
 
-/// Returns a recording of `rounds` telegrams of each sensor with their results, four per chunk and sensor, and a
-/// channel of another program.
+/// Returns a recording with `rounds` telegrams of each sensor and their results, and with a channel of another program.
+/// Each chunk has four telegrams of each sensor.
 pub(crate) fn recording(rounds: u64, seed: u64) -> WrittenRecording {
     recording_with(rounds, seed, Compression::None)
 }
 
-/// Returns the same recording with this compression.
+/// Returns the same recording as [`recording`], but with this compression.
 pub(crate) fn recording_with(rounds: u64, seed: u64, compression: Compression) -> WrittenRecording {
     write_recording(rounds, seed, compression, |writer, sensor, topic, header, payload| {
         writer.write_sample(sensor, topic, header, payload).unwrap();
     })
 }
 
-/// Returns the same recording in the format of version 1, with only these `topics`.
+/// Returns the same recording as [`recording`], but in the format of version 1 and with only these `topics`.
 pub(crate) fn recording_of_version_1(rounds: u64, seed: u64, topics: &[Topic]) -> WrittenRecording {
     write_recording(rounds, seed, Compression::None, |writer, sensor, topic, header, payload| {
         if !topics.contains(&topic) {
@@ -74,7 +74,7 @@ pub(crate) fn version_1_scan() -> Vec<u8> {
     payload
 }
 
-/// Returns a recording whose samples `write` writes.
+/// Creates a recording. Calls `write` to write each sample.
 fn write_recording(
     rounds: u64,
     seed: u64,
@@ -96,7 +96,7 @@ fn write_recording(
         for (number, sensor) in SENSOR_NAMES.into_iter().enumerate() {
             let telegram = match round {
                 0 => reply::configuration_reply(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec(),
-                // The reply is the same, bit for bit, each time.
+                // This reply has the same bytes each time.
                 round if round % 16 == 7 => reply::mode_reply(0, true, 0x10).bytes().to_vec(),
                 _ => scan(&mut random),
             };
@@ -141,7 +141,7 @@ fn scan(random: &mut Rng) -> Vec<u8> {
     measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
 }
 
-/// Returns results of a telegram as the hub publishes them. Only their sizes are realistic.
+/// Returns the results that the hub would publish for a telegram. Only the sizes of these results are realistic.
 fn results(telegram: &[u8], random: &mut Rng) -> Vec<(Topic, Vec<u8>)> {
     let packed = |payload: &dyn Fn(&mut [u8]) -> Option<usize>| {
         let mut room = [0; 4096];
