@@ -1,7 +1,7 @@
-//! Measurement of the best number of beams for each model of a rotating scanner. For several numbers of bins in the
-//! grid, it prints the share of points whose bin is already taken and the share of empty bins. It also prints the time
-//! that it takes to fill the grid with a revolution. The tables are in docs/measured.md: `cargo run --release -p
-//! scanhub-sim --example beams`.
+//! Measures which number of beams is best for each model of a rotating scanner. For several numbers of beams, this
+//! example prints the share of points that the grid drops because their beam already has a point, and the share of
+//! beams without a point. It also prints how long the grid takes to assign the points of a revolution to beams. The
+//! tables are in docs/measured.md. To run the example: `cargo run --release -p scanhub-sim --example beams`.
 
 use scanhub_drivers::line::{Action, Event, ScannerSession};
 use scanhub_drivers::line::{Grid, NOT_MEASURED, Point};
@@ -22,7 +22,7 @@ fn room() -> Room {
 }
 
 /// Returns the complete revolutions that `session` forms from the bytes that `device` sends in `seconds`, and the
-/// default number of beams.
+/// number of beams that `session` uses by default.
 fn revolutions<S>(mut session: S, mut device: impl Device, seconds: u64) -> (Vec<Vec<Point>>, usize)
 where
     S: ScannerSession,
@@ -79,8 +79,8 @@ impl GridSheet {
         GridSheet { grid, ranges: vec![0; beams], intensities: vec![0; beams], angles: vec![0.0; beams] }
     }
 
-    /// Fills the grid. Returns the number of `points` whose bin was already taken, and the number of beams without a
-    /// point.
+    /// Fills the grid with `points`. Returns the number of points whose beam already had a point, and the number of
+    /// beams without a point.
     fn fill(&mut self, points: &[Point]) -> (u32, u32) {
         let collisions = self.grid.fill(points, &mut self.ranges, &mut self.intensities, &mut self.angles);
         let empty = self.ranges.iter().filter(|range| **range == NOT_MEASURED).count();
@@ -88,7 +88,8 @@ impl GridSheet {
     }
 }
 
-/// Prints the rows of one model, which measures `points_per_revolution` points in a revolution.
+/// Prints the rows of one model, which measures `points_per_revolution` points in a revolution. Each row is for another
+/// number of beams. The `percents` are these numbers of beams relative to the number of points.
 fn rows(name: &str, points_per_revolution: usize, revolutions: &[Vec<Point>], percents: &[usize]) {
     let points: usize = revolutions.iter().map(Vec::len).sum();
     for percent in percents {

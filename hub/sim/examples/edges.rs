@@ -1,10 +1,11 @@
-//! Measurement of the values between two surfaces at edges in simulated scans. The table in docs/measured.md has the
-//! same figures for recordings: `cargo run --release -p scanhub-sim --example edges -- WORLD..` The world `board` is a
-//! board in front of a wall.
+//! Counts the edges in simulated scans at which beams report a range between two surfaces, because these beams hit both
+//! surfaces. The table in docs/measured.md compares these counts with recordings. To run the example: `cargo run
+//! --release -p scanhub-sim --example edges -- WORLD..` The world `board` is a board in front of a wall.
 //!
-//! At an edge, three consecutive beams are on one surface and three on another one. Between them are at most
-//! [`MAX_BETWEEN`] beams, all of them with values between the surfaces. Beams without width would have other values
-//! there, so an oblique surface does not count as an edge.
+//! At an edge, three consecutive beams are on one surface, and three later beams are on another surface. Between the
+//! two groups are at most [`MAX_BETWEEN`] beams, each with a range between the surfaces. The example also simulates
+//! every scan with beams without width. If such a beam reports the same range, the range is that of an oblique surface,
+//! and the example does not count an edge.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -18,13 +19,13 @@ use scanhub_sim::room::Room;
 struct Edge {
     /// Index of the first beam after the first surface.
     beam: usize,
-    /// Index of the last beam on the nearer side of the edge.
+    /// Index of the beam next to the edge, on the nearer surface.
     near: usize,
-    /// For each value between, its share of the way from the nearer surface to the farther one.
+    /// Position of each range between the surfaces, from 0 at the nearer surface to 1 at the farther one.
     between: Vec<f64>,
 }
 
-/// Finds the edges in the scan `ranges`, in millimeters. A code is `None`.
+/// Returns the edges in a scan. `ranges` has the range of each beam in millimeters, or `None` if the beam has a code.
 fn edges(ranges: &[Option<f64>]) -> Vec<Edge> {
     let surface = |beams: Range<usize>| -> Option<()> {
         let ranges = ranges.get(beams)?.iter().copied().collect::<Option<Vec<f64>>>()?;
@@ -49,11 +50,13 @@ fn edges(ranges: &[Option<f64>]) -> Vec<Edge> {
     (0..ranges.len()).filter_map(edge).collect()
 }
 
-/// Numbers of edges, of edges with a value between the surfaces, and of edges with several.
+/// Counts of edges.
 #[derive(Default)]
 struct Counts {
     all: u32,
+    /// Edges with at least one range between the surfaces.
     one: u32,
+    /// Edges with more than one range between the surfaces.
     several: u32,
 }
 
@@ -70,8 +73,9 @@ impl Counts {
     }
 }
 
-/// Returns the median of the standard deviations of the values between. Edges count if they have one value between at
-/// the same beam in a tenth of the scans.
+/// Returns, as text, how much a range between two surfaces changes from scan to scan. For each beam that has such a
+/// range in at least a tenth of the scans, this function computes the standard deviation of [`Edge::between`]. It
+/// returns the median of all beams.
 fn median_deviation(edges_by_beam: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> String {
     let often = edges_by_beam.values().filter(|shares| shares.len() >= SCAN_COUNT as usize / 10);
     let mut deviations: Vec<f64> = often
@@ -90,7 +94,8 @@ struct EdgeCounts {
     all: Counts,
     /// Edges whose nearer side is a leg of a person.
     legs: Counts,
-    /// For each seed, sensor and beam, the values between at an edge that does not move and has one value between.
+    /// For each seed, sensor and beam: the values of [`Edge::between`] at edges with exactly one such value. Edges of
+    /// legs are excluded, because people move.
     edges_by_beam: BTreeMap<(u64, usize, usize), Vec<f64>>,
 }
 
@@ -147,7 +152,7 @@ fn main() {
     }
 }
 
-/// Ranges in millimeters of the value words of mode 1. A code is `None`.
+/// Converts value words of mode 1 to ranges in millimeters. A code becomes `None`.
 fn ranges_mm(words: &[u16]) -> Vec<Option<f64>> {
     words.iter().map(|word| Some(word & 8191).filter(|range| *range < 8183).map(f64::from)).collect()
 }
@@ -163,15 +168,18 @@ pose = [0, 2800]
 jitter_mm = 200
 ";
 const DEPTHS_MM: std::ops::RangeInclusive<f64> = 300.0..=1_500.0;
-/// Number of consecutive beams that form a surface, and maximum distance of neighboring points on it. Values between
-/// are farther than that from both surfaces.
+/// Number of consecutive beams that form a surface.
 const MIN_SURFACE_BEAMS: usize = 3;
+/// Minimum difference of two ranges that do not belong to one surface. The ranges of neighboring beams on a surface
+/// differ by less, and a range between two surfaces differs from both surfaces by more.
 const MIN_MARGIN_MM: f64 = 60.0;
-/// Maximum number of values between.
+/// Maximum number of beams between the two surfaces of an edge.
 const MAX_BETWEEN: usize = 3;
-/// Number of seeds, and number of scans for each seed and sensor: 53 s.
+/// Number of seeds with which each world is simulated.
 const SEED_COUNT: u64 = 20;
+/// Number of scans that are evaluated for each seed and sensor. They are spread over 53 s.
 const SCAN_COUNT: u64 = 200;
-/// Number of scans from one that is measured to the next one, and period of the scans.
+/// Distance between two evaluated scans, in scans.
 const SCAN_SPACING: u64 = 10;
+/// Period of the scans.
 const SCAN_PERIOD_NS: u64 = 26_640_000;

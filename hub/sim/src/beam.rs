@@ -1,9 +1,9 @@
-//! The result of one beam: its echo, and the noise of the measured range.
+//! Computes the result of one beam: its echo, and the noise of the measured range.
 //!
 //! The echo is computed from the rays that the spot of the beam covers. If the rays hit two surfaces, the scanner
-//! reports one of the surfaces. If the surfaces are not far apart, it may report a value between them instead. That
-//! value follows the share of the light on each surface, so it hardly changes from scan to scan. `cargo run --release
-//! -p scanhub-sim --example edges` measures these values.
+//! reports the range of one surface. If the surfaces are not far apart, the scanner may report a range between the two
+//! surfaces instead. This range depends on the share of the light on each surface, so it hardly changes from scan to
+//! scan. `cargo run --release -p scanhub-sim --example edges` measures such ranges.
 //!
 //! The noise has layers, each with its own switch. Two effects have no switch: ranges are sent in whole units, and a
 //! range beyond the maximum is sent as a code.
@@ -19,26 +19,27 @@ use crate::view::{Face, Hit, Kind, RAY_STEP, SPOT_RAYS, View};
 /// Strength of each layer of noise. A share or a length of 0 switches the layer off.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NoiseModel {
-    /// Maximum constant error of all ranges of one scanner, in millimeters. The seed draws it uniformly.
+    /// Maximum of the constant error that all ranges of one scanner share, in millimeters. The error is drawn uniformly
+    /// from the seed.
     pub bias_mm: f64,
     /// Standard deviation of a range, in millimeters.
     pub sigma_mm: f64,
-    /// Share of the readings at edges that have the standard deviation [`TAIL_SIGMA_MM`]. In a recording of a scanner
-    /// at rest, 316 of 348 beams were never off by 30 mm, and 22 beams were off by 30 mm in more than one scan of a
-    /// hundred. Large errors therefore come from few beams.
+    /// Share of the readings at edges that have the standard deviation [`TAIL_SIGMA_MM`]. Other readings do not have
+    /// it, because in recordings, large errors come from few beams. In a recording of a scanner at rest, 316 of 348
+    /// beams never had an error of 30 mm, and 22 beams had such an error in more than one scan of a hundred.
     pub tail: f64,
     /// Whether a beam is as wide as a real beam. A wide beam on two surfaces reports the range of either surface, or a
-    /// value between them. If the surfaces are far apart, it reports the range of either surface, or too weak a signal.
-    /// Without this layer, a beam is a line without width.
+    /// range between the two. If the surfaces are far apart, it reports the range of either surface, or the code for a
+    /// signal that is too weak. Without this layer, a beam is a line without width.
     pub spot: bool,
     /// Share of the beams that report a code although they could report a range.
     pub errors: f64,
     /// Whether far surfaces that are dark or oblique return too weak a signal.
     pub weak: bool,
-    /// Whether the sun dazzles.
+    /// Whether the sun dazzles beams that point toward it.
     pub dazzle: bool,
-    /// Whether beams between whole degrees are measured in later revolutions of the mirror, as in a real scanner.
-    /// Otherwise all beams are measured at the same time.
+    /// Whether beams between whole degrees are measured in later revolutions of the mirror than beams at whole degrees,
+    /// as in a real scanner. Otherwise all beams are measured at the same time.
     pub comb: bool,
 }
 
@@ -57,7 +58,8 @@ impl NoiseModel {
 }
 
 impl Default for NoiseModel {
-    /// Returns all layers with the strength of real recordings: a deviation of 6 to 7 mm per beam, and 0.5 % of codes.
+    /// Returns all layers with the strength of real recordings: the ranges of a beam have a standard deviation of 6 to
+    /// 7 mm, and 0.5 % of the beams report a code.
     fn default() -> Self {
         NoiseModel {
             bias_mm: 15.0,
@@ -78,9 +80,9 @@ impl Default for NoiseModel {
 pub(crate) struct BeamRng {
     /// Deviation of the beam's direction, standard normal.
     pub(crate) mirror: f64,
-    /// Selects the surface that the scanner reports if a spot is on two of them, 0 to 1.
+    /// Selects the surface that the scanner reports if the spot is on two surfaces, 0 to 1.
     pub(crate) surface: f64,
-    /// Selects whether the scanner reports a value between the two surfaces instead, 0 to 1.
+    /// Selects whether the scanner reports a range between the two surfaces instead, 0 to 1.
     pub(crate) between: f64,
     /// Selects whether a signal is too weak, 0 to 1.
     pub(crate) weak: f64,
@@ -118,14 +120,16 @@ impl NoiseModel {
         rng.deviation * if edge && rng.tail < self.tail { TAIL_SIGMA_MM } else { self.sigma_mm }
     }
 
-    /// Returns the code that a beam reports although it could report a range, counted down from the maximum.
+    /// Returns the code that this beam reports although it could report a range. Returns `None` if the beam reports the
+    /// range. The code is counted down from the maximum.
     pub(crate) fn error(&self, rng: &BeamRng) -> Option<u16> {
         let of = |code: &&(f64, u16)| rng.code < code.0;
         (rng.error < self.errors).then(|| CODES.iter().find(of).map_or(NO_RETURN, |code| code.1))
     }
 
-    /// Returns whether an echo of this `signal` is lost. Every echo below [`MIN_SIGNAL`] is lost, and no echo above
-    /// twice [`MIN_SIGNAL`] is lost. If the spot is `torn`, a share of the beams between the two surfaces is lost.
+    /// Returns whether the scanner misses an echo of this `signal`. With the layer `weak`, it misses every echo below
+    /// [`MIN_SIGNAL`], and no echo above twice [`MIN_SIGNAL`]. If the spot is `torn` between two distant surfaces, it
+    /// also misses [`EDGE_LOSS_SHARE`] of the echoes.
     pub(crate) fn loses(&self, signal: f64, torn: bool, rng: &BeamRng) -> bool {
         let faint = self.weak && rng.weak > signal / MIN_SIGNAL - 1.0;
         faint || torn && rng.weak < EDGE_LOSS_SHARE
@@ -169,23 +173,23 @@ fn gaussian(random: &mut fastrand::Rng) -> f64 {
 /// Echo of a beam.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Echo {
-    /// Distance; infinite if there is no echo.
+    /// Range; infinite if there is no echo.
     pub(crate) range_mm: f64,
     /// Signal relative to a white surface at 1 m that is at a right angle to the beam.
     pub(crate) signal: f64,
-    /// Share of the beams with the same target that have an echo.
+    /// Share of the beams on such a surface that have an echo. It is 1, except for a faint surface.
     pub(crate) returns: f64,
     /// Share of the light that fell on reflectors.
     pub(crate) reflector_share: f64,
-    /// Whether a beam with the width of a real one hits two surfaces at different distances, and no reflector.
+    /// Whether a beam with the width of a real beam would hit two surfaces at different ranges, and no reflector.
     pub(crate) is_edge: bool,
-    /// Whether this spot hit two surfaces that are far apart, and no reflector.
+    /// Whether the spot of this beam hit two surfaces that are far apart, and no reflector.
     pub(crate) is_torn: bool,
-    /// The true target.
+    /// The true target of the beam.
     pub(crate) target: BeamTarget,
 }
 
-/// The part of a spot on one face.
+/// The part of a spot that is on one face.
 #[derive(Clone, Copy)]
 struct SpotPart<'a> {
     face: Option<&'a Face>,
@@ -203,8 +207,8 @@ impl SpotPart<'_> {
         self.weight * if self.is_reflector() { REFLECTOR_BRIGHTNESS } else { 1.0 }
     }
 
-    /// Returns the target of a beam that hits only this part. An object that moved away counts as an uncovered surface,
-    /// because it is new to the beam but not nearer than the previous target.
+    /// Returns the kind of target of a beam whose whole spot is this part. An object that moved away from the scanner
+    /// counts as an uncovered surface, because it is new to the beam but not nearer than the previous target.
     fn kind(&self) -> Kind {
         match self.face.map_or(Kind::Static, |face| face.kind) {
             Kind::Box { since_ns } if self.hit.since_ns >= since_ns => Kind::Static,
@@ -244,13 +248,13 @@ pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, rng: &BeamRng) -> E
     }
 }
 
-/// Returns face and range of the part with the strongest echo.
+/// Returns face and range of the part with the strongest echo, or `None` if there is no part.
 fn heaviest<'a>(parts: impl Iterator<Item = &'a SpotPart<'a>>) -> Option<(Option<&'a Face>, f64)> {
     parts.max_by(|a, b| a.echo().total_cmp(&b.echo())).map(|part| (part.face, part.hit.range_mm))
 }
 
-/// Returns the face and the range that the scanner reports for a spot on the face `near` and perhaps the face `far`.
-/// `share` of the light falls on `near`.
+/// Returns the face and the range that the scanner reports for a spot on the face `near` and possibly also on the face
+/// `far`. `share` is the part of the echo's light that comes from `near`.
 fn reported_surface<'a>(
     near: Option<(Option<&'a Face>, f64)>,
     far: Option<(Option<&'a Face>, f64)>,
@@ -276,7 +280,7 @@ fn spread<'a>(view: &'a View, rays: &'a [Hit], rng: &BeamRng) -> Vec<SpotPart<'a
     }
     let mut parts: Vec<SpotPart> = Vec::with_capacity(2);
     let off = MIRROR_SIGMA_RAYS * rng.mirror;
-    // From the middle outwards, so that the ray nearest to the middle represents a face.
+    // Go from the middle outwards, so that each face is represented by its ray nearest to the middle.
     for number in 0..rays.len() {
         let offset = number.div_ceil(2);
         let ray = if number % 2 == 0 { SPOT_RAYS + offset } else { SPOT_RAYS - offset };
@@ -327,24 +331,25 @@ fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
     let white = match face.surface {
         Surface::Plain | Surface::Faint => 0.5,
         Surface::Dark => 0.02,
-        // Glass at a right angle and reflectors always return enough.
+        // Glass that a beam hits at a right angle, and reflectors, always return enough light.
         Surface::Reflector | Surface::Glass => return f64::INFINITY,
     };
     let (left, ahead) = (f64::from(angle_mdeg) / 1000.0).to_radians().sin_cos();
     let square = match face.shape {
         Shape::Wall { .. } => face.shape.squareness((-left, ahead)),
-        // A part of the spot on a post is always at a right angle.
+        // A post is round, so the beam hits a part of its surface at a right angle.
         Shape::Post { .. } => 1.0,
     };
     white * square / (range_mm / 1000.0).powi(2)
 }
 
-/// Standard deviation of the readings in the tail, in millimeters. Most readings in the tail differ from the true range
-/// by more than 30 mm, which algorithms take for a change.
+/// Standard deviation of the readings that [`NoiseModel::tail`] selects, in millimeters. Most of these readings differ
+/// from the true range by more than 30 mm, which algorithms take for a change.
 pub const TAIL_SIGMA_MM: f64 = 60.0;
-/// Minimum signal for a range, relative to a white surface at 1 m: 10 % of white at 18 m.
+/// Minimum signal for which a scanner reports a range, relative to a white surface at 1 m. A surface with 10 % of the
+/// brightness of white has this signal at 18 m.
 const MIN_SIGNAL: f64 = 0.0003;
-/// Share of the beams between two surfaces far apart whose signal is too weak.
+/// Share of the beams on two surfaces far apart whose signal is too weak.
 const EDGE_LOSS_SHARE: f64 = 0.15;
 // Codes are counted down from the maximum (Telegram listing 10.8).
 pub(crate) const NO_RETURN: u16 = 0;
@@ -352,30 +357,31 @@ pub(crate) const DAZZLE: u16 = 1;
 pub(crate) const TOO_WEAK: u16 = 4;
 const OVERFLOW: u16 = 2;
 /// Codes of beams that could have reported a range, with cumulative shares. Codes and shares come from a recording of a
-/// real LMS 200, from the beams that reported a range in at least 16 of 20 scans.
+/// real LMS 200. They were counted for the beams that reported a range in at least 16 of 20 scans.
 const CODES: [(f64, u16); 3] = [(0.57, NO_RETURN), (0.94, TOO_WEAK), (1.0, OVERFLOW)];
-/// Diameter of the spot at the window in millimeters, and its growth per millimeter of range.
+/// Diameter of the spot at the scanner's window, in millimeters.
 const SPOT_DIAMETER_MM: f64 = 10.0;
+/// Growth of the spot's diameter per millimeter of range, in millimeters.
 const SPOT_GROWTH: f64 = 0.0045;
-/// Standard deviation of a beam's direction, in rays: 0.0025 degrees. The value between two surfaces then has a
-/// standard deviation of about 0.01 of the distance between the surfaces, without the other layers. In recordings of
-/// scanners that stand, the total is 0.004 to 0.03 of that distance.
+/// Standard deviation of a beam's direction, in units of the angle between two rays: 0.0025 degrees. Without other
+/// noise, a range between two surfaces then has a standard deviation of about 0.01 of the distance between the
+/// surfaces. In recordings of scanners at rest, where all noise adds up, it is 0.004 to 0.03 of that distance.
 const MIRROR_SIGMA_RAYS: f64 = 0.04;
-/// Maximum distance between two surfaces that count as one, in mm. An example is the two sides of a corner.
+/// Maximum distance between two surfaces that count as one surface, such as the two sides of a corner, in mm.
 const MAX_STEP_MM: f64 = 40.0;
-/// Maximum distance between two surfaces whose echoes the scanner takes for one, in mm. If the surfaces are farther
-/// apart, the scanner separates or loses their echoes. In recordings, hardly any value lies between the two surfaces of
-/// an edge deeper than 1.25 m, and hardly any beam is lost at an edge below 1 m.
+/// Maximum distance between two surfaces whose echoes the scanner takes for one echo, in mm. If the surfaces are
+/// farther apart, the scanner separates or loses their echoes. In recordings, hardly any range lies between two
+/// surfaces that are more than 1.25 m apart, and hardly any beam is lost if they are less than 1 m apart.
 const MAX_MERGE_DISTANCE_MM: f64 = 1_000.0;
-/// Brightness of a reflector relative to other surfaces. In recordings, beams that only touch a reflector report its
-/// range.
+/// Brightness of a reflector relative to other surfaces. In recordings, a beam reports the range of a reflector even if
+/// only the edge of its spot is on the reflector, so the brightness must be high.
 const REFLECTOR_BRIGHTNESS: f64 = 100.0;
-/// Minimum share of the light that must fall on a surface for the scanner to report it.
+/// Minimum share of the echo's light that must come from a surface for the scanner to report the surface.
 const MIN_REPORTED_SHARE: f64 = 0.17;
 /// Share of the beams on a faint surface that have an echo.
 const FAINT_RETURN_SHARE: f64 = 0.15;
-/// Share of the readings at an edge that are values between the two surfaces. In recordings of an LMS 200, the share
-/// was 203 of 205 for beams with at least one value between two surfaces.
+/// Share of the readings that lie between the two surfaces, if the spot is on both. In recordings of an LMS 200, beams
+/// with at least one reading between two surfaces had 203 of 205 readings there.
 const MIXED_SHARE: f64 = 0.98;
 
 #[cfg(test)]
@@ -406,8 +412,8 @@ mod tests {
         }
     }
 
-    /// Returns a view of a person whose right edge is `edge_x` to the right of the beam at 0 degrees, 3 m ahead, in
-    /// front of a wall at `far_y`.
+    /// Returns a view of a person 3 m ahead of the scanner, in front of a wall at `far_y`. The person's right edge is
+    /// `edge_x` millimeters to the right of the beam at 0 degrees.
     fn edge(edge_x: f64, far_y: f64) -> View {
         view(&[
             (wall(-2_000.0, edge_x, 3_000.0), Surface::Plain, Kind::Person),
@@ -437,7 +443,7 @@ mod tests {
             let rng = BeamRng { mirror, between: 0.0, ..RNG };
             echo(&edge(edge_x, 3_800.0), 0, true, &rng).range_mm
         };
-        // Rays are 3.3 mm apart there.
+        // At the person, neighboring rays are 3.3 mm apart.
         let ranges = [-9.0, -6.0, -2.0, 1.0, 4.0, 7.0, 10.0].map(|edge_x| range(edge_x, 0.0));
         assert!(ranges.windows(2).all(|pair| pair[0] >= pair[1]), "{ranges:?}");
         let is_between = |range: &&f64| (3_040.0..3_760.0).contains(*range);

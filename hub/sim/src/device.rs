@@ -1,8 +1,9 @@
 //! The scanner's end of a line: the trait of every simulated scanner, and its transmitter.
 //!
-//! To drive a scanner, call [`Device::poll_transmit`] until it returns `None`, pass the host's bytes, and call again at
-//! [`Device::poll_timeout`]. `Transmission` sends one telegram or one single byte at the rate of the line, in the
-//! chunks that the receiver's hardware delivers. `TxQueue` sends everything that a rotating scanner sends.
+//! To drive a scanner, call [`Device::poll_transmit`] until it returns `None`, and pass the host's bytes to
+//! [`Device::receive`]. Repeat both at the time that [`Device::poll_timeout`] returns. `Transmission` sends one
+//! telegram or one single byte at the rate of the line, in the chunks that the receiver's hardware delivers. `TxQueue`
+//! sends the packets and replies of a rotating scanner, one after the other.
 
 use std::collections::VecDeque;
 
@@ -13,13 +14,14 @@ use crate::request_decoder::{Arrival, DroppedRequest};
 
 /// A simulated scanner.
 pub trait Device {
-    /// Returns the next chunk whose transmission is complete at `now`.
+    /// Returns the next chunk whose transmission is complete at `now`, or `None` if there is no such chunk.
     fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk>;
 
-    /// Returns the time at which the next chunk is complete.
+    /// Returns the time at which the next chunk is complete, or `None` if the scanner sends nothing.
     fn poll_timeout(&self) -> Option<Nanos>;
 
-    /// Receives a byte of the host. Call it after [`Device::poll_transmit`] returned `None` for `arrival.not_after`.
+    /// Receives a byte of the host. Before, call [`Device::poll_transmit`] with `arrival.not_after` until it returns
+    /// `None`.
     fn receive(&mut self, byte: u8, arrival: Arrival);
 
     /// Switches the power off and on. Returns whether a telegram was aborted.
@@ -51,7 +53,8 @@ pub trait Device {
         None
     }
 
-    /// Returns the number of requests that would change the permanent settings, executed or refused.
+    /// Returns the number of received requests to change the permanent settings, whether the scanner executed or
+    /// refused them.
     fn eeprom_writes(&self) -> u64 {
         0
     }
@@ -60,7 +63,8 @@ pub trait Device {
 /// Bytes that the host's hardware delivers at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Chunk {
-    /// Up to 62 bytes. The chunk is empty at the end of a telegram that was aborted between two bursts.
+    /// Up to 62 bytes. There are none if the chunk only ends a telegram that was aborted during a pause. An LMS pauses
+    /// after every 508 bytes of a telegram.
     pub bytes: Vec<u8>,
     /// Rate of the line in bits per second.
     pub rate: u32,
@@ -84,11 +88,11 @@ pub enum ChunkKind {
 /// A telegram that was sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SentTelegram {
-    /// Whether it is a reply, and not data of the stream.
+    /// Whether the telegram is a reply. Otherwise it is data of the stream.
     pub is_reply: bool,
-    /// The intact telegram.
+    /// The complete telegram, including bytes that were not sent because it was aborted.
     pub telegram: Vec<u8>,
-    /// Whether it was aborted by a request or a power cycle.
+    /// Whether the telegram was aborted by a request or a power cycle.
     pub aborted: bool,
 }
 
@@ -111,7 +115,8 @@ impl ChunkSize {
     }
 }
 
-/// Transmission of bytes, one after the other from a start time on.
+/// Transmission of bytes without gaps from a start time on, except for the pauses of an LMS between two revolutions of
+/// its mirror.
 #[derive(Debug)]
 pub(crate) struct Transmission<T> {
     bytes: Vec<u8>,
@@ -158,8 +163,8 @@ impl<T> Transmission<T> {
         self.rate
     }
 
-    /// Returns the next chunk if it is complete at `now`, and whether the line is idle after it. The chunk is empty if
-    /// the transmission was aborted between two bursts.
+    /// Returns the next chunk if it is complete at `now`, and whether the line is idle after the chunk. The chunk is
+    /// empty if the transmission was aborted during the pause after the last chunk.
     pub(crate) fn take_chunk(&mut self, now: Nanos) -> Option<(&[u8], bool)> {
         if self.next_chunk_ns() > now {
             return None;
@@ -192,8 +197,9 @@ impl<T> Transmission<T> {
         (self.bytes, self.tag)
     }
 
-    /// Returns the time at which the first `count` (at least 1) bytes end. If 508 bytes need less time than a
-    /// revolution of the mirror, the rest waits for the next revolution.
+    /// Returns the time at which the first `count` (at least 1) bytes end. An LMS sends at most 508 bytes per
+    /// revolution of its mirror. If the line carries 508 bytes in less time than a revolution, the LMS pauses after
+    /// them until the next revolution. Packets of rotating scanners are shorter.
     fn end_of_bytes_ns(&self, count: usize) -> Nanos {
         let rate = self.rate;
         let revolutions = (count - 1) / BYTES_PER_REVOLUTION;
@@ -212,7 +218,7 @@ impl<T> Transmission<T> {
 /// Transmit queue of a rotating scanner. It sends one telegram after the other.
 #[derive(Debug)]
 pub(crate) struct TxQueue {
-    /// The transmissions. The tag is whether the telegram is a reply.
+    /// The transmissions in the order of their start. The tag is true if the telegram is a reply.
     queue: VecDeque<Transmission<bool>>,
     chunk: ChunkSize,
     rate: u32,
@@ -225,7 +231,7 @@ impl TxQueue {
         TxQueue { queue: VecDeque::new(), chunk, rate, free_ns: 0 }
     }
 
-    /// Sends `telegram` after everything before it, at `at_ns` at the earliest.
+    /// Sends `telegram` after all earlier telegrams, at `at_ns` at the earliest.
     pub(crate) fn send(&mut self, telegram: Vec<u8>, at_ns: Nanos, is_reply: bool) {
         let start_ns = at_ns.max(self.free_ns);
         let transmission = Transmission::new(telegram, start_ns, self.rate, self.chunk, is_reply);
@@ -276,7 +282,7 @@ impl TxQueue {
         broken
     }
 
-    /// Drops the data whose transmission has not started.
+    /// Drops the telegrams of the stream whose transmission has not started. Replies remain.
     pub(crate) fn drop_data(&mut self, now: Nanos) {
         self.queue.retain(|transmission| transmission.tag || transmission.start_ns() <= now);
         self.free_ns = self.queue.back().map_or(now, Transmission::end_ns);

@@ -1,16 +1,16 @@
 //! Faults that a simulation injects. A user writes them as `loss=0.00135,burst=1.89`. One table defines the keys with
 //! their meaning and range for the parser, the printer and the help.
 //!
-//! [`crate::line_model`] applies the faults between the scanner and the port, except the scanner's own deviations from
-//! the protocol:
+//! The scanner itself applies its deviations from the protocol ([`ProtocolQuirks`]). [`crate::line_model`] applies all
+//! other faults between the scanner and the port:
 //!
-//! - Damage to bytes. A byte is lost, flipped or doubled, or random bytes arrive before it. The random numbers of every
-//!   byte are drawn, even if they have no effect. The same seed therefore damages the same bytes in every run, for any
+//! - Damage to bytes. A byte is lost, flipped or doubled, or random bytes arrive before it. Random numbers are drawn
+//!   for every byte, even if they have no effect. The same seed therefore damages the same bytes in every run, for any
 //!   size of chunks.
 //! - Damage to telegrams. A telegram is truncated, aborted or sent twice, or its length field is changed. The random
 //!   numbers of a telegram are drawn at its start.
-//! - Faults at a time, by the scanner's clock: `Schedule` has points in time, and `FaultWindow` has spans of time.
-//!   `Garbage` arrives between or inside telegrams. `Delay` delays chunks.
+//! - Faults at certain times of the scanner's clock. `Schedule` has points in time, and `FaultWindow` has spans of
+//!   time. `Garbage` arrives between or inside telegrams. `Delay` delays chunks.
 
 use std::fmt;
 use std::str::FromStr;
@@ -20,8 +20,8 @@ use scanhub_schema::{Failure, Kind, MILLIS, Nanos};
 
 use crate::machine::ProtocolQuirks;
 
-/// First cause for which a telegram did not reach the host intact, as recorded in the truth. A telegram is intact if
-/// all its bytes arrive as sent and without other bytes between them.
+/// First cause for which a telegram did not reach the host intact. The truth file names it. A telegram is intact if all
+/// its bytes arrive as sent and without other bytes between them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// The scanner aborted the telegram, because of a request or spontaneously.
@@ -30,7 +30,7 @@ pub enum Fault {
     Loss,
     /// Bits were flipped.
     Flip,
-    /// Other bytes arrived between its bytes.
+    /// Random bytes arrived between the bytes of the telegram.
     Insert,
     /// A byte arrived twice.
     Double,
@@ -38,9 +38,9 @@ pub enum Fault {
     Truncated,
     /// The length field was changed.
     Length,
-    /// A flood of garbage arrived between its bytes.
+    /// A flood of garbage arrived between the bytes of the telegram.
     Flood,
-    /// A long run of start bytes arrived between its bytes.
+    /// A long run of start bytes arrived between the bytes of the telegram.
     Wall,
     /// The line was interrupted.
     Silence,
@@ -48,7 +48,7 @@ pub enum Fault {
     Unplug,
     /// The power of the scanner was cycled.
     Power,
-    /// The host's port had another rate.
+    /// The rate of the host's port differed from the rate of the line.
     Baud,
     /// No host had the port open.
     Unread,
@@ -57,7 +57,7 @@ pub enum Fault {
 }
 
 impl Fault {
-    /// Returns the name of the fault in the truth.
+    /// Returns the name of the fault in the truth file.
     pub fn name(self) -> &'static str {
         match self {
             Fault::Aborted => "aborted",
@@ -79,7 +79,7 @@ impl Fault {
     }
 }
 
-/// A row of the table.
+/// A row of [`TABLE`]: a key with its meaning, its range, its default, and the field of [`Faults`] that it sets.
 struct FaultKey {
     name: &'static str,
     meaning: &'static str,
@@ -89,10 +89,10 @@ struct FaultKey {
     field: fn(&mut Faults) -> &mut f64,
 }
 
-/// Creates a field and a key from each row.
+/// Creates a field of `Faults` and a row of `TABLE` from each line.
 macro_rules! faults {
     ($($name:ident, $min:literal to $max:literal, $default:literal, $meaning:literal;)*) => {
-        /// Kinds and amounts of faults.
+        /// Amount of each kind of fault.
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub struct Faults {
             $(#[doc = $meaning] pub $name: f64,)*
@@ -169,7 +169,7 @@ faults! {
 }
 
 impl Faults {
-    /// Returns each key, and its meaning, range and default as text.
+    /// Returns each key with a text that contains its meaning, range and default.
     pub fn keys() -> impl Iterator<Item = (&'static str, String)> {
         TABLE.iter().map(|key| {
             let FaultKey { name, meaning, min, max, default, .. } = key;
@@ -225,8 +225,8 @@ impl FromStr for Faults {
 }
 
 impl fmt::Display for Faults {
-    /// Writes the keys that differ from their default, in the form that the parser accepts. Without faults, the text is
-    /// empty.
+    /// Writes the keys whose values differ from the defaults, in the form that the parser accepts. If there are no
+    /// faults, the text is empty.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut faults = *self;
         let parts = TABLE.iter().filter_map(|key| {
@@ -245,8 +245,8 @@ fn key_names() -> String {
     format!("keys: {}", TABLE.iter().map(|key| key.name).collect::<Vec<_>>().join(", "))
 }
 
-/// Returns random numbers for one `kind` of fault. Each kind has a separate sequence, so that one kind of fault does
-/// not change the others.
+/// Returns the generator of random numbers for one `kind` of fault. Each kind has a separate sequence, so that changing
+/// one kind of fault does not change the others.
 fn random(seed: u64, kind: u64) -> fastrand::Rng {
     fastrand::Rng::with_seed(seed ^ kind.wrapping_mul(0x9E37_79B9_7F4A_7C15))
 }
@@ -266,8 +266,8 @@ impl Loss {
     /// Creates the losses of `faults` with `seed`.
     pub fn new(faults: Faults, seed: u64) -> Self {
         Loss {
-            // Bursts have the mean length b, and the runs between them have the mean length 1/begin. The share of the
-            // bursts is b / (b + 1/begin).
+            // Bursts have the mean length b, and the runs between them have the mean length 1/begin. The share of lost
+            // bytes is therefore b / (b + 1/begin), which must be `loss`.
             begin_share: faults.loss / (faults.burst * (1.0 - faults.loss)),
             continue_share: 1.0 - 1.0 / faults.burst,
             is_in_burst: false,
@@ -310,7 +310,7 @@ pub(crate) struct Noise {
     loss: Loss,
     flip: f64,
     flip_bits: f64,
-    /// Bits of a run that reach into the next byte.
+    /// Number of bits of the current run that belong to the next byte.
     bits_left: u32,
     flips: fastrand::Rng,
     insert: f64,
@@ -385,7 +385,7 @@ fn geometric(random: &mut fastrand::Rng, mean: f64) -> u32 {
     count
 }
 
-/// The faults of the telegram on the line.
+/// Faults of telegrams, and their values for the telegram on the line.
 #[derive(Clone, Debug)]
 pub(crate) struct TelegramFaults {
     truncate: f64,
@@ -393,14 +393,14 @@ pub(crate) struct TelegramFaults {
     repeat: f64,
     abort: f64,
     random: fastrand::Rng,
-    /// Share of the bytes that arrive, if the telegram is truncated.
+    /// Share of the bytes that arrive if the telegram is truncated; `None` if it is not truncated.
     arriving_share: Option<f64>,
     /// Mask of the flipped bits of the length field; 0 if no bit is flipped.
     length_mask: u16,
     is_repeated: bool,
-    /// Share of the bytes after which the scanner aborts the telegram.
+    /// Share of the bytes after which the scanner aborts the telegram; `None` if it sends the whole telegram.
     abort_share: Option<f64>,
-    /// Length of the telegram, if the bytes so far determine the length.
+    /// Length of the telegram. It is complete only after both bytes of the length field were sent.
     len: usize,
     has_length_field: bool,
 }
@@ -422,10 +422,11 @@ impl TelegramFaults {
         }
     }
 
-    /// Starts a telegram of `len` bytes. With `None`, the telegram contains its length.
+    /// Starts a telegram of `len` bytes. `None` means that the telegram has a length field.
     pub(crate) fn begin(&mut self, len: Option<usize>) {
         let shares = [self.random.f64(), self.random.f64()];
-        // Half of the changed lengths are valid.
+        // The first mask changes only the low ten bits, so the changed length may still be valid. It is used for half
+        // of the changed lengths.
         let masks = [self.random.u16(1..0x0400), self.random.u16(1..)];
         let mask = masks[usize::from(self.random.bool())];
         self.arriving_share = draw(&mut self.random, self.truncate).then_some(shares[0]);
@@ -436,11 +437,11 @@ impl TelegramFaults {
         self.has_length_field = len.is_none();
     }
 
-    /// Returns the byte that arrives if the scanner sends `byte` at `position`, and the fault that occurred. The byte
-    /// is `None` if it is lost.
+    /// Returns the byte that arrives if the scanner sends `byte` at `position` of the telegram, and the fault that
+    /// occurred. The byte is `None` if it is lost.
     pub(crate) fn apply(&mut self, position: usize, byte: u8) -> (Option<u8>, Option<Fault>) {
         let [low, high] = self.length_mask.to_le_bytes();
-        // A telegram of a fixed length has its length in the byte after the first one.
+        // A telegram of a fixed length has a single length byte, after its first byte.
         let flipped = match (self.has_length_field, position) {
             (true, 2) | (false, 1) => low,
             (true, 3) => high,
@@ -467,7 +468,7 @@ impl TelegramFaults {
         self.is_repeated
     }
 
-    /// Returns the position at `share` of the length, after the first byte and within the telegram.
+    /// Returns the position at `share` of the telegram's length. It is after the first byte and within the telegram.
     fn position_at(&self, share: f64) -> usize {
         1 + (share * (self.len - 1) as f64) as usize
     }
@@ -482,9 +483,9 @@ pub(crate) struct Schedule {
 }
 
 impl Schedule {
-    /// Creates a schedule. The first time is `at_s` seconds, and each later time follows `every_s` seconds after the
-    /// time before on average. If `every_s` is 0, there is only the first time. If `at_s` is 0, the first time is drawn
-    /// like the others. If both are 0, it is [`DEFAULT_FAULT_TIME_S`].
+    /// Creates a schedule. The first time is `at_s` seconds. Each later time follows `every_s` seconds, on average,
+    /// after the previous time. If `every_s` is 0, there is only the first time. If `at_s` is 0, the first time is
+    /// drawn like the later times. If both are 0, the only time is [`DEFAULT_FAULT_TIME_S`].
     pub(crate) fn new(at_s: f64, every_s: f64, random: fastrand::Rng) -> Schedule {
         let mut schedule = Schedule { every_s, next_ns: 0, random };
         schedule.next_ns = match (at_s > 0.0, every_s > 0.0) {
@@ -537,12 +538,13 @@ impl Schedule {
 pub(crate) struct FaultWindow {
     begins: Schedule,
     span_ns: Nanos,
-    /// End of the span that has started last.
+    /// End of the latest span that has started.
     until_ns: Nanos,
 }
 
 impl FaultWindow {
-    /// Creates spans of `span_s` seconds that start at the times of [`Schedule::new`]. There are none if `span_s` is 0.
+    /// Creates spans of `span_s` seconds that start at the times of [`Schedule::new`]. If `span_s` is 0, there are no
+    /// spans.
     pub(crate) fn new(span_s: f64, at_s: f64, every_s: f64, random: fastrand::Rng) -> FaultWindow {
         let begins = if span_s > 0.0 { Schedule::new(at_s, every_s, random) } else { Schedule::never() };
         FaultWindow { begins, span_ns: nanos(span_s), until_ns: 0 }
@@ -554,17 +556,17 @@ impl FaultWindow {
         FaultWindow { begins, span_ns, until_ns: 0 }
     }
 
-    /// Returns the times at which no byte arrives.
+    /// Returns the spans of time in which no byte arrives.
     pub(crate) fn silences(faults: &Faults, seed: u64) -> FaultWindow {
         FaultWindow::new(faults.silence, faults.silence_at, faults.silence_every, random(seed, 8))
     }
 
-    /// Returns the times at which the port is unplugged.
+    /// Returns the spans of time in which the port is unplugged.
     pub(crate) fn unplugs(faults: &Faults, seed: u64) -> FaultWindow {
         FaultWindow::new(faults.unplug, faults.unplug_at, faults.unplug_every, random(seed, 9))
     }
 
-    /// Returns the times at which the head of the scanner is blocked.
+    /// Returns the spans of time in which the head of the scanner is blocked.
     pub(crate) fn stalls(faults: &Faults, seed: u64) -> FaultWindow {
         FaultWindow::new(faults.hold, faults.hold_at, faults.hold_every, random(seed, 13))
     }
@@ -577,12 +579,12 @@ impl FaultWindow {
         now < self.until_ns
     }
 
-    /// Returns the end of the span at `now`, or `now` if there is none.
+    /// Returns the end of the span that contains `now`, or `now` if no span contains it.
     pub(crate) fn end_ns(&mut self, now: Nanos) -> Nanos {
         if self.is_active(now) { self.until_ns } else { now }
     }
 
-    /// Returns the time of the next change after `now`.
+    /// Returns the next time after `now` at which a span starts or ends.
     pub(crate) fn next_ns(&self, now: Nanos) -> Nanos {
         if now < self.until_ns { self.until_ns.min(self.begins.next_ns()) } else { self.begins.next_ns() }
     }
@@ -598,7 +600,7 @@ pub(crate) struct Garbage {
     random: fastrand::Rng,
     /// Whether the next garbage arrives inside a telegram.
     is_next_inside: bool,
-    /// Number of bytes of the telegram before the garbage.
+    /// Number of bytes of a telegram that still pass before garbage that is due inside the telegram.
     bytes_to_pass: usize,
 }
 
@@ -628,14 +630,15 @@ impl Garbage {
         }
     }
 
-    /// Returns the time of the next garbage, if it arrives inside a telegram and `inside` is set, or if it arrives
-    /// between two telegrams and `inside` is not set. Otherwise returns [`Nanos::MAX`].
+    /// Returns the time of the next garbage if it arrives at the place that `inside` selects: inside a telegram if it
+    /// is set, and otherwise between two telegrams. Returns [`Nanos::MAX`] if the next garbage arrives at the other
+    /// place.
     pub(crate) fn due_ns(&self, inside: bool) -> Nanos {
         if inside == self.is_next_inside { self.schedule.next_ns() } else { Nanos::MAX }
     }
 
-    /// Returns the garbage if it is due before the byte that ends at `now`. `header` contains the first bytes of the
-    /// stream's telegrams.
+    /// Returns the garbage that is due before the byte that ends at `now`. `inside` is as in [`Garbage::due_ns`].
+    /// `header` contains the first bytes of the stream's telegrams, which runs of start bytes imitate.
     pub(crate) fn take(&mut self, now: Nanos, inside: bool, header: &[u8]) -> Option<Vec<u8>> {
         if self.due_ns(inside) > now {
             return None;
@@ -650,7 +653,7 @@ impl Garbage {
         if self.fault == Fault::Flood {
             return Some((0..self.len).map(|_| self.random.u8(..)).collect());
         }
-        // Before the start of the stream, use the first bytes of an LMS telegram.
+        // Before the start of the stream, no header is known, so use the first bytes of an LMS telegram.
         let header = if header.len() < 2 { &[0x02, 0x80] } else { header };
         let bricks: [&[u8]; 3] = [&header[..1], &header[..2], header];
         let brick = bricks[self.random.usize(..3)];
@@ -666,10 +669,10 @@ fn nanos(seconds: f64) -> Nanos {
 #[derive(Clone, Debug)]
 pub(crate) struct Delay {
     stall: FaultWindow,
-    /// Maximum random delay.
+    /// Maximum random delay of a chunk.
     delay_ns: Nanos,
     random: fastrand::Rng,
-    /// Time at which the last chunk arrives.
+    /// Time at which the latest chunk arrives. No later chunk arrives before it.
     last_ns: Nanos,
 }
 
@@ -683,7 +686,7 @@ impl Delay {
         }
     }
 
-    /// Returns these delays, changed so that no chunk overtakes a chunk that `other` delays.
+    /// Returns these delays, changed so that no later chunk arrives before the chunks that `other` has delayed.
     pub(crate) fn after(self, other: &Delay) -> Delay {
         Delay { last_ns: other.last_ns, ..self }
     }
@@ -696,7 +699,8 @@ impl Delay {
     }
 }
 
-/// Time of a single fault without a configured time, in seconds. By this time, the session has started the stream.
+/// Time of a single fault for which no time is configured, in seconds. By then, the hub's session has started the
+/// stream.
 const DEFAULT_FAULT_TIME_S: f64 = 5.0;
 
 #[cfg(test)]
@@ -746,7 +750,8 @@ mod tests {
 
     #[test]
     fn damages_share_of_telegrams_as_measured() {
-        // 0.135 % of the bytes in bursts of 1.89 damage 40.8 % of 732-byte telegrams.
+        // If 0.135 % of the bytes are lost, in bursts of 1.89 bytes on average, 40.8 % of the telegrams of 732 bytes
+        // are damaged.
         let mut loss = Loss::new(Faults { loss: 0.00135, burst: 1.89, ..Faults::default() }, 1);
         let (telegrams, mut damaged, mut lost) = (20_000, 0, 0);
         for _ in 0..telegrams {

@@ -1,6 +1,6 @@
-//! A simulated LDROBOT scanner, without I/O. Its head rotates and measures one point after the other. Each point has
-//! its own time, and a packet has twelve points. The scanner receives nothing from the host. Instead of measuring, it
-//! can send recorded packets.
+//! A simulated LDROBOT scanner, without I/O. Its head rotates and measures one point after the other, each at its own
+//! time and angle. A packet has twelve points. The scanner ignores bytes from the host. Instead of measuring, it can
+//! send recorded packets.
 
 use std::path::Path;
 
@@ -30,7 +30,7 @@ pub struct LdSettings {
     pub revolutions_per_second: f64,
     /// Points per second. The default depends on `model`.
     pub points_per_second: f64,
-    /// Share by which the speed varies. Real scanners stay within 1 %.
+    /// Maximum deviation of the speed from its mean, as a share of the mean. Real scanners stay within 1 %.
     pub speed_variation: f64,
     /// Time constant of the spin-up after power-on, in seconds. With 0, the head has its full speed at once.
     pub spin_up_s: f64,
@@ -38,12 +38,13 @@ pub struct LdSettings {
     pub boot_ns: Nanos,
     /// Number of bytes that the host's hardware delivers at once.
     pub chunk: ChunkSize,
-    /// Seed of the speed.
+    /// Seed of the angle at the start and of the variation of the speed.
     pub seed: u64,
 }
 
 impl LdSettings {
-    /// Returns the factory settings of `model`, for a scanner that was switched on two seconds ago.
+    /// Returns the factory settings of `model`. After a power cycle, such a scanner sends its first packet two seconds
+    /// later, and its head has its full speed at once.
     pub fn of(model: Model) -> LdSettings {
         LdSettings {
             model,
@@ -64,9 +65,9 @@ pub struct LdSimulator {
     source: Source,
     /// Time of power-on.
     power_ns: Nanos,
-    /// Time from which on the head rotates.
+    /// Time at which the head starts to rotate.
     rotates_from_ns: Nanos,
-    /// Number of packets since the head started to rotate.
+    /// Number of packets that were queued for transmission since the head started to rotate.
     sent: u64,
     rotation: Rotation,
     tx_queue: TxQueue,
@@ -92,7 +93,8 @@ impl LdSimulator {
         LdSimulator::of(settings, Source::Room(BeamSampler::new(room)))
     }
 
-    /// Creates a scanner that repeats recorded `packets` instead of measuring, once or in a loop.
+    /// Creates a scanner that sends recorded `packets` instead of measuring. If `looped` is set, they restart at their
+    /// end.
     pub fn repeating(settings: LdSettings, packets: Vec<[u8; PACKET_LEN]>, looped: bool) -> LdSimulator {
         LdSimulator::of(settings, Source::Recorded { packets, is_looped: looped, elapsed_ms: 0 })
     }
@@ -110,14 +112,15 @@ impl LdSimulator {
         self.rotation.set_speed(self.seconds(self.sent * POINTS_PER_PACKET as u64), revolutions_per_second);
     }
 
-    /// Returns the number of packets that were measured in a room since the head started to rotate, including the
-    /// current packet. Each packet has twelve points.
+    /// Returns the number of packets since the head started to rotate, including the packet on the line. Each packet
+    /// has twelve points.
     pub fn sent(&self) -> u64 {
         self.sent
     }
 
-    /// Returns point number `point` since the head started to rotate, without noise. The point must not be before the
-    /// last [`set_speed`](Self::set_speed). For a recording, the range is `None`.
+    /// Returns time, angle and range of a point, without noise. `point` is its index since the head started to rotate.
+    /// The point must not be earlier than the last call of [`set_speed`](Self::set_speed). For a recording, the range
+    /// is `None`.
     pub fn truth(&mut self, point: u64) -> TruePoint {
         let (at_ns, clockwise_deg) = self.time_and_angle(point);
         let range_mm = match &mut self.source {
@@ -127,23 +130,23 @@ impl LdSimulator {
         TruePoint { at_ns, clockwise_deg, range_mm }
     }
 
-    /// Returns the clockwise angle of point number `point` from the head's zero, 0 to 360 degrees.
+    /// Returns the clockwise angle of the point with index `point` from the head's zero, 0 to 360 degrees.
     pub fn clockwise_deg(&self, point: u64) -> f64 {
         self.time_and_angle(point).1
     }
 
-    /// Returns time and clockwise angle of point number `point`.
+    /// Returns time and clockwise angle of the point with index `point`.
     fn time_and_angle(&self, point: u64) -> (Nanos, f64) {
         let seconds = self.seconds(point);
         (self.rotates_from_ns + (seconds * 1e9) as Nanos, self.rotation.revolutions(seconds).fract() * 360.0)
     }
 
-    /// Returns the time of point number `point`, in seconds since the head started to rotate.
+    /// Returns the time of the point with index `point`, in seconds since the head started to rotate.
     fn seconds(&self, point: u64) -> f64 {
         point as f64 / self.settings.points_per_second
     }
 
-    /// Restarts the scanner at `now`. Its first packet follows after `boot_ns`. Returns whether a packet was aborted.
+    /// Restarts the scanner at `now`. Its head starts to rotate after `boot_ns`. Returns whether a packet was aborted.
     fn restart(&mut self, now: Nanos, boot_ns: Nanos, spin_up_s: f64) -> bool {
         let broken = self.tx_queue.abort(now);
         self.power_ns = now;
@@ -156,7 +159,7 @@ impl LdSimulator {
         broken
     }
 
-    /// Returns packet number `number`, measured in the room.
+    /// Measures the points of packet number `number` in the room, and returns the packet.
     fn measure(&mut self, number: u64) -> [u8; PACKET_LEN] {
         let first = number * POINTS_PER_PACKET as u64;
         let times_and_angles: [(Nanos, f64); POINTS_PER_PACKET] =
@@ -189,7 +192,8 @@ impl LdSimulator {
         }
     }
 
-    /// Returns packet number `number`, which is sent now.
+    /// Returns packet number `number` for transmission: the next recorded packet, or a packet that is measured in the
+    /// room.
     fn take(&mut self, number: u64) -> [u8; PACKET_LEN] {
         let Source::Recorded { packets, elapsed_ms: passed_ms, .. } = &mut self.source else {
             return self.measure(number);
@@ -198,7 +202,8 @@ impl LdSimulator {
         let millis = |at: usize| Packet::check(&packets[at]).map_or(0, |packet| packet.millis());
         let next = (at + 1) % packets.len();
         let passed = (millis(next) + CLOCK_PERIOD_MS - millis(at)) % CLOCK_PERIOD_MS;
-        // The clock does not define the time from the last packet to the first.
+        // The recorded clock does not define the time from the last packet to the first packet of the next lap, so use
+        // 1 ms.
         *passed_ms += if next == 0 { 1 } else { u64::from(passed.min(1_000)) };
         packets[at]
     }
@@ -225,7 +230,7 @@ impl Device for LdSimulator {
         self.restart(now, self.settings.boot_ns, self.settings.spin_up_s)
     }
 
-    /// Restarts the scanner. Its clock restarts at 0, and inertia keeps the head rotating.
+    /// Restarts the scanner. Its clock restarts at 0. Its head has its full speed, because inertia kept it rotating.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.restart(now, RESTART_NS, 0.0)
     }
@@ -247,8 +252,8 @@ impl Device for LdSimulator {
     }
 }
 
-/// Returns the packets in the recording at `path`, without damaged ones. If it has several sensors, `sensor` selects
-/// one.
+/// Returns the intact packets in the recording at `path`. If the recording has several sensors, `sensor` selects one of
+/// them.
 ///
 /// # Errors
 ///
@@ -272,10 +277,11 @@ pub fn recorded_packets(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; PA
     Ok(packets)
 }
 
-/// Time from a dip of the voltage to the first packet. It is invented, because the real one is not published.
+/// Time from a dip of the voltage to the restart of the measurement. The value is invented, because LDROBOT does not
+/// publish it.
 const RESTART_NS: Nanos = 300 * MILLIS;
 
-/// Returns the minimum and maximum range of `model` by its data sheet, in millimeters.
+/// Returns the minimum and the maximum range of `model` according to its data sheet, in millimeters.
 fn reach_mm(model: Model) -> std::ops::RangeInclusive<f64> {
     match model {
         Model::Ld06 | Model::Ld19 | Model::Stl19p => 20.0..=12_000.0,

@@ -1,12 +1,12 @@
 //! Simulated scanners on ptys or TCP servers, for tests, demonstrations and measurements without hardware.
 //!
-//! - [`machine`] is a SICK LMS 2xx, [`ld`] an LDROBOT, and [`rplidar`] an RPLIDAR of Slamtec. They do no I/O, and time
-//!   is an argument.
-//! - [`world`] describes the surroundings of a scanner, [`room`] computes scans of them together with the true values,
-//!   and [`mount`] tilts a scanner.
-//! - [`line_model`] and [`fault`] simulate the line.
-//! - [`port`] is the only file that reads a clock.
-//! - [`simulate()`] is the command.
+//! - [`machine`] is a SICK LMS 2xx, [`ld`] an LDROBOT, and [`rplidar`] an RPLIDAR of Slamtec. These modules do no I/O,
+//!   and time is an argument of their functions.
+//! - [`world`] describes the surroundings of a scanner, [`room`] computes scans of these surroundings together with the
+//!   true targets, and [`mount`] tilts a scanner.
+//! - [`line_model`] simulates the line, and [`fault`] defines the faults of the line and of the scanner.
+//! - [`port`] creates the ptys and TCP servers. It is the only module that reads a clock.
+//! - [`simulate()`] runs the simulated scanners for the verb `simulate`.
 
 pub mod beam;
 pub mod device;

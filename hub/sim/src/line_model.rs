@@ -1,11 +1,13 @@
 //! The line between scanner and port, with all its faults. Time is an argument, so that ptys and tests in virtual time
 //! share this model.
 //!
-//! A [`LineModel`] is driven like a [`Device`]: call [`LineModel::poll_transmit`] until it returns `None`, pass the
-//! host's bytes, and call again at [`LineModel::poll_timeout`]. The rate of the host's port takes effect after the
-//! line. If it differs from the rate of the line, a [`UartReceiver`] converts bytes to bits at the rate of the sender,
-//! and samples the bits at its own rate. An ideal UART that samples a little early agrees with recordings of real
-//! UARTs. Bytes with a wrong stop bit are delivered, as in Linux.
+//! A [`LineModel`] is driven like a [`Device`]: call [`LineModel::poll_transmit`] until it returns `None`, and pass the
+//! host's bytes to [`LineModel::receive`]. Repeat both at the time that [`LineModel::poll_timeout`] returns.
+//!
+//! The line model does not depend on the rate of the host's port. If this rate differs from the rate of the line, the
+//! caller passes delivered bytes through a [`UartReceiver`]. The receiver converts the bytes to bits at the rate of the
+//! sender, and samples the bits at its own rate. An ideal UART that samples a little before the middle of a bit agrees
+//! with recordings of real UARTs. The receiver delivers bytes with a wrong stop bit, as Linux does.
 
 use std::collections::VecDeque;
 
@@ -20,15 +22,15 @@ use crate::request_decoder::Arrival;
 /// Bytes that arrive at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Delivery {
-    /// The bytes, including foreign bytes between them. Empty if all bytes were lost.
+    /// The bytes that arrive, including bytes that the scanner did not send. Empty if all bytes were lost.
     pub bytes: Vec<u8>,
-    /// Rate at which they were sent, in bits per second.
+    /// Rate at which the bytes were sent, in bits per second.
     pub rate: u32,
     /// Whether the line is idle after these bytes.
     pub idle_after: bool,
-    /// The part of a telegram that was sent; `None` for bytes that the scanner did not send.
+    /// The part of a telegram that the scanner sent; `None` for bytes that the scanner did not send.
     pub part: Option<ChunkKind>,
-    /// First cause for which bytes of the telegram did not arrive as sent.
+    /// First cause for which this part of the telegram did not arrive as sent; `None` if it arrived as sent.
     pub fault: Option<Fault>,
 }
 
@@ -47,9 +49,9 @@ pub struct LineModel {
     is_rs232: bool,
     /// Whether the adapter is plugged in.
     plugged: bool,
-    /// Number of bytes of the current telegram that were sent.
+    /// Number of bytes of the current telegram that the scanner has sent.
     position: usize,
-    /// The last byte that was sent.
+    /// The last byte that the scanner has sent.
     last: u8,
     /// First cause for which a byte of the current telegram did not arrive as sent.
     fault: Option<Fault>,
@@ -57,7 +59,7 @@ pub struct LineModel {
     power_broke: bool,
     /// Length of a telegram, if all telegrams have the same length.
     telegram_len: Option<usize>,
-    /// First bytes of the last telegram of measured values.
+    /// First bytes of the last telegram of the stream, which runs of start bytes imitate.
     header: Vec<u8>,
     /// Bytes that have not arrived yet, with the times of their arrival.
     queue: VecDeque<(Nanos, Delivery)>,
@@ -111,15 +113,15 @@ impl LineModel {
         self.plugged
     }
 
-    /// Passes a byte of the host to `machine`, if the line carries it. Call it after [`LineModel::poll_transmit`]
-    /// returned `None`.
+    /// Passes a byte of the host to `machine`, if the line carries it. Before, call [`LineModel::poll_transmit`] until
+    /// it returns `None`.
     pub fn receive(&mut self, machine: &mut dyn Device, byte: u8, arrival: Arrival) {
         if self.plugged && self.carries(machine.rate()) {
             machine.receive(byte, arrival);
         }
     }
 
-    /// Returns the next bytes that arrive at `now`.
+    /// Returns the next bytes that have arrived at `now`, or `None` if there are no more.
     pub fn poll_transmit(&mut self, machine: &mut dyn Device, now: Nanos) -> Option<Delivery> {
         self.plugged = !self.unplug.is_active(now);
         if self.power.take(now).is_some() {
@@ -164,7 +166,7 @@ impl LineModel {
             .min()
     }
 
-    /// Damages a chunk whose transmission is complete, and queues it for the host.
+    /// Applies the faults to a chunk whose transmission is complete, and queues the resulting bytes for the host.
     fn transmit(&mut self, machine: &mut dyn Device, chunk: Chunk, now: Nanos) {
         let Chunk { bytes, rate, idle_after, part } = chunk;
         let is_silent = self.is_silent(rate, now);
@@ -198,7 +200,7 @@ impl LineModel {
         !self.is_rs232 || rate < RS422_RATE
     }
 
-    /// Returns whether every byte that is sent at `rate` is lost at `now`.
+    /// Returns whether the line loses every byte that is sent at `now`, at `rate` bits per second.
     fn is_silent(&mut self, rate: u32, now: Nanos) -> bool {
         self.silence.is_active(now) || !self.carries(rate)
     }
@@ -214,8 +216,8 @@ impl LineModel {
         arrived
     }
 
-    /// Returns the bytes that arrive if `bytes` of a telegram are sent, and the first fault. The telegram has `len`
-    /// bytes; `usize::MAX` means that its length is unknown.
+    /// Returns the bytes that arrive if the scanner sends `bytes` of a telegram, and the first fault of these bytes.
+    /// The telegram has `len` bytes; `usize::MAX` means that these bytes do not end the telegram.
     fn damage_telegram(
         &mut self,
         bytes: &[u8],
@@ -256,7 +258,7 @@ impl LineModel {
         (arrived, fault)
     }
 
-    /// Ends the current telegram. Returns a copy of the telegram if it is sent twice.
+    /// Ends the current telegram. Returns a copy of the telegram if it arrived intact and is to arrive twice.
     fn end_telegram(&mut self, sent: &SentTelegram, fault: Option<Fault>) -> Option<SentTelegram> {
         self.position = 0;
         if !sent.is_reply {
@@ -266,7 +268,8 @@ impl LineModel {
         (is_whole && self.telegram_faults.is_repeated()).then(|| sent.clone())
     }
 
-    /// Returns the garbage that is due, and its fault.
+    /// Returns the garbage that is due at `now`, and its kind. `inside` selects garbage inside a telegram; otherwise
+    /// the garbage is between two telegrams.
     fn due_garbage(&mut self, now: Nanos, inside: bool) -> Option<(Vec<u8>, Fault)> {
         if self.garbage_faults.iter().all(|extra| extra.due_ns(inside) > now) {
             return None;
@@ -287,8 +290,10 @@ impl Delivery {
     }
 }
 
-/// Changes the foreign bytes `between` two bytes of a telegram, so that they differ from their neighbors. A foreign
-/// byte that equals its neighbor would only shift the telegram, whose bytes would still be contiguous.
+/// Returns the foreign `bytes` between two bytes of a telegram, changed so that the last foreign byte differs from the
+/// byte before them, and the first foreign byte differs from the byte after them. `between` contains these two bytes of
+/// the telegram. Otherwise, a foreign byte could take the place of its neighbor, and the telegram would still be
+/// contiguous.
 fn separated(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
     if let (Some((before, after)), [first, rest @ ..]) = (between, &mut bytes[..]) {
         let last = rest.last_mut();
@@ -306,7 +311,7 @@ fn separated(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
 /// A receiver at the wrong rate.
 #[derive(Clone, Debug)]
 pub struct UartReceiver {
-    /// Number of the sender's bits in one bit of the receiver.
+    /// Duration of one bit of the receiver, in bits of the sender.
     ratio: f64,
     /// Levels of the line that were not sampled yet. The first level is bit number `first`.
     levels: VecDeque<bool>,
@@ -314,7 +319,8 @@ pub struct UartReceiver {
     state: ReceiverState,
 }
 
-/// A port that may have another rate than the line. Both rates can change; the receiver restarts then.
+/// Receiver of a port whose rate may differ from the rate of the line. If one of the two rates changes, the receiver
+/// restarts.
 #[derive(Clone, Debug, Default)]
 pub struct BaudMismatch(Option<((u32, u32), UartReceiver)>);
 
@@ -328,7 +334,7 @@ impl BaudMismatch {
         receiver.receive(bytes, idle_after)
     }
 
-    /// Drops a byte that was partly received, because both ends have the same rate now.
+    /// Drops a byte that was partly received. The caller calls this function when both ends have the same rate.
     pub fn reset(&mut self) {
         self.0 = None;
     }
@@ -336,9 +342,9 @@ impl BaudMismatch {
 
 #[derive(Clone, Copy, Debug)]
 enum ReceiverState {
-    /// Waits for a falling edge after bit number `after`, whose level was `level`.
+    /// Waits for a falling edge at the beginning of bit number `after` or of a later bit. The bit before had `level`.
     Hunting { after: u64, level: bool },
-    /// Samples a byte whose start bit fell at the beginning of bit number `start`. `bits` data bits were sampled.
+    /// Samples a byte whose start bit began with bit number `start` of the sender. `bits` data bits have been sampled.
     Sampling { start: u64, bits: u32, byte: u8 },
 }
 
@@ -353,8 +359,8 @@ impl UartReceiver {
         }
     }
 
-    /// Returns the bytes that the receiver reads from `bytes` without a pause. If `idle_after` is set, the line is idle
-    /// afterwards.
+    /// Returns the bytes that the receiver reads if the sender sends `bytes` without a pause. If `idle_after` is set,
+    /// the line is idle afterwards.
     pub fn receive(&mut self, bytes: &[u8], idle_after: bool) -> Vec<u8> {
         for &byte in bytes {
             self.levels.push_back(false);
@@ -362,8 +368,8 @@ impl UartReceiver {
             self.levels.push_back(true);
         }
         if idle_after {
-            // The receiver can complete its last byte if the line is idle for the duration of one byte at the
-            // receiver's rate.
+            // Let the line be idle for more than the duration of one byte at the receiver's rate. The receiver can then
+            // complete its last byte.
             let bits = (11.0 * self.ratio).ceil() as usize + 1;
             self.levels.extend(std::iter::repeat_n(true, bits));
         }
@@ -412,10 +418,11 @@ impl UartReceiver {
 
 /// Lowest rate that an RS-232 line does not carry, in bits per second.
 const RS422_RATE: u32 = 500_000;
-/// Length of a stream's header in bytes: STX to count word.
+/// Number of bytes at the start of a stream's telegram that runs of start bytes imitate: STX to count word.
 const HEADER_LEN: usize = 7;
-/// Position in a bit at which the receiver samples. Positions from 0.40 to 0.48 agree with a recording of a real port
-/// at 19200 on a line at 38400. Positions from 0.5 on do not (reference, section 2).
+/// Position in a bit at which the receiver samples, from 0 at its beginning to 1 at its end. Positions from 0.40 to
+/// 0.48 agree with a recording of a real port at 19200 on a line at 38400. Positions of 0.5 and more do not agree with
+/// the recording (reference, section 2).
 const SAMPLE_POSITION: f64 = 0.45;
 
 #[cfg(test)]
@@ -478,7 +485,8 @@ mod tests {
         let model = UartReceiver::new(38_400, 19_200).receive(&sent, true);
         let grams: HashSet<&[u8]> = model.windows(4).collect();
         let found = real.windows(4).filter(|gram| grams.contains(gram)).count();
-        // The recordings show different scenes. With a sample position of 0.5, no run is found.
+        // The two recordings show different scenes, so only a part of the runs agrees. With a sample position of 0.5,
+        // no run agrees.
         println!("{found} of {} runs of 4 bytes are in the model's output", real.len() - 3);
         assert!(found > 3_000, "{found}");
         let histogram = |bytes: &[u8]| {

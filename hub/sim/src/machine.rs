@@ -1,11 +1,11 @@
 //! A simulated LMS, without I/O. Its inputs are bytes of the host and times, and its outputs are chunks of bytes with
-//! the times of their transmission. It is driven as a [`Device`]; [`ScanSource`] provides its measured values, and
-//! [`crate::line_model`] damages the bytes later.
+//! the times of their transmission. The caller drives the LMS as a [`Device`]. [`ScanSource`] provides the measured
+//! values, and [`crate::line_model`] damages the bytes later.
 //!
-//! It supports every request that a host sends before a stream, every mode that sends measured values, and the requests
-//! of the installation mode that change the configuration and the permanent rate. It refuses every other well-formed
-//! request with 92h, as a real scanner refuses a request that it does not support. It counts the requests that would
-//! write its EEPROM. Automatic code never sends a request that writes, and tests check this count.
+//! The scanner supports every request that a host sends before a stream, every mode that sends measured values, and the
+//! requests of the installation mode that change the configuration and the permanent rate. It refuses every other
+//! well-formed request with 92h, as a real scanner refuses a request that it does not support. It counts the requests
+//! that would write its EEPROM. Tests check this count to prove that automatic code never sends such a request.
 
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -30,7 +30,7 @@ use crate::request_decoder::{Arrival, DecodedRequest, DroppedRequest, RequestDec
 /// host's end of its line.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// Address of the scanner, 0 to 127. It replies to this address and to 0.
+    /// Address of the scanner, 0 to 127. It replies to requests for this address and for 0.
     pub address: u8,
     /// Reply to 3Ah: by convention 21 ASCII characters. If it names an LMS 211, the scanner sees only 100 degrees.
     pub type_name: String,
@@ -46,7 +46,7 @@ pub struct Settings {
     pub mode: Mode,
     /// Byte 4 of the configuration: bit 1 appends scan and telegram index to measured values.
     pub availability: u8,
-    /// Bytes of the configuration: 34, or 32 with older firmware.
+    /// Length of the configuration in bytes: 34, or 32 with older firmware.
     pub configuration_len: usize,
     /// State in which an earlier host left the scanner.
     pub start: StartState,
@@ -61,10 +61,10 @@ pub struct Settings {
     pub pollution_percent: u16,
     /// Deviations from the listing.
     pub quirks: ProtocolQuirks,
-    /// Number of bytes that arrive at once.
+    /// Number of bytes that the host's hardware delivers at once.
     pub chunk: ChunkSize,
-    /// Speed of the simulation's time relative to the host's time. The host measures the gaps of its requests by its
-    /// own clock.
+    /// Speed of the simulation's time relative to the host's time. The host measures the gaps between the bytes of its
+    /// requests by its own clock.
     pub speed: f64,
     /// Seed of the random delays before replies, and of the deviations.
     pub seed: u64,
@@ -105,7 +105,7 @@ pub enum StartState {
     PowerOn,
 }
 
-/// Deviations of a scanner from the listing. Real ones deviate occasionally.
+/// Deviations of a scanner from the listing. Real scanners deviate occasionally.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ProtocolQuirks {
     /// Share of the requests that the scanner overlooks while its mirror rotates.
@@ -118,13 +118,13 @@ pub struct ProtocolQuirks {
     pub late_acknowledge_ns: Nanos,
     /// Additional delay of a reply. The reply is sent even if the next request arrives before it.
     pub late_reply_ns: Nanos,
-    /// Additional duration of a change of mode, rate or variant: up to 3 s by the listing. The scanner answers a
-    /// request that arrives during the change at once, and then never sends the reply to the change.
+    /// Additional duration of a change of mode, rate or variant: up to 3 s by the listing. If a request arrives during
+    /// the change, the scanner answers this request immediately, and never sends the reply to the change.
     pub late_mode_ns: Nanos,
     /// Additional duration of a write to the EEPROM. SICK's quick manual allows 7 s.
     pub late_write_ns: Nanos,
-    /// Whether the scanner refuses to measure in installation mode, with 92h. It must first enter the monitoring mode
-    /// (Telegram listing 6.3.2; its table 7-1 allows measuring).
+    /// Whether the scanner refuses requests to measure with 92h while it is in installation mode. The host must first
+    /// select the monitoring mode (Telegram listing 6.3.2; table 7-1 of the listing allows measuring).
     pub is_strict: bool,
     /// Whether the scanner drops requests whose bytes arrive less than 55 us apart (Telegram listing 4.3). Most hosts
     /// do not keep this minimum.
@@ -165,7 +165,7 @@ enum Tag {
     Acknowledge,
     Scan,
     Reply {
-        /// Whether the reply is sent even if another request arrives before.
+        /// Whether the scanner sends the reply even if another request arrives before it.
         is_late: bool,
         effect: ReplyEffect,
     },
@@ -179,7 +179,7 @@ struct Reply {
     effect: ReplyEffect,
 }
 
-/// Action after the transmission of a reply.
+/// Action of the scanner after the transmission of a reply.
 #[derive(Clone, Copy, Debug)]
 enum ReplyEffect {
     Nothing,
@@ -271,7 +271,7 @@ impl LmsSimulator {
         if let Some(next) = self.queue.front_mut() {
             next.start_no_earlier(end_ns);
         } else if self.operating.streams() && (aborted || !matches!(front.tag, Tag::Scan)) {
-            // The stream continues with a complete scan, when the mirror starts one.
+            // The stream continues with a complete scan, at the next time at which the mirror starts a scan.
             let scan_ns = self.operating.revolutions(self.variant) * MIRROR_PERIOD;
             self.next_scan_ns = Some(end_ns.next_multiple_of(scan_ns));
         }
@@ -284,8 +284,9 @@ impl LmsSimulator {
         }
     }
 
-    /// Interrupts all transmissions for a request of the host. The current transmission ends with the byte in the
-    /// transmitter, and queued transmissions are dropped. Returns the time from which the line is free.
+    /// Interrupts all transmissions because of a request of the host. The current transmission ends with the byte in
+    /// the transmitter, and queued transmissions are dropped, except late replies. Returns the time from which on the
+    /// line is free.
     fn interrupt(&mut self, now: Nanos) -> Nanos {
         self.next_scan_ns = None;
         let mut is_first = true;
@@ -425,7 +426,7 @@ impl LmsSimulator {
                 &reply::variant_reply(address, false, self.variant, status),
                 self.mode_delay_ns(),
             ),
-            // The listing allows the scanner to send a word without a meaning here.
+            // The listing allows a word without a meaning in this request.
             (command::COUNTERS, [0, 0]) => self.counters(),
             _ => self.refusal(),
         }
@@ -454,8 +455,8 @@ impl LmsSimulator {
         )
     }
 
-    /// Writes the configuration (77h in installation mode), as many bytes as `data` has. Unit and mode of a recording
-    /// cannot change.
+    /// Replaces the start of the configuration by `data` (request 77h in installation mode). A scanner that replays a
+    /// recording refuses another unit or mode.
     fn write_configuration(&mut self, data: &[u8]) -> Reply {
         let (unit, mode) = (self.eeprom.unit(), self.eeprom.mode());
         let eeprom = self.eeprom.with_configuration(data).filter(|eeprom| {
@@ -468,7 +469,8 @@ impl LmsSimulator {
         delayed_reply(&self.reply(eeprom::CONFIGURATION | REPLY, &outcome), delay_ns)
     }
 
-    /// Returns the status B1h of a healthy scanner, changed to the settings and the errors of this scanner.
+    /// Returns the status B1h: that of a healthy scanner, changed according to the settings and the errors of this
+    /// scanner.
     fn status(&self) -> EncodedTelegram {
         let firmware = self.settings.type_name.rsplit(';').next().unwrap_or_default().as_bytes();
         let health = SimulatedStatus {
@@ -481,7 +483,7 @@ impl LmsSimulator {
         };
         let healthy = reply::status_reply(self.settings.address, &health, self.settings.status);
         let mut data = healthy.telegram().data().to_vec();
-        // Offsets in the data of B1h, which begin after the command byte (Telegram listing 7-5).
+        // Offsets in the data of B1h, counted from the byte after the command byte (Telegram listing 7-5).
         data[8] = u8::from(self.settings.errors.iter().any(|&(kind, _)| kind == FATAL_ERROR));
         let pollution = CLEAN_POLLUTION / 100 * self.settings.pollution_percent;
         for (at, words, value) in [(18, 12, pollution), (42, 12, CLEAN_POLLUTION)] {
@@ -492,12 +494,12 @@ impl LmsSimulator {
         self.reply(healthy.telegram().command(), &data)
     }
 
-    /// Returns the time from ACK to reply if nothing changes.
+    /// Returns the time from ACK to the reply to a request that changes nothing.
     fn reply_delay_ns(&mut self) -> Nanos {
         self.quirk_delay_ns(REPLY_DELAY_NS)
     }
 
-    /// Returns the time from ACK to A0h or BBh.
+    /// Returns the time from ACK to A0h or BBh, the replies to a change of mode, rate or variant.
     fn mode_delay_ns(&mut self) -> Nanos {
         self.quirk_delay_ns(MODE_CHANGE_NS) + self.settings.quirks.late_mode_ns
     }
@@ -510,7 +512,7 @@ impl LmsSimulator {
         }
     }
 
-    /// Returns the time from ACK to F7h or E6h.
+    /// Returns the time from ACK to F7h or E6h, the replies to a write to the EEPROM.
     fn write_delay_ns(&self, is_other_unit: bool) -> Nanos {
         let usual_ns = if is_other_unit { UNIT_CHANGE_NS } else { WRITE_NS };
         usual_ns + self.settings.quirks.late_write_ns
@@ -695,14 +697,14 @@ impl Eeprom {
 
 /// Time from 91h to the announced reset (Telegram listing, 10h).
 const RESET_NS: Nanos = 10 * MILLIS;
-/// Type of a present fatal error.
+/// Error type of a fatal error that is present now.
 const FATAL_ERROR: u8 = 4;
-/// Counters of a scanner that is some years old: hours (unit 2 h) and power-ons.
+/// Counters of a scanner that is some years old: operating time in units of 2 h, and number of power-ons.
 const OPERATING_COUNTERS: [u8; 4] = [0x10, 0x27, 0x2C, 0x01];
 /// Value that the pollution sensors report for a clean window. Only the ratio to this value matters.
 const CLEAN_POLLUTION: u16 = 1_000;
-/// Time from ACK to reply if nothing changes. Captured exchanges took 70 to 158 ms at 38400. Request and reply took 10
-/// to 45 ms of this time.
+/// Time from ACK to the reply to a request that changes nothing. Captured exchanges took 70 to 158 ms at 38400. The
+/// transmission of request and reply took 10 to 45 ms of this time.
 const REPLY_DELAY_NS: Range<Nanos> = 55 * MILLIS..145 * MILLIS;
 /// Time from ACK to A0h or BBh. Captured exchanges took 66 to 94 ms; the listing allows 3 s.
 const MODE_CHANGE_NS: Range<Nanos> = 55 * MILLIS..85 * MILLIS;
@@ -710,7 +712,8 @@ const MODE_CHANGE_NS: Range<Nanos> = 55 * MILLIS..85 * MILLIS;
 const WRITE_NS: Nanos = 110 * MILLIS;
 /// Time from ACK to F7h if the unit changes. SICK's quick manual allows 7 s.
 const UNIT_CHANGE_NS: Nanos = 1_000 * MILLIS;
-/// Indices in the configuration (Telegram listing, 77h).
+/// Indices of three bytes in the configuration (Telegram listing, 77h): [`Settings::availability`], measuring mode and
+/// unit.
 const AVAILABILITY: usize = 4;
 const MODE: usize = 5;
 const UNIT: usize = 6;

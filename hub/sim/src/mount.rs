@@ -1,5 +1,5 @@
-//! A mount that tilts a scanner: its angle at each time, and the reports of its encoder, which may have faults. Angle
-//! and reports are pure functions of time.
+//! A mount that tilts a scanner: the angle of the mount at each time, and the reports of its encoder, which may have
+//! faults. Angle and reports are pure functions of time.
 
 use std::cmp::Reverse;
 use std::f64::consts::PI;
@@ -9,8 +9,8 @@ use scanhub_schema::Nanos;
 use crate::shape::Plane;
 use crate::shape::Point;
 
-/// A mount with a horizontal axis across the field of view, which swings back and forth at a constant speed. Larger
-/// angles are farther down.
+/// A mount that swings a scanner back and forth at a constant speed, around a horizontal axis across the field of view.
+/// At larger angles, the scanner points farther down.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mount {
     /// Height of the axis above the floor.
@@ -19,7 +19,7 @@ pub struct Mount {
     pub arm_mm: (f64, f64),
     /// Angle at the start and at one reversal.
     pub from_deg: f64,
-    /// Angle at the other reversal, which is greater.
+    /// Angle at the other reversal. It is greater than `from_deg`.
     pub to_deg: f64,
     /// Speed in degrees per second.
     pub deg_s: f64,
@@ -49,13 +49,13 @@ pub enum FaultKind {
     Silence,
     /// The encoder reports a constant angle, while the mount swings.
     Stuck,
-    /// The encoder is suddenly off by this number of degrees.
+    /// All reported angles are off by this number of degrees.
     Jump(f64),
     /// The error of the encoder grows to this number of degrees at 2 degrees per second, and shrinks again.
     Drift(f64),
-    /// Reports arrive this number of seconds later, with correct stamps.
+    /// Reports arrive this number of seconds after their angles were measured. The stamps are correct.
     Delay(f64),
-    /// The stamps are this many seconds later than the angles; earlier if negative.
+    /// The stamps are this number of seconds later than the measurements of the angles; earlier if negative.
     StampDelay(f64),
 }
 
@@ -140,7 +140,8 @@ impl Mount {
         let nanos = |time_s: f64| (time_s * 1e9).round() as Nanos;
         Some(Report {
             stamp_ns: nanos(stamp_s),
-            // A program that stamps an angle at its arrival stamps it late.
+            // A stamp that is too late comes from a program that stamps an angle at its arrival. The report therefore
+            // does not arrive before its stamp.
             arrival_ns: nanos(stamp_s.max(time_s) + late_s),
             angle_rad: (self.angle_deg(at_s) + off_deg).to_radians(),
             rate_rad_s: rate_deg_s / 180.0 * PI,
@@ -166,7 +167,7 @@ impl Mount {
         if self.travel_deg(time_s) < self.to_deg - self.from_deg { 1.0 } else { -1.0 }
     }
 
-    /// Returns the degrees since the mount was at `from_deg` last.
+    /// Returns how many degrees the mount has traveled since it was last at `from_deg`.
     fn travel_deg(&self, time_s: f64) -> f64 {
         let halts = self.faults.iter().filter(|fault| fault.kind == FaultKind::Halt);
         let halted_s: f64 = halts.map(|fault| (time_s.min(fault.until_s) - fault.from_s).max(0.0)).sum();

@@ -1,6 +1,6 @@
-//! Operating modes of an LMS: the telegrams that a scanner sends continuously after a request 20h, or once after the
-//! request for one value (Telegram listing, 20h, 30h to 3Fh and 75h). [`ScanSource`] provides the measured values: a
-//! room, or a recording.
+//! Operating modes of an LMS, and the telegrams of measured values that a scanner sends in each mode. It sends them
+//! continuously after a request 20h, or one telegram after a request 30h to 3Fh or 75h (Telegram listing). The measured
+//! values come from a [`ScanSource`]: a room, or a recording.
 
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::measured::{ScanFrame, encode_with};
@@ -11,7 +11,8 @@ use scanhub_schema::{Nanos, line_time};
 
 use crate::room::Room;
 
-/// Operating mode of a scanner.
+/// Operating mode of a scanner: the byte after 20h that selects it, the contents of its telegrams, and their command
+/// byte. Beams are counted from 1.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum OperatingMode {
     /// 00h: installation, the only mode in which the EEPROM can be written.
@@ -22,15 +23,15 @@ pub enum OperatingMode {
     OnRequest,
     /// 26h: means of this number of scans, B6h.
     Means(u8),
-    /// 27h: the values from one beam to another, counted from 1, B7h.
+    /// 27h: the values from the first of these beams to the second one, B7h.
     Range(u16, u16),
-    /// 28h: means of this number of scans, for the beams from one to another, BFh.
+    /// 28h: means of this number of scans, from the first of these beams to the second one, BFh.
     MeanRange(u8, u16, u16),
-    /// 29h: the values from one beam to another, with the states of the fields, BEh.
+    /// 29h: the values from the first of these beams to the second one, with the states of the fields, BEh.
     Fields(u16, u16),
     /// 2Ah: every revolution of the mirror as a separate scan, B0h with the partial bit.
     Partial,
-    /// 2Bh: range and reflectivity of up to five ranges of beams, F5h.
+    /// 2Bh: range and reflectivity of each beam in up to five intervals of beams, F5h.
     Reflectivity(Vec<(u16, u16)>),
 }
 
@@ -43,9 +44,9 @@ pub(crate) struct MeasuredValues<'a> {
     pub(crate) at_ns: Nanos,
     pub(crate) address: u8,
     pub(crate) status: u8,
-    /// Number of the telegram; `None` if real-time indices are off.
+    /// Count of the telegrams since power-on, modulo 256; `None` if real-time indices are off.
     pub(crate) index: Option<u8>,
-    /// Number of the partial scan.
+    /// Number of partial scans since the last change of the operating mode.
     pub(crate) revolution: u64,
 }
 
@@ -70,8 +71,8 @@ impl OperatingMode {
         !matches!(self, OperatingMode::Installation | OperatingMode::OnRequest)
     }
 
-    /// Returns the mode that `request` selects, once or from now on, if a scanner in `variant` supports it. It is never
-    /// the installation mode, which needs a password.
+    /// Returns the mode that `request` selects for one telegram or for all telegrams from now on. Returns `None` if a
+    /// scanner in `variant` does not support the mode, and for the installation mode, which needs a password.
     pub(crate) fn of_request(request: Request, variant: Variant) -> Option<OperatingMode> {
         let operating = match request {
             Request::Stream | Request::Values(1) => OperatingMode::All,
@@ -107,8 +108,8 @@ impl OperatingMode {
             OperatingMode::Reflectivity(ranges) => {
                 let pairs: usize =
                     ranges.iter().map(|(first, last)| usize::from(last.abs_diff(*first)) + 1).sum();
-                // Maximum of LENGTH, which is 808, minus the command, the number of ranges, their headers, and the
-                // status.
+                // The length field is at most 808. Command, number of ranges and status take 4 bytes of it, and each
+                // range has a header of 6 bytes.
                 let room = 6 * ranges.len() + 4 * pairs <= 804;
                 room && ranges.iter().all(|&(first, last)| within(first, last))
             }
@@ -127,14 +128,15 @@ impl OperatingMode {
         }
     }
 
-    /// Returns the time from one telegram of `len` bytes to the next at `rate`. It is the duration of the smallest
-    /// number of whole scans in which the line can carry the telegram (Telegram listing, table 10-17).
+    /// Returns the time from the start of one telegram of `len` bytes to the start of the next telegram, at `rate` bits
+    /// per second. The result is the duration of the smallest number of whole scans in which the line can carry the
+    /// telegram (Telegram listing, table 10-17).
     pub(crate) fn period(&self, variant: Variant, len: usize, rate: u32) -> Nanos {
         let scan = self.revolutions(variant) * MIRROR_PERIOD;
         scan * line_time(len, rate).div_ceil(scan).max(1)
     }
 
-    /// Returns the telegram with `values`; `None` in a mode that sends none.
+    /// Returns the telegram with `values`, or `None` in a mode that sends no telegrams.
     pub(crate) fn telegram(&self, values: &MeasuredValues<'_>) -> Option<Vec<u8>> {
         let count_word = |words: &[u16]| words.len() as u16 | u16::from(values.unit.code()) << 14;
         let begin = |command| Writer::new(values.address | REPLY, command);
@@ -185,8 +187,8 @@ impl OperatingMode {
 }
 
 impl MeasuredValues<'_> {
-    /// Returns the telegram B0h with `words`: a whole scan, or a partial scan whose beams are this number of quarters
-    /// of a degree after whole degrees.
+    /// Returns the telegram B0h with `words`. If `partial` is `None`, they are a whole scan. Otherwise they are a
+    /// partial scan, whose beams are this number of quarters of a degree after whole degrees.
     fn scan(&self, partial: Option<u8>, words: &[u16]) -> Vec<u8> {
         let frame = ScanFrame { unit: self.unit, partial, indices: self.indices() };
         encode_with(self.address, frame, words, self.status).bytes().to_vec()
@@ -201,8 +203,8 @@ impl MeasuredValues<'_> {
         self.room.scan(self.variant, self.unit, self.mode, self.at_ns)
     }
 
-    /// Returns ranges without levels, each the mean of `shots` scans. A beam without a range in at least a fifth of the
-    /// scans has the code for overflow.
+    /// Returns the mean range of each beam in `shots` scans, without levels. If a beam has no range in a fifth of the
+    /// scans or more, its value is the code for overflow.
     fn means(&self, shots: u8) -> Vec<u16> {
         let (greatest, scan) = (self.mode.max_value(), self.variant.revolutions() * MIRROR_PERIOD);
         let mut sums = vec![(0u32, 0u32); self.variant.beams()];
@@ -250,8 +252,8 @@ pub enum ScanSource {
 }
 
 impl ScanSource {
-    /// Returns the next telegram of a scanner in `operating`, with the values that `measure` takes from the room.
-    /// Returns `None` at the end of a recording, and in a mode that sends nothing.
+    /// Returns the next telegram of a scanner in `operating`: the next recorded telegram, or a telegram with the values
+    /// that `measure` takes from the room. Returns `None` at the end of a recording, and in a mode that sends nothing.
     pub(crate) fn telegram<'a>(
         &'a mut self,
         operating: &OperatingMode,
@@ -263,7 +265,7 @@ impl ScanSource {
         }
     }
 
-    /// Returns the only supported variant, or `None` if all are supported.
+    /// Returns the only supported variant, or `None` if all variants are supported.
     pub(crate) fn variant(&self) -> Option<Variant> {
         match self {
             ScanSource::Room(_) => None,
@@ -271,7 +273,8 @@ impl ScanSource {
         }
     }
 
-    /// Returns whether `operating` is supported: a recording streams whole scans, each of them once.
+    /// Returns whether `operating` is supported. A recording supports only a stream of whole scans, and the modes that
+    /// do not stream.
     pub(crate) fn supports(&self, operating: &OperatingMode) -> bool {
         matches!(self, ScanSource::Room(_)) || *operating == OperatingMode::All || !operating.streams()
     }

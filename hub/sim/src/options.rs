@@ -42,17 +42,18 @@ pub struct SimulateOptions {
     pub indices: bool,
     /// Whether the configuration has 32 bytes, as with older firmware.
     pub short_configuration: bool,
-    /// Surroundings of the scanners, unless they replay.
+    /// Surroundings of the scanners. A scanner that replays a recording does not use them.
     pub world: World,
     /// Recording to send instead of scans of a world.
     pub replay: Option<PathBuf>,
-    /// Sensor of the recording that each port plays: one for all ports, or none if the recording has only one.
+    /// Sensors of the recording that the ports play: one sensor for all ports, or one for each port. It may be empty if
+    /// the recording has only one sensor.
     pub sensors: Vec<String>,
-    /// Whether the recording starts again at its end.
+    /// Whether the recording restarts at its end.
     pub looped: bool,
     /// Speed of the scanner's time relative to the clock, including the bit time: 0.01 to 100.
     pub speed: f64,
-    /// Seed of worlds, delays and faults. For delays and faults, each port adds its number. For worlds, see
+    /// Seed of worlds, delays and faults. For delays and faults, the index of the port is added. For worlds, see
     /// [`Room::of_port`](crate::room::Room::of_port).
     pub seed: u64,
     /// Faults of the line.
@@ -74,7 +75,7 @@ pub struct SimulateOptions {
     pub chunk: ChunkSize,
     /// Whether the scanners wait while the host's buffer is full. Otherwise bytes are lost, as on a real line.
     pub lossless: bool,
-    /// Scanner of another family; `None` is an LMS. With a scanner, options that only an LMS has must have their
+    /// Scanner of another family; `None` means an LMS. For another family, options that only an LMS has must have their
     /// defaults.
     pub scanner: Option<Scanner>,
 }
@@ -88,7 +89,8 @@ pub enum Scanner {
     Rplidar {
         /// The model.
         model: rplidar::Model,
-        /// Number of the mode that the scanner recommends. If an earlier host left a stream on, it has this mode.
+        /// Index of the mode that the scanner recommends. If an earlier host has started a stream, the stream is in
+        /// this mode, too.
         mode: usize,
     },
 }
@@ -139,11 +141,11 @@ impl Default for SimulateOptions {
 }
 
 impl SimulateOptions {
-    /// Checks that the values fit together.
+    /// Checks that every value is in its range, and that no two options contradict each other.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`] if they do not.
+    /// Returns [`Kind::Configuration`] if a value is out of range, or if options contradict each other.
     pub(crate) fn check(&self) -> Result<(), Failure> {
         let invalid = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
         if self.ports.is_empty() {
@@ -283,7 +285,7 @@ pub fn parse_family(
     }
 }
 
-/// Parses `lms200` and the other types that support the values of [`Variant`].
+/// Parses a type of LMS that has a factory variant, such as `lms200`.
 pub fn parse_type(text: &str) -> Result<LmsModel, Failure> {
     let families = LmsModel::ALL.into_iter().filter(|family| family.factory_variant().is_some());
     one_of("type", text, &families.map(|family| (family.name(), family)).collect::<Vec<_>>())
@@ -342,7 +344,7 @@ impl FromStr for ChunkSize {
     }
 }
 
-/// Parses a variant: degrees, and degrees between beams, such as `180/0.5`.
+/// Parses a variant: the angle of the scan and the angle between beams, both in degrees, such as `180/0.5`.
 pub fn parse_variant(text: &str) -> Result<Variant, Failure> {
     let names = ["180/1", "180/0.5", "100/1", "100/0.5", "100/0.25"];
     let named: Vec<(&str, Variant)> = names.into_iter().zip(Variant::ALL).collect();
@@ -380,9 +382,9 @@ fn one_of<T: Clone>(what: &str, text: &str, known: &[(&str, T)]) -> Result<T, Fa
     })
 }
 
-/// Family of the scanners, unless an option names another one.
+/// Family of the scanners, unless an option names another family.
 pub const DEFAULT_FAMILY: &str = "lms";
-/// Type of the scanners of this family, unless an option names another one.
+/// Type of the scanners of family `lms`, unless an option names another type.
 pub const DEFAULT_TYPE: &str = "lms200";
 /// Measuring modes whose values contain a range (Telegram listing, 77h block D).
 const MODES: [u8; 8] = [0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F];

@@ -1,13 +1,13 @@
 //! The port that a host opens to reach a simulated scanner: a pty with a symlink as its name, or a TCP server that
-//! passes on bytes like a serial server in raw mode. A port that is dropped disappears like an adapter that was
-//! unplugged. The clock is here too: no other file of this crate reads the kernel's clock.
+//! passes on bytes like a serial server in raw mode. When a port is dropped, it disappears for the host, as if an
+//! adapter was unplugged. This file also reads the kernel's clock, which no other file of this crate does.
 //!
 //! A pty differs from a serial line in three ways:
 //!
 //! - It keeps bytes that no host reads. The simulator writes nothing while the host's side is closed, and discards
 //!   unread bytes when it closes.
 //! - Its exclusive mode survives the last close, so the simulator clears it.
-//! - It does not report that it is closed before the first open, so the simulator opens and closes it once.
+//! - Before the first open, it does not report that it is closed, so the simulator opens and closes it once.
 
 use std::ffi::OsStr;
 use std::fs::{self, Metadata};
@@ -28,7 +28,7 @@ use scanhub_schema::{Failure, Kind, Nanos};
 
 /// The host's end of a line.
 pub(crate) enum SimPort {
-    /// The symlink is dropped before the pty.
+    /// A pty and its symlink. The symlink is dropped before the pty.
     Pty {
         _symlink: PtySymlink,
         pty: Pty,
@@ -46,7 +46,8 @@ impl SimPort {
         Ok(SimPort::Pty { _symlink: PtySymlink::new(port, pty.name())?, pty })
     }
 
-    /// Returns the name under which a host finds the port that was requested as `port`.
+    /// Returns the name under which a host finds the port that [`SimPort::new`] created for `port`. It differs from
+    /// `port` if a server has selected a free TCP port.
     pub(crate) fn found(&self, port: &Path) -> PathBuf {
         match self {
             SimPort::Pty { .. } => port.to_owned(),
@@ -62,7 +63,8 @@ impl SimPort {
         }
     }
 
-    /// Returns whether a host has the port open. After a host has closed a pty, its unread bytes are discarded.
+    /// Returns whether a host has the port open. `was_open` is the result of the last call. If a host has closed a pty
+    /// since then, the bytes that the host did not read are discarded.
     pub(crate) fn is_open(&mut self, was_open: bool) -> bool {
         match self {
             SimPort::Pty { pty, .. } => {
@@ -116,7 +118,7 @@ pub(crate) fn server(port: &Path) -> Option<&str> {
     port.to_str()?.strip_prefix("tcp:")
 }
 
-/// A TCP server and its host. It accepts one host at a time, and closes the connections of others.
+/// A TCP server, and the connection of a host. The server accepts one host at a time, and closes other connections.
 #[derive(Debug)]
 pub(crate) struct Server {
     listener: TcpListener,
@@ -151,7 +153,7 @@ impl Server {
         self.address
     }
 
-    /// Returns whether a host is connected. Accepts one host, and closes the connections of others.
+    /// Returns whether a host is connected. Accepts a host if none is connected, and closes other connections.
     pub(crate) fn is_open(&mut self) -> bool {
         while let Ok((stream, _)) = self.listener.accept() {
             let is_set = stream.set_nonblocking(true).and_then(|()| stream.set_nodelay(true));
@@ -218,14 +220,14 @@ pub struct Pty {
 /// Reason why a wait ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum WaitResult {
-    /// Time, bytes, or the host's side was closed.
+    /// The deadline has passed, bytes have arrived, or the host has closed its side.
     Line,
     /// A stop descriptor is readable.
     Stop,
 }
 
 impl Pty {
-    /// Creates a pty in raw mode, whose host's side is closed.
+    /// Creates a pty in raw mode. The host's side is closed.
     ///
     /// # Errors
     ///
@@ -259,7 +261,7 @@ impl Pty {
         &self.name
     }
 
-    /// Returns whether a host has its side open.
+    /// Returns whether a host has its side of the pty open.
     pub fn is_open(&self) -> bool {
         let mut fds = [PollFd::new(&self.master, PollFlags::IN)];
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };
@@ -314,7 +316,7 @@ impl Pty {
     }
 }
 
-/// Waits for bytes at `line`, for `deadline_ns` of the clock, or for one of the `stops`.
+/// Waits until `line` has bytes, until the time `deadline_ns`, or until one of the descriptors `stops` is readable.
 pub(crate) fn wait(
     stops: [BorrowedFd<'_>; 2],
     line: Option<BorrowedFd<'_>>,
@@ -386,9 +388,9 @@ impl Drop for PtySymlink {
     }
 }
 
-/// Returns whether a killed simulator left the symlink at `path`. A terminal that is older than the symlink still
-/// belongs to the simulator that created the symlink. A terminal that is younger only has the same number as the
-/// earlier one.
+/// Returns whether a killed simulator left the symlink at `path`. If the terminal is older than the symlink, it still
+/// belongs to the simulator that created the symlink. If the terminal is younger, the kernel has created it later with
+/// the number of a terminal that no longer exists.
 fn is_stale(path: &Path) -> bool {
     let (Ok(terminal), Ok(link)) = (fs::metadata(path), fs::symlink_metadata(path)) else { return true };
     let since = |metadata: &Metadata| (metadata.ctime(), metadata.ctime_nsec());
@@ -436,7 +438,8 @@ mod tests {
         assert_eq!(link(), one.name(), "it was taken away from who has it");
         drop(place);
 
-        // The simulator was killed, and a younger terminal has its number. Its change time is later.
+        // The simulator was killed, and a younger terminal has the number of its terminal. The change time of the
+        // younger terminal is later than that of the symlink.
         std::os::unix::fs::symlink(one.name(), &path).unwrap();
         let since = |metadata: Metadata| (metadata.ctime(), metadata.ctime_nsec());
         let made = since(fs::symlink_metadata(&path).unwrap());

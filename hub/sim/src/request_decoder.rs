@@ -1,14 +1,14 @@
 //! Decoder of the requests of a host to an LMS. If a host writes several bytes at once, a real UART sends them one
 //! after the other, but a pty delivers them at once. The decoder therefore handles each byte at the time at which a
-//! real line would have carried it. It drops a request if a gap between two bytes is too long. A strict scanner also
-//! drops a request if a gap is too short.
+//! real line would have carried the byte. The decoder drops a request if a gap between two bytes is too long. For a
+//! strict scanner, it also drops a request if a gap is too short.
 
 use std::fmt;
 
 use scanhub_drivers::lms::telegram::{FRAME_LEN, MAX_LENGTH, STX};
 use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
-/// Time at which the host wrote a byte, as a range.
+/// Time at which the host wrote a byte. It is a range, because the simulator reads the byte later.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Arrival {
     /// Earliest possible time.
@@ -62,9 +62,10 @@ pub(crate) struct DecodedRequest {
 #[derive(Debug)]
 pub(crate) struct RequestDecoder {
     bytes: Vec<u8>,
-    /// Time at which the line carried the last byte, if every gap before it was valid; `None` before the first byte.
+    /// Time at which the line carried the last byte, assuming that every gap before it was valid; `None` before the
+    /// first byte.
     last: Option<Arrival>,
-    /// Whether a gap of the request was too short.
+    /// Whether a gap in the current request was too short.
     is_broken: bool,
     /// Whether the scanner is strict, so that the host must leave the minimum gap between two bytes.
     pub(crate) is_strict: bool,
@@ -83,8 +84,8 @@ impl RequestDecoder {
         self.dropped.take()
     }
 
-    /// Adds a byte on a line at `baud` bits per second. Returns the request that it completes, unless its gaps were
-    /// certainly wrong.
+    /// Adds a byte on a line at `baud` bits per second. Returns the request that the byte completes. Drops the request
+    /// only if a gap was wrong for all possible times of the bytes.
     pub(crate) fn receive(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<DecodedRequest> {
         let possible = self.narrow_arrival(arrival, baud);
         self.last = Some(possible);
@@ -116,8 +117,8 @@ impl RequestDecoder {
         let Some(last) = self.last else { return arrival };
         let scaled = |span: Nanos| (span as f64 * self.speed) as Nanos;
         let byte_ns = scaled(line_time(1, baud));
-        // The line carries bytes one after the other even if they were read at once, so each one leaves less time for
-        // the next.
+        // Even if the simulator read several bytes at once, the line carried them one after the other. The earliest
+        // time of a byte is therefore after the earliest time of the byte before.
         let min_gap = if self.is_strict { scaled(MIN_GAP) } else { 0 };
         let earliest = last.not_before + byte_ns + min_gap;
         let latest = last.not_after + byte_ns + scaled(MAX_GAP);
@@ -133,7 +134,8 @@ impl RequestDecoder {
             self.is_broken = true;
             return arrival;
         }
-        // Otherwise the UART sends it after the byte before it.
+        // In a request to a strict scanner, the host times every byte itself. Otherwise the host's UART sends the byte
+        // when it has sent the byte before.
         let uart_time = if is_host_s { 0 } else { last.not_after + byte_ns };
         Arrival {
             not_before: arrival.not_before.max(earliest),
@@ -157,7 +159,8 @@ mod tests {
     use super::*;
     use scanhub_drivers::lms::command::Request;
 
-    /// Returns the time at which a status request is received whose bytes have `gap` of idle time between them.
+    /// Sends a status request with the idle time `gap` between its bytes. The time of each byte is known to `width`.
+    /// Returns the time at which the decoder receives the request.
     fn accepted_at(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> Option<Nanos> {
         let request = Request::Status.encode(0);
         let step = line_time(1, 9_600) + gap;
@@ -174,7 +177,7 @@ mod tests {
         accepted_at(decoder, start, gap, width).is_some()
     }
 
-    /// Returns the time at which a status request is received that is written at once at `start`.
+    /// Writes all bytes of a status request at `start`. Returns the time at which the decoder receives the request.
     fn written_at_once(decoder: &mut RequestDecoder, start: Nanos, baud: u32) -> Option<Nanos> {
         let request = Request::Status.encode(0);
         let decoded =
@@ -188,7 +191,7 @@ mod tests {
         for (round, baud) in [9_600, 19_200, 38_400, 500_000].repeat(25).into_iter().enumerate() {
             let start = (round as Nanos + 1) * 1_000 * MILLIS;
             assert_eq!(written_at_once(&mut decoder, start, baud), Some(start + 6 * line_time(1, baud)));
-            // Some drivers leave 55 us from one byte to the next at any rate.
+            // Some hosts write one byte every 55 us at any rate, although the line needs more time for a byte.
             let request = Request::Stop.encode(0);
             let bytes = request.bytes().iter().enumerate();
             let at = |i: usize| Arrival::at(start + 500 * MILLIS + i as Nanos * 55 * MICROS);
@@ -215,7 +218,7 @@ mod tests {
             (54 * MICROS, 0, true),
             (6 * MILLIS, 0, true),
             (6 * MILLIS + MICROS, 0, false),
-            // Bytes that may have arrived long before they were read prove nothing.
+            // If the times of the bytes are uncertain, the gap may have been valid.
             (6_100 * MICROS, MILLIS, true),
         ] {
             let mut decoder = RequestDecoder::new(1.0, false);
@@ -231,7 +234,7 @@ mod tests {
             );
             assert_eq!(decoder.take_dropped(), None);
         }
-        // Bytes that were written at once need their time on the line, and the gap begins after it.
+        // The line needs time to carry bytes that were written at once. The gap begins when it has carried them.
         let request = Request::Status.encode(0);
         let (head, tail) = request.bytes().split_at(4);
         let byte_ns = line_time(1, 9_600);
@@ -253,7 +256,7 @@ mod tests {
             (0, 0, false),
             (6 * MILLIS, 0, true),
             (6 * MILLIS + MICROS, 0, false),
-            // Bytes that may have arrived long before they were read prove nothing. But seven bytes within 2 ms were
+            // If the times of the bytes are uncertain, the gaps may have been valid. But seven bytes within 2 ms were
             // too fast for 9600 in any case.
             (40 * MICROS, 50 * MICROS, true),
             (0, 100 * MICROS, false),
@@ -314,7 +317,7 @@ mod tests {
                 assert_eq!(decoder.receive(byte, Arrival::at(0), 9_600), None);
             }
             assert!(is_accepted(&mut decoder, 100 * MILLIS, 100 * MICROS, 0));
-            // An impossible length is dropped at once.
+            // The decoder drops a request with an impossible length at once.
             for (i, byte) in [STX, 0, 0xFF, 0xFF].into_iter().enumerate() {
                 assert_eq!(
                     decoder.receive(byte, Arrival::at(200 * MILLIS + i as Nanos * 2 * MILLIS), 9_600),

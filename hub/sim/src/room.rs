@@ -1,6 +1,6 @@
-//! Measurements of an LMS 2xx in a world, with the true target of each beam. They are a pure function of world, seed
-//! and time. [`PrecomputedScans`] are measured once and then repeated, for simulations that run through hours in
-//! seconds: measuring a scan takes far longer than sending it.
+//! Measurements of an LMS 2xx in a world, with the true target of each beam. The measurements are a pure function of
+//! world, seed and time. [`PrecomputedScans`] are measured once and then repeated. They are for simulations that run
+//! through hours in seconds, because measuring a scan takes far longer than sending it.
 
 use std::sync::Arc;
 
@@ -20,27 +20,27 @@ pub struct Room {
     pub(crate) view: RoomView,
 }
 
-/// Rendering method of a room.
+/// Origin of the scans of a room.
 #[derive(Clone, Debug)]
 pub(crate) enum RoomView {
-    /// No return anywhere.
+    /// No beam has a return.
     Empty,
-    /// All values are equal.
+    /// All beams have this value.
     Value(u16),
     Random,
     Scene(Box<WorldView>),
-    /// Measured in advance.
+    /// Scans that were measured in advance.
     PrecomputedScans(Arc<PrecomputedScans>, Changes),
 }
 
 impl Room {
-    /// Creates the room of the first sensor in `world`. `seed` draws the noise and the paths of people.
+    /// Creates the room of the first sensor in `world`. Noise and paths of people are drawn from `seed`.
     pub fn new(world: &World, seed: u64) -> Self {
         Room::of_port(world, seed, 0)
     }
 
-    /// Creates the room of the sensor at port number `port`, counted from 0. The first ports belong to the sensors of
-    /// the world. The next port belongs to a second copy of the world, with the next seed.
+    /// Creates the room of the sensor at the port with index `port`. If there are more ports than sensors in the world,
+    /// the next ports belong to the sensors of a second copy of the world, with the next seed.
     pub fn of_port(world: &World, seed: u64, port: u64) -> Self {
         let sensors = world.sensors() as u64;
         let (seed, sensor) = (seed.wrapping_add(port / sensors), port % sensors);
@@ -58,8 +58,9 @@ impl Room {
         Room { seed: 0, view: RoomView::PrecomputedScans(series, changes) }
     }
 
-    /// Returns the values of the scan whose last revolution of the mirror ended at `end_ns`: one for each beam of
-    /// `variant`, in `unit`, split according to `mode`. The same arguments give the same values.
+    /// Returns the values of the scan whose last revolution of the mirror ended at `end_ns`: one value for each beam of
+    /// `variant`. Each value has a range in `unit`, and the other bits that `mode` defines. The same arguments give the
+    /// same values.
     pub fn scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         match &self.view {
             RoomView::PrecomputedScans(series, changes) => {
@@ -74,8 +75,8 @@ impl Room {
         self.measure(angles_mdeg(variant), variant.revolutions(), unit, mode, end_ns, &|_| Vec::new())
     }
 
-    /// Returns the values of the partial scan whose revolution of the mirror ended at `end_ns`: 181 beams on whole
-    /// degrees, or 180 that are `quarter` quarters of a degree after them.
+    /// Returns the values of the partial scan whose revolution of the mirror ended at `end_ns`. If `quarter` is 0, it
+    /// has 181 beams on whole degrees. Otherwise it has 180 beams, `quarter` quarters of a degree after whole degrees.
     pub(crate) fn partial_scan(&self, quarter: u8, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         let beams = if quarter > 0 { 180 } else { 181 };
         let angles_mdeg = (0..beams).map(|beam| 1_000 * beam + 250 * i32::from(quarter) - 90_000).collect();
@@ -83,8 +84,8 @@ impl Room {
     }
 
     /// Returns the values of [`Room::scan`] with additional shapes in view, such as the legs of people and the doors in
-    /// a simulation of the caller. `shapes` returns the shapes at a time, in the frame of the world. A world that is
-    /// not a scene, and a tilted sensor, do not show them.
+    /// a simulation of the caller. `shapes` returns the shapes at a time, in the frame of the world. If the world is
+    /// not a scene, or if the sensor is tilted, the additional shapes are ignored.
     pub fn scan_with(
         &self,
         shapes: &dyn Fn(Nanos) -> Vec<Shape>,
@@ -177,7 +178,7 @@ fn measure(
 }
 
 /// Returns the measurements of a sensor whose plane moves during the scan. Each beam is measured at its own time
-/// according to [`ScanHead::lms`]. Without the layer `comb`, all are measured at the end.
+/// according to [`ScanHead::lms`]. Without the layer `comb`, all beams are measured at the end of the scan.
 fn measure_tilted(
     world: &WorldView,
     angles_mdeg: &[i32],
@@ -257,13 +258,13 @@ fn truth(word: u16, target: BeamTarget, mode: Mode) -> BeamTarget {
     }
 }
 
-/// Returns the range value of `units` (any number), or the code for a range beyond the maximum.
+/// Returns the value for a range of `units`, or the code for a range beyond the maximum. A negative range becomes 0.
 fn range_value(units: f64, mode: Mode) -> u16 {
     let beyond = mode.max_value() - scanhub_recording::BEYOND_RANGE_OFFSET;
     (units.round().max(0.0) as u16).min(beyond)
 }
 
-/// Returns the level of a reflector.
+/// Returns the reflector level of a beam; 0 if the beam does not hit a reflector.
 fn level(echo: &Echo, mode: Mode, rng: &BeamRng) -> u16 {
     if echo.reflector_share == 0.0 {
         return 0;
@@ -285,8 +286,8 @@ pub struct LabeledScan {
 
 /// Target that the whole spot of a beam hits.
 ///
-/// An object that has appeared, disappeared or moved has the time of this change. The user of this type decides how
-/// long afterwards it counts as foreground.
+/// A target that has appeared, disappeared or moved has the time of this change. The user of this type decides for how
+/// long after this time the target counts as foreground.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BeamTarget {
     /// A surface of the surroundings at the start of the world, or another surface that is not nearer than the previous
@@ -306,8 +307,8 @@ pub enum BeamTarget {
         /// Time at which the object was put down or came to rest. While the object moves, it is the time of the scan.
         since_ns: Nanos,
     },
-    /// A person or an object as in [`BeamTarget::Box`], and another surface next to it. The beam may report either of
-    /// them. The edges of a box remain this target.
+    /// A person or an object as in [`BeamTarget::Box`], together with another surface next to it. The beam may report
+    /// either of the two. Beams at the edges of a box have this target for as long as the box exists.
     Grazed,
     /// Any target, if the value is a code instead of a range.
     Invalid,
@@ -316,21 +317,22 @@ pub enum BeamTarget {
 /// True position of a reflector.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mark {
-    /// Angle of its middle in degrees, counterclockwise, 0 ahead of the sensor.
+    /// Angle of the reflector's middle in degrees, counterclockwise, 0 ahead of the sensor.
     pub angle_deg: f64,
-    /// Range of its middle in millimeters.
+    /// Range of the reflector's middle in millimeters.
     pub range_mm: f64,
 }
 
-/// Several scans of each of a few rooms, with changes between the rooms at fixed times. No two scans within
-/// [`PrecomputedScans::COUNT_CYCLE`] revolutions of the mirror are equal, because the first beam counts them.
+/// Several scans of each of a few rooms. A sensor changes between the rooms at fixed times ([`Changes`]). No two scans
+/// within [`PrecomputedScans::COUNT_CYCLE`] revolutions of the mirror are equal, because the value of the first beam
+/// counts the revolutions.
 #[derive(Clone, Debug)]
 pub struct PrecomputedScans {
     settings: (Variant, Unit, Mode),
     rooms: Vec<(Room, Vec<Vec<u16>>)>,
 }
 
-/// The rooms of [`PrecomputedScans`] that one sensor sees, with the times of the changes.
+/// The sequence of rooms that one sensor of [`PrecomputedScans`] sees: the time of each change, and the room after it.
 #[derive(Clone, Debug, Default)]
 pub struct Changes(Vec<(Nanos, usize)>);
 
@@ -348,7 +350,7 @@ impl PrecomputedScans {
         PrecomputedScans { settings: (variant, unit, mode), rooms: rooms.into_iter().map(measured).collect() }
     }
 
-    /// Returns the scan that ended at `end_ns`, of the room that `changes` select at this time.
+    /// Returns the scan that ended at `end_ns` in the room that `changes` select for this time.
     pub(crate) fn scan(
         &self,
         changes: &Changes,
@@ -366,7 +368,7 @@ impl PrecomputedScans {
         words
     }
 
-    /// Returns the room that `changes` select at `time_ns`.
+    /// Returns the room that `changes` select for `time_ns`.
     pub(crate) fn room(&self, changes: &Changes, time_ns: Nanos) -> &Room {
         &self.at(changes, time_ns).0
     }
@@ -376,7 +378,7 @@ impl PrecomputedScans {
         self.rooms.iter().map(|(room, _)| room)
     }
 
-    /// Returns the index of the room that `changes` select at `time_ns`.
+    /// Returns the index of the room that `changes` select for `time_ns`.
     pub(crate) fn number(&self, changes: &Changes, time_ns: Nanos) -> usize {
         changes.at(time_ns).min(self.rooms.len() - 1)
     }
@@ -387,8 +389,8 @@ impl PrecomputedScans {
 }
 
 impl Changes {
-    /// Creates changes from times and indices of rooms, in the order of time. Before the first time, the sensor is in
-    /// the first room.
+    /// Creates changes from pairs of a time and the index of the room from this time on, in the order of time. Before
+    /// the first time, the sensor is in the first room.
     pub fn new(changes: Vec<(Nanos, usize)>) -> Changes {
         Changes(changes)
     }
@@ -401,9 +403,9 @@ impl Changes {
 
 /// Standard deviation of a reflector level. A recording of a standing sensor shows no deviation at all.
 const LEVEL_DEVIATION: f64 = 0.1;
-/// Time between the scans that are measured in advance. The choice of this time has no influence.
+/// Period of the scans that are measured in advance. Any other period would do, too.
 const PERIOD: Nanos = 26_640_000;
-/// Start of the count of the first beam, in the unit of the range. With the count, it fits into 13 bits, below all
+/// Value of the first beam at count 0. The sum of this value and the highest count fits into 13 bits, and is below all
 /// codes.
 const COUNT_START: u16 = 2_000;
 

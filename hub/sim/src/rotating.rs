@@ -1,5 +1,5 @@
-//! Parts of all simulated rotating scanners: the clockwise rotation of the head, and the measurement of a room beam by
-//! beam, each at its own time and angle.
+//! Parts that all simulated rotating scanners share: the clockwise rotation of the head, and the measurement of a room
+//! beam by beam, each beam at its own time and angle.
 
 use std::f64::consts::TAU;
 
@@ -33,7 +33,7 @@ pub struct TruePoint {
     pub at_ns: Nanos,
     /// Clockwise angle from the head's zero, 0 to 360 degrees.
     pub clockwise_deg: f64,
-    /// Distance of the surface in millimeters; `None` if there is none.
+    /// Range of the surface in millimeters; `None` if there is no surface.
     pub range_mm: Option<f64>,
 }
 
@@ -96,9 +96,9 @@ pub(crate) fn counterclockwise_deg(clockwise_deg: f64) -> f64 {
 #[derive(Clone, Debug)]
 pub(crate) struct BeamSampler {
     room: Room,
-    /// View of the static surroundings of the last beam. Each beam draws its own surroundings over it.
+    /// View of the surroundings of the last beam. The next beam replaces everything in it except the static faces.
     view: Option<View>,
-    /// Samplers of the rooms of precomputed scans.
+    /// One sampler for each room, if `room` has precomputed scans; otherwise empty.
     rooms: Vec<BeamSampler>,
 }
 
@@ -107,7 +107,7 @@ pub(crate) struct BeamSampler {
 pub(crate) struct BeamReading {
     /// Measured range in millimeters; `None` without an echo, or if the echo is too weak.
     pub(crate) range_mm: Option<f64>,
-    /// Distance of the surface without noise, in millimeters; `None` if there is none.
+    /// Range of the surface without noise, in millimeters; `None` if there is no surface.
     pub(crate) exact_mm: Option<f64>,
     /// Intensity of the echo, 0 to 255.
     pub(crate) intensity: u8,
@@ -152,7 +152,8 @@ impl BeamSampler {
         let angle_mdeg = (angle_deg * 1e3) as i32;
         let echo = echo(view, angle_mdeg, world.noise.spot, &rng);
         let (ray_mm, exact_mm) = view.exact(angle_deg);
-        // Beams lie between the rays. The range to a single surface is corrected to the point where the beam meets it.
+        // The beam lies between two rays. If it hits a single surface, correct the range of the ray to the point at
+        // which the beam hits this surface.
         let is_one = echo.range_mm == ray_mm;
         let off_mm = exact_mm.filter(|_| is_one).map_or(0.0, |exact_mm| exact_mm - ray_mm);
         let time_s = at_ns as f64 / 1e9;
@@ -171,7 +172,7 @@ impl BeamSampler {
 
 /// Period of the variation of the speed, in seconds.
 const SPEED_VARIATION_PERIOD_S: f64 = 7.3;
-/// Intensity of a plain surface nearby. The manual of the LD06 has 228 to 233 at 0.2 m.
+/// Intensity of a plain surface at a short range. According to the manual of the LD06, it is 228 to 233 at 0.2 m.
 const PLAIN_INTENSITY: f64 = 230.0;
 /// Intensity of a reflector.
 const REFLECTOR_INTENSITY: f64 = 255.0;

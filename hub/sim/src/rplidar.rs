@@ -2,12 +2,13 @@
 //! measures one point after the other, each at its own time. It sends the points in packets of the requested mode.
 //!
 //! In a scanner that triangulates, the laser is next to the lens. The angle of a point therefore lags behind the angle
-//! of the head by a shift that depends on the range. Points at the edge of a near object are out of angular order. The
-//! vendor's decoder of type 0x84 has a formula for the shift. The simulator uses this formula for all modes of a
-//! scanner that triangulates. At an edge where the formula has no solution, there is no return.
+//! of the head by a shift that depends on the range, and points at the edge of a near object are out of angular order.
+//! The vendor's decoder of packets of type 0x84 has a formula for the shift. The simulator uses this formula for all
+//! modes of a scanner that triangulates. If the formula has no solution, which happens at an edge, the point has no
+//! return.
 //!
 //! The sources of this behavior are the vendor's protocol manual and driver, and published measurements of a real A1M8.
-//! The simulator does not reply to requests that they do not describe.
+//! The simulator does not reply to a request that none of these sources describes.
 
 mod protocol;
 
@@ -30,36 +31,36 @@ pub struct RplidarSettings {
     pub model: Model,
     /// Number that the scanner reports as its model. The default is the number of `model`.
     pub id: u8,
-    /// Number of the mode that the scanner recommends. The default is the mode that `model` recommends.
+    /// Index of the mode that the scanner recommends. The default is the mode that `model` recommends.
     pub typical: usize,
     /// Mean revolutions per second. The default depends on `model`.
     pub revolutions_per_second: f64,
-    /// Share by which the speed varies.
+    /// Maximum deviation of the speed from its mean, as a share of the mean.
     pub speed_variation: f64,
     /// State at time 0.
     pub start: RplidarStart,
     /// Time from power-on to the boot message.
     pub boot_ns: Nanos,
-    /// Health status and code that the scanner reports. A status of 2 is an error, in which it does not measure.
+    /// Health status and code that the scanner reports. With status 2, an error, the scanner does not measure.
     pub health: (u8, u16),
-    /// Whether the status remains after a RESET.
+    /// Whether the health status remains after a RESET.
     pub keeps_health: bool,
     /// Deviations from the manual. Deviations that only an LMS has are ignored.
     pub quirks: ProtocolQuirks,
-    /// Faults of the scanner: times at which its head is blocked.
+    /// Faults of the simulation. The scanner uses only those that block its head.
     pub faults: Faults,
     /// Number of bytes that the host's hardware delivers at once.
     pub chunk: ChunkSize,
-    /// Seed of the speed, the serial number, the deviations and the faults.
+    /// Seed of the variation of the speed, the serial number, the deviations and the faults.
     pub seed: u64,
 }
 
 /// State of a scanner at time 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RplidarStart {
-    /// The scanner waits for requests. Its motor is on or off as after power-on, and at full speed if it is on.
+    /// The scanner waits for requests. Its motor is on or off as after power-on. If it is on, it is at full speed.
     Idle,
-    /// The scanner streams in its typical mode, because an earlier host left the stream on.
+    /// The scanner streams in the mode that it recommends, because an earlier host has not stopped the stream.
     Streaming,
     /// The power is switched on now.
     PowerOn,
@@ -97,12 +98,13 @@ pub struct RplidarSimulator {
     motor: Option<Motion>,
     stream: Option<Stream>,
     health: (u8, u16),
-    /// Time of the boot message; `None` after the start-up.
+    /// Time at which the scanner sends the boot message; `None` after the start-up.
     boot_at_ns: Option<Nanos>,
-    /// Time from which the scanner receives requests.
+    /// Time from which on the scanner receives requests.
     receives_from_ns: Nanos,
     stalls: FaultWindow,
-    /// Motion of the motor that resumes when the head is free again. `None` while the head is not blocked.
+    /// Motion that the motor resumes when the head is free again: `Some(None)` if the motor stays off. `None` while the
+    /// head is not blocked.
     held_motion: Option<Option<Motion>>,
     writes: u64,
 }
@@ -142,7 +144,8 @@ impl RplidarSimulator {
         simulator
     }
 
-    /// Returns point number `point` of the present stream, without noise. Returns `None` before the first point.
+    /// Returns the point with index `point` of the present stream, without noise. Returns `None` if the stream has not
+    /// had its first point yet.
     pub fn truth(&mut self, point: u64) -> Option<TruePoint> {
         let (at_ns, head_deg) = self.stream?.time_and_angle(point, self.motor)?;
         Some(self.optics.truth(at_ns, head_deg))
@@ -158,8 +161,9 @@ impl RplidarSimulator {
         Some(self.stream?.mode)
     }
 
-    /// Returns the number of packets of the present stream, including the current packet. The next packet begins with
-    /// the point after the last point of these packets. Returns `None` before the first point.
+    /// Returns the number of packets of the present stream, including the packet on the line. The next packet begins
+    /// with the point after the last point of these packets. Returns `None` if the stream has not had its first point
+    /// yet.
     pub fn sent(&self) -> Option<u64> {
         self.begin_ns()?;
         Some(self.stream?.sent())
@@ -170,8 +174,8 @@ impl RplidarSimulator {
         Some(self.motor?.rotation.revolutions_per_second)
     }
 
-    /// Changes the speed of a motor that is on, from the next packet of the stream on. The caller has to simulate the
-    /// inertia of a real head.
+    /// Changes the speed of a motor that is on. The change takes effect at the next packet of the stream. The caller
+    /// has to simulate the inertia of a real head.
     pub fn set_speed(&mut self, revolutions_per_second: f64) {
         let next = self.stream.and_then(|stream| stream.next_ns(self.motor));
         if let (Some(motor), Some(next_ns)) = (&mut self.motor, next) {
@@ -190,8 +194,8 @@ impl RplidarSimulator {
         self.stalls = FaultWindow::once(now, span);
     }
 
-    /// Changes the reported status and code. Both remain after a RESET if `stubborn` is set. A status of 2 ends a
-    /// stream.
+    /// Changes the health status and code that the scanner reports. Both remain after a RESET if `stubborn` is set. A
+    /// status of 2 ends a stream.
     pub fn set_health(&mut self, now: Nanos, health: (u8, u16), stubborn: bool) {
         (self.health, self.settings.keeps_health) = (health, stubborn);
         if health.0 == HEALTH_ERROR {
@@ -199,7 +203,7 @@ impl RplidarSimulator {
         }
     }
 
-    /// Returns the motion of a motor that starts at `now`, with this share of its usual speed.
+    /// Returns the motion of a motor that starts at `now`. Its speed is `share` of the usual speed.
     fn motion(&self, now: Nanos, share: f64) -> Motion {
         let RplidarSettings { revolutions_per_second, speed_variation: wander, seed, .. } = self.settings;
         let revolutions_per_second = revolutions_per_second * share;
@@ -207,7 +211,8 @@ impl RplidarSimulator {
         Motion { since_ns: now, steady_ns: now + SETTLE_TIME_NS, rotation }
     }
 
-    /// Changes the motion of the motor. The present stream restarts.
+    /// Changes the motion of the motor. The present stream restarts, because it waits for a steady speed, unless it
+    /// measures at any speed.
     fn set_motion(&mut self, motion: Option<Motion>) {
         self.motor = motion;
         if let Some(stream) = self.stream.filter(|stream| !stream.forced) {
@@ -227,7 +232,7 @@ impl RplidarSimulator {
         }
     }
 
-    /// Restarts the scanner. It sends the boot message after `span`. Returns whether a packet was aborted.
+    /// Restarts the scanner, which sends the boot message after `span`. Returns whether a packet was aborted.
     fn restart(&mut self, now: Nanos, span: Nanos) -> bool {
         let broken = self.tx_queue.abort(now);
         self.stream = None;
@@ -282,7 +287,7 @@ impl RplidarSimulator {
     fn handle_request(&mut self, request: Request, now: Nanos) {
         let is_motor_s = matches!(request, Request::Pwm(_) | Request::Rpm(_) | Request::Board);
         if !is_motor_s {
-            // By the manual, any other request ends a stream.
+            // By the manual, every request that is not for the motor ends a stream.
             self.end_stream(now);
         }
         let (model, typical) = (self.settings.model, self.settings.typical);
@@ -293,7 +298,7 @@ impl RplidarSimulator {
             }
             Request::Scan => self.start_mode(0, false, now),
             Request::Force => self.start_mode(0, true, now),
-            // Number 0 selects the first express mode, for hosts without support for other modes.
+            // Number 0 selects the first express mode. Hosts that support no other express mode send this number.
             Request::Express(0) => {
                 let first = model.modes().iter().position(|mode| mode.form == PacketFormat::Express);
                 self.start_mode(first.unwrap_or(1), false, now);
@@ -330,7 +335,7 @@ impl RplidarSimulator {
         }
     }
 
-    /// Starts a stream in mode `number`, if the model has this mode and the scanner is not in error.
+    /// Starts a stream in mode `number`, if the model has this mode and the health status is not an error.
     fn start_mode(&mut self, number: usize, forced: bool, now: Nanos) {
         let Some(&mode) = self.settings.model.modes().get(number) else { return };
         if self.health.0 == HEALTH_ERROR {
@@ -340,7 +345,7 @@ impl RplidarSimulator {
         self.start_stream(mode, forced, self.tx_queue.free_ns());
     }
 
-    /// Sets the speed of the motor to this share of its usual speed.
+    /// Sets the speed of the motor to `share` of its usual speed; 0 stops the motor.
     fn set_speed_share(&mut self, share: f64, now: Nanos) {
         let motion = (share > 0.0).then(|| self.motion(now, share));
         let speed = |motion: Motion| motion.rotation.revolutions_per_second;
@@ -363,7 +368,8 @@ impl Device for RplidarSimulator {
 
     fn poll_timeout(&self) -> Option<Nanos> {
         let data_ns = self.tx_queue.next_ns().or_else(|| self.stream?.due_ns(self.motor));
-        // While the head is blocked, the end of the window is the next change.
+        // While the head is blocked, the next change is the end of the block. Otherwise it is the start of the next
+        // block.
         let held_ns = self.stalls.next_ns(if self.held_motion.is_some() { 0 } else { Nanos::MAX });
         let times = [data_ns, self.boot_at_ns, Some(held_ns)];
         times.into_iter().flatten().filter(|&at| at < Nanos::MAX).min()
@@ -393,7 +399,7 @@ impl Device for RplidarSimulator {
         broken
     }
 
-    /// Restarts the scanner while its motor continues. The boot message then arrives during a stream.
+    /// Restarts the scanner while its motor continues. For the host, the boot message arrives during a stream.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.restart(now, RESTART_NS)
     }
@@ -437,7 +443,7 @@ struct Stream {
     forced: bool,
     /// Time of the request.
     requested_ns: Nanos,
-    /// Time of the first point; `None` while the motor is off.
+    /// Time of the first point, which may be in the future; `None` while the motor is off.
     begin_ns: Option<Nanos>,
     /// Time from one point to the next.
     sample_ns: f64,
@@ -446,8 +452,8 @@ struct Stream {
 }
 
 impl Stream {
-    /// Creates a stream of `model` in `mode` that was requested at `requested_ns`. It starts as soon as `motor` is
-    /// steady, or at once if it is `forced`.
+    /// Creates a stream of `model` in `mode` that was requested at `requested_ns`. The stream starts as soon as the
+    /// speed of `motor` is steady, or at once if it is `forced`.
     fn new(model: Model, mode: Mode, forced: bool, requested_ns: Nanos, motor: Option<Motion>) -> Stream {
         let steady_ns = if forced { Some(0) } else { motor.map(|motion| motion.steady_ns) };
         let begin_ns = steady_ns.map(|steady_ns| steady_ns.max(requested_ns));
@@ -455,8 +461,8 @@ impl Stream {
         Stream { mode, forced, requested_ns, begin_ns, sample_ns, sent: 0 }
     }
 
-    /// Returns the time of point number `point`, and the clockwise angle of the head from its zero at this time, in
-    /// degrees.
+    /// Returns the time of the point with index `point`, and the clockwise angle of the head from its zero at this
+    /// time, in degrees.
     fn time_and_angle(&self, point: u64, motor: Option<Motion>) -> Option<(Nanos, f64)> {
         let at_ns = self.begin_ns? + (point as f64 * self.sample_ns) as Nanos;
         let turns = motor.map_or(0.0, |motion| {
@@ -465,7 +471,7 @@ impl Stream {
         Some((at_ns, turns.fract() * 360.0))
     }
 
-    /// Returns the number of packets, including the current one.
+    /// Returns the number of packets, including the packet on the line.
     fn sent(&self) -> u64 {
         self.sent
     }
@@ -478,7 +484,8 @@ impl Stream {
     /// Returns the time at which the next packet has all its points.
     fn due_ns(&self, motor: Option<Motion>) -> Option<Nanos> {
         let points = self.mode.form.points() as u64 * (self.sent + 1);
-        // A range that is sent as a difference from the first range of the next packet must wait for that range.
+        // The last ranges of such a packet are sent as differences from the first range of the next packet, so the
+        // packet must wait for that range.
         let last = if self.mode.form == PacketFormat::Ultra { points } else { points - 1 };
         self.time_and_angle(last, motor).map(|(at_ns, _)| at_ns)
     }
@@ -511,8 +518,8 @@ impl Stream {
     }
 }
 
-/// Optics of a head in a room. For each point, it determines the position that the laser hits, whether the surface
-/// there reflects, and how strongly.
+/// Optics of a head in a room. They determine for each point which position the laser hits, and whether and how
+/// strongly the surface at this position reflects.
 struct Optics {
     model: Model,
     beams: BeamSampler,
@@ -541,13 +548,13 @@ impl Optics {
         };
         let is_in_reach = |mm: &f64| self.model.reach_mm().contains(mm) && *mm <= 1e3 * reach_m;
         let Some(range_mm) = beam.range_mm.filter(is_in_reach) else { return no_return };
-        // The minimum quality that the six bits of type 0x81 can hold.
+        // Type 0x81 has only the upper six bits of the quality. The quality of a return must not become 0 there.
         let quality = beam.intensity.max(4);
         Reading { clockwise_deg, range_mm: range_mm.round() as u16, quality, ..no_return }
     }
 
-    /// Returns the clockwise angle of the point that the laser hits, in degrees from the head's zero, and its reading.
-    /// There is no reading if the formula has no solution.
+    /// Returns the clockwise angle of the point that the laser hits, in degrees from the head's zero, and the reading
+    /// at this point. The reading is `None` if the formula of the shift has no solution.
     fn hit(&mut self, at_ns: Nanos, head_deg: f64) -> (f64, Option<BeamReading>) {
         let mut measure = |clockwise_deg: f64| self.beams.measure(at_ns, counterclockwise_deg(clockwise_deg));
         if !self.model.triangulates() {
@@ -566,8 +573,9 @@ impl Optics {
         (angle_behind(None), None)
     }
 
-    /// Returns the reported shift of a point without a return, in degrees. A real A1 reports 12 % of its points out of
-    /// angular order, and the first point of a revolution anywhere from 351 to 359.5 degrees. Its rule is unknown.
+    /// Returns the shift that the scanner reports for a point without a return, in degrees. A real A1 reports 12 % of
+    /// its points out of angular order, and the first point of a revolution anywhere from 351 to 359.5 degrees. The
+    /// rule by which it selects this shift is unknown, so the shift is random.
     fn shift_without_return_deg(&self, at_ns: Nanos) -> f64 {
         if !self.model.triangulates() {
             return 0.0;
@@ -576,8 +584,8 @@ impl Optics {
         if random.f64() < STRAY_SHARE { 2.0 + 7.0 * random.f64() } else { shift_deg(None) }
     }
 
-    /// Returns whether the echo is strong enough. Indoors, scanners that triangulate lose most points, because many
-    /// surfaces are dark, far or oblique. The darkness of a patch of surface is drawn for its direction.
+    /// Returns whether the echo is strong enough for a return. Indoors, scanners that triangulate lose most points,
+    /// because many surfaces are dark, far or oblique. The darkness is drawn for each [`PATCH_DEG`] of direction.
     fn has_return(&self, at_ns: Nanos, clockwise_deg: f64, beam: &BeamReading) -> bool {
         if !self.model.triangulates() {
             return true;
@@ -589,9 +597,9 @@ impl Optics {
     }
 }
 
-/// Returns the shift of a point at `range_mm` behind the head, in degrees, with the steps of the vendor's decoder: 8
-/// degrees less k / 1024 less k^3 / 6442450944 radians, where k is the integer part of 98361 / (4 range). It is 7.5
-/// degrees below 50 mm and for no return.
+/// Returns the angle by which a point at `range_mm` lags behind the head, in degrees. The formula has the steps of the
+/// vendor's decoder: 8 degrees - (k / 1024 + k^3 / 6442450944) radians, where k is the integer part of 98361 / (4
+/// range). Below 50 mm and without a return, the angle is 7.5 degrees.
 fn shift_deg(range_mm: Option<f64>) -> f64 {
     match range_mm {
         Some(range_mm) if range_mm >= 50.0 => {
@@ -604,7 +612,7 @@ fn shift_deg(range_mm: Option<f64>) -> f64 {
 
 /// Health status of a scanner that does not measure.
 const HEALTH_ERROR: u8 = 2;
-/// Health code while the head is blocked. It is invented, because the real ones are not published.
+/// Health code while the head is blocked. It is invented, because the vendor does not publish the codes.
 const HELD_CODE: u16 = 0x0001;
 /// Time from RESET to the boot message, as measured on a real A1.
 const RESTART_NS: Nanos = 671 * MILLIS;
@@ -616,16 +624,17 @@ const RESPONSE_DELAY_NS: Nanos = MILLIS;
 const SPIN_UP_TIME_S: f64 = 0.4;
 /// Time from the start of the motor until its speed is steady enough to measure.
 const SETTLE_TIME_NS: Nanos = 1_600 * MILLIS;
-/// Share of the points without a return that are reported anywhere from 2 to 9 degrees behind the head.
+/// Share of the points without a return whose reported angle is random, from 2 to 9 degrees behind the head.
 const STRAY_SHARE: f64 = 0.27;
-/// Range at which the search for a point begins, in millimeters.
+/// Assumed range with which the iteration for the angle of a point starts, in millimeters.
 const START_RANGE_MM: f64 = 3_000.0;
-/// Maximum number of steps of the search for a point.
+/// Maximum number of steps of the iteration for the angle of a point.
 const MAX_ITERATIONS: usize = 6;
-/// Width of a patch of surface that is equally dark, in degrees.
+/// Angle within which all surfaces are equally dark, in degrees.
 const PATCH_DEG: f64 = 2.0;
 /// Minimum signal for a return from the brightest surfaces, relative to a white surface at 1 m. The darkest surfaces
 /// need a signal that is [`MAX_DARKNESS`] times as strong. With these values, 61 to 84 % of the points indoors are
 /// invalid, as on a real A1.
 const MIN_SIGNAL: f64 = 0.003;
+/// Ratio of the signals that the darkest and the brightest surfaces need.
 const MAX_DARKNESS: f64 = 20_000.0;

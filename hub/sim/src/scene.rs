@@ -1,6 +1,6 @@
-//! A scene as data: its sensors, objects and people, the times at which they are present, and their motion. Lengths are
-//! in millimeters, in the frame of the world, and times in seconds. Everything is a function of time and a seed, so
-//! that two sensors, a test and a bench see the same person.
+//! A scene as data: its sensors, objects and people, the times at which objects and people are present, and their
+//! motion. Lengths are in millimeters, in the frame of the world. Times are in seconds. Every position is a function of
+//! time and a seed, so that two sensors, a test and a bench see the same person at the same position.
 
 use std::f64::consts::TAU;
 
@@ -22,13 +22,13 @@ pub struct Scene {
 /// A sensor in a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Sensor {
-    /// Pose of the sensor, or of its mount if it has one. A rotation of 0 directs the beam ahead along x.
+    /// Pose of the sensor, or of its mount if it has one. With a rotation of 0, the sensor points along x.
     pub(crate) pose: Pose,
     /// Mount that tilts the sensor. A sensor without a mount measures level, and sees objects of every height.
     pub(crate) mount: Option<Mount>,
 }
 
-/// Reflection of a beam by a surface.
+/// Kind of a surface, by its reflection of beams.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Surface {
     Plain,
@@ -40,7 +40,7 @@ pub(crate) enum Surface {
     Faint,
 }
 
-/// A wall, a piece of furniture, a box, a door.
+/// An object: a wall, a piece of furniture, a box or a door.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Object {
     /// Outline in the object's own frame.
@@ -55,10 +55,10 @@ pub(crate) struct Object {
     pub(crate) until_s: f64,
     /// Moves while the object is present, in the order of time. They do not overlap.
     pub(crate) moves: Vec<Movement>,
-    /// Time after which all moves start again, in seconds. The last move must end within this time, at the pose at
-    /// which the first move began.
+    /// Time from the first move until all moves start again, in seconds; `None` if they happen once. The last move must
+    /// end within this time, at the pose at which the first move began.
     pub(crate) repeat_s: Option<f64>,
-    /// Maximum distance by which the seed moves the object along each axis.
+    /// Maximum distance by which the object is displaced along each axis, drawn from the seed.
     pub(crate) jitter_mm: f64,
 }
 
@@ -73,7 +73,7 @@ pub(crate) struct Movement {
 /// A sun that dazzles a sector of a sensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Sun {
-    /// Angles of the sensor.
+    /// First angle of the sector, in degrees counterclockwise from ahead of the sensor.
     pub(crate) from_deg: f64,
     pub(crate) to_deg: f64,
     pub(crate) from_s: f64,
@@ -82,7 +82,7 @@ pub(crate) struct Sun {
     pub(crate) share: f64,
 }
 
-/// Pose of an object, and the time at which the object arrived at it or left it.
+/// Pose of an object, and the time at which the object arrived at the pose or left it.
 pub(crate) struct Presence {
     pub(crate) pose: Pose,
     pub(crate) since_s: f64,
@@ -94,8 +94,9 @@ impl Object {
         self.from_s <= 0.0 && self.until_s.is_infinite() && self.moves.is_empty()
     }
 
-    /// Returns the pose at `time_s` if the object is present, and the time at which the object arrived at this pose.
-    /// This time is 0 if the object has had this pose from the start, and `time_s` while the object moves.
+    /// Returns the pose at `time_s`, and the time at which the object arrived at this pose. This time is 0 if the
+    /// object has had this pose from the start, and `time_s` while the object moves. Returns `None` while the object is
+    /// not present.
     pub(crate) fn at(&self, time_s: f64) -> Option<Presence> {
         let start = Presence { pose: self.pose, since_s: self.from_s.max(0.0) };
         let last = |_, presence: Presence| presence;
@@ -104,8 +105,8 @@ impl Object {
             .then(|| self.poses(time_s, self.round(time_s)).fold(start, last))
     }
 
-    /// Returns the poses that the object had before `time_s` and has left. If the moves repeat, only the poses of the
-    /// present round and the round before are returned.
+    /// Returns the poses that the object has left by `time_s`, with the times at which it left them. If the moves
+    /// repeat, returns only the poses of the current and the previous repetition.
     pub(crate) fn previous_presences(&self, time_s: f64) -> Vec<Presence> {
         let round = self.round(time_s);
         let rounds = if round > 0.0 { vec![round - 1.0, round] } else { vec![round] };
@@ -129,8 +130,8 @@ impl Object {
         }
     }
 
-    /// Returns the poses after the moves of `round` that have begun at `time_s`, and the times at which the object
-    /// arrived at each of them: this time is `time_s` for a move that has not ended.
+    /// Returns the pose after each move of repetition `round` that has begun by `time_s`, with the time at which the
+    /// object arrived at the pose. If the move has not ended, the pose and the time are those of `time_s`.
     fn poses(&self, time_s: f64, round: f64) -> impl Iterator<Item = Presence> {
         let offset_s = round * self.repeat_s.unwrap_or(0.0);
         let started = self.moves.iter().take_while(move |movement| movement.from_s + offset_s <= time_s);
@@ -171,7 +172,7 @@ pub(crate) struct PersonSpec {
     pub(crate) from_s: f64,
     /// Time at which the person disappears.
     pub(crate) until_s: f64,
-    /// Maximum distance by which the seed moves each corner of the path along each axis.
+    /// Maximum distance by which each corner of the path is displaced along each axis, drawn from the seed.
     pub(crate) jitter_mm: f64,
     /// Radius of a leg with its trousers.
     pub(crate) leg_mm: f64,
@@ -180,10 +181,10 @@ pub(crate) struct PersonSpec {
 /// Path of a person.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum WalkPath {
-    /// A closed curve within `reach` of `centre`, drawn with the seed.
+    /// A closed curve within `reach` of `centre`, whose course is drawn from the seed.
     Roam { centre: Point, reach: Point },
-    /// A polyline of corners, with a pause at each. After the last corner, the person disappears, or walks to the first
-    /// corner if the path `repeats`.
+    /// A polyline of corners, with a pause at each corner. After the last corner, the person disappears. If the path
+    /// `repeats`, the person walks to the first corner instead.
     Path { corners: Vec<Corner>, speed: Speed, repeats: bool },
 }
 
@@ -191,19 +192,19 @@ pub(crate) enum WalkPath {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Corner {
     pub(crate) point: Point,
-    /// Time that the person spends there, in seconds.
+    /// Time that the person spends at this corner, in seconds.
     pub(crate) pause_s: f64,
     /// Direction that the person faces while they sit at this corner, in degrees counterclockwise from x. `None` if
-    /// they do not sit there.
+    /// they stand at this corner.
     pub(crate) seat_deg: Option<f64>,
 }
 
 /// Speed of a person on a path.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Speed {
-    /// The seed draws a speed between two bounds, in millimeters per second.
+    /// A speed between these bounds, in millimeters per second, drawn from the seed.
     Between(f64, f64),
-    /// The person reaches the end of the path, after all pauses, at the time at which they disappear.
+    /// The speed with which the person reaches the end of the path, after all pauses, when they disappear.
     ToEnd,
 }
 
@@ -213,7 +214,7 @@ pub(crate) struct Person {
     from_s: f64,
     until_s: f64,
     leg_mm: f64,
-    /// Phase of the steps at the start, in double steps.
+    /// Phase of the gait at the start, in double steps.
     phase: f64,
     course: Course,
 }
@@ -222,8 +223,8 @@ pub(crate) struct Person {
 enum Course {
     /// A closed curve. `frequency` is the number of cycles per second along the two axes.
     Roam { centre: Point, reach: Point, frequency: Point, phase: Point },
-    /// A polyline. `knots` has the time, position and distance walked at each corner, before and after the pause. If
-    /// the path `repeats`, they describe one lap.
+    /// A polyline. `knots` has two entries for each corner, before and after the pause: time, position, and the
+    /// distance that the person has walked. If the path `repeats`, the entries describe one lap.
     Path { knots: Vec<(f64, Point, f64)>, seats: Vec<Seat>, repeats: bool },
 }
 
@@ -260,7 +261,7 @@ impl Person {
         let PersonSpec { from_s, until_s, jitter_mm, leg_mm, .. } = *plan;
         let course = match plan.path {
             WalkPath::Roam { centre, reach } => {
-                // The peak speed is 2 pi * reach * frequency: 0.5 to 1.3 m/s, as people indoors walk.
+                // The peak speed is 2 pi * reach * frequency. It is 0.5 to 1.3 m/s, like the speed of people indoors.
                 let mut frequency = |reach: f64| (500.0 + 800.0 * random.f64()) / (TAU * reach);
                 let frequency = (frequency(reach.0), frequency(reach.1));
                 Course::Roam { centre, reach, frequency, phase: (random.f64(), random.f64()) }
@@ -356,8 +357,9 @@ impl Course {
                 let ((t0, a, s0), (t1, b, s1)) = (knots[next - 1], knots[next]);
                 let share = if t1 > t0 { ((time_s - t0) / (t1 - t0)).min(1.0) } else { 1.0 };
                 let seat = seats.iter().find(|seat| (seat.from_s..seat.until_s).contains(&time_s));
-                // A person who pauses faces along the path, and at the end of the path back along it. A person who sits
-                // down turns from the previous part of the path to the seat, and later to the next part.
+                // A person who pauses faces in the direction of the next part of the path. At the end of the path, they
+                // face in the direction of the last part. A person who sits down turns from the direction of the
+                // previous part to the direction of the seat, and when they stand up, to that of the next part.
                 let is_arriving = seat.is_some_and(|seat| time_s < (seat.from_s + seat.until_s) / 2.0);
                 let before = || knots[..next].windows(2).rev();
                 let after = || knots[next - 1..].windows(2);
@@ -378,8 +380,7 @@ impl Course {
     }
 }
 
-/// Returns time, position and distance walked at each corner, before and after the pause, for a person who starts at
-/// `from_s`.
+/// Returns the knots of [`Course::Path`] for a person who starts at `from_s` and walks at `speed`.
 fn course(corners: &[Corner], from_s: f64, speed: f64) -> Vec<(f64, Point, f64)> {
     let (mut time_s, mut walked) = (from_s, 0.0);
     let mut before = corners[0].point;
@@ -439,22 +440,25 @@ fn unit(vector: Point) -> Point {
 
 /// Half of the distance between the legs, across the path.
 const HIP_MM: f64 = 110.0;
-/// Heights of an adult of 1.75 m, and the radii of trunk and head.
+/// Heights in the body of a standing adult of 1.75 m.
 const CROTCH_MM: f64 = 820.0;
 const NECK_MM: f64 = 1_480.0;
 const CROWN_MM: f64 = 1_750.0;
+/// Radii of trunk and head.
 const TRUNK_MM: f64 = 170.0;
 const HEAD_MM: f64 = 95.0;
-/// Distance of the feet of a person who sits ahead of the body, and height of the seat.
+/// Distance from the body to the feet of a person who sits, in the direction that the person faces.
 const FEET_AHEAD_MM: f64 = 300.0;
+/// Height of a seat.
 const SEAT_MM: f64 = 450.0;
 /// Time in which a person sits down, or stands up.
 pub(crate) const SIT_DOWN_S: f64 = 1.2;
-/// Maximum distance of a foot ahead of the body.
+/// Maximum distance by which a foot of a walking person is ahead of the body.
 const STRIDE_MM: f64 = 250.0;
 /// Double steps per second of a person who roams.
 const STEPS_HZ: f64 = 0.9;
-/// Length of a double step of a person on a path. With [`STRIDE_MM`], one foot nearly stands while the other swings.
+/// Length of a double step of a person on a path. Together with [`STRIDE_MM`], it makes one foot nearly stand still
+/// while the other foot swings.
 const DOUBLE_STEP_MM: f64 = 1_400.0;
 
 #[cfg(test)]
@@ -629,8 +633,7 @@ mod tests {
             assert!(distance(left, (-300.0, 1890.0)) < 1e-6, "{time_s} s: {left:?}");
             assert!(distance(right, (-300.0, 2110.0)) < 1e-6, "{time_s} s: {right:?}");
         }
-        // The feet do not jump when the person sits down, and hardly move when the person stands up and turns to walk
-        // on.
+        // The feet do not jump when the person sits down, and not when the person stands up and turns to walk on.
         for tenth in 35..139 {
             let (before, after) = (feet(f64::from(tenth) / 10.0), feet(f64::from(tenth + 1) / 10.0));
             let jumps = before.iter().zip(after).map(|(a, b)| distance(*a, b)).fold(0.0, f64::max);
@@ -690,7 +693,7 @@ mod tests {
                     nearest = nearest.min(gap);
                 }
             }
-            // A person passes the door.
+            // The test is only meaningful if a person passes near the door.
             assert!(nearest < 500.0, "{name}: {nearest} mm");
         }
     }

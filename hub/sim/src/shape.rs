@@ -1,8 +1,8 @@
 //! Geometry of a world. Lengths are in millimeters.
 //!
 //! A [`Shape`] is flat and seen from the origin, with x to the right and y ahead. Angles are counted from x. For a
-//! tilted scanner, a [`Plane`] cuts everything that has a height into flat shapes. The plane is in the frame of the
-//! mount: x to the right, y ahead, z up, and the floor at 0.
+//! tilted scanner, a [`Plane`] cuts objects, which have a height, into flat shapes. The plane is in the frame of the
+//! mount: x to the right, y ahead, z up, and the floor at z = 0.
 
 use std::f64::consts::TAU;
 
@@ -29,7 +29,8 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// Returns the distance along the ray from the origin in `direction` (a unit vector), if it meets the shape.
+    /// Returns the distance from the origin to the shape along a ray in `direction` (a unit vector), or `None` if the
+    /// ray does not meet the shape.
     pub(crate) fn distance(&self, direction: Point) -> Option<f64> {
         match *self {
             Shape::Wall { from, to } => {
@@ -66,9 +67,9 @@ impl Shape {
         }
     }
 
-    /// Returns the angles at which the shape is seen from the origin: the first one in degrees, -180 to 180, and the
-    /// width counterclockwise from it. Returns `None` for a post around the origin, and for a wall that points at the
-    /// origin.
+    /// Returns the interval of angles at which the shape is seen from the origin: its first angle, -180 to 180 degrees,
+    /// and its width counterclockwise from there, in degrees. Returns `None` for a post around the origin, and for a
+    /// wall that points at the origin.
     pub(crate) fn span_deg(&self) -> Option<(f64, f64)> {
         let bearing = |point: Point| point.1.atan2(point.0).to_degrees();
         match *self {
@@ -167,8 +168,8 @@ impl Plane {
         Plane { eye, sin, cos }
     }
 
-    /// Calls `each` with the cut of each surface of an object with the outline `shapes`. A post also has surfaces at
-    /// its top and its bottom, and so does an object if `is_box` is set.
+    /// Cuts each surface of an object with the outline `shapes`, and calls `each` with each resulting shape. Posts also
+    /// have surfaces at top and bottom, and so does an object for which `is_box` is set.
     pub(crate) fn cut(&self, shapes: &[Shape], heights: Heights, is_box: bool, mut each: impl FnMut(Shape)) {
         let (bottom, top) = (heights.from_mm.min(MAX_DISTANCE_MM), heights.to_mm.min(MAX_DISTANCE_MM));
         let mut wall = |from: Point, to: Point| {
@@ -209,13 +210,14 @@ impl Plane {
         }
     }
 
-    /// Returns the cut of the floor.
+    /// Returns the line along which the plane cuts the floor, or `None` if it does not cut the floor.
     pub(crate) fn cut_floor(&self) -> Option<Shape> {
         let far = MAX_DISTANCE_MM;
         self.cut_panel(&[(-far, -far, 0.0), (far, -far, 0.0), (far, far, 0.0), (-far, far, 0.0)])
     }
 
-    /// Returns the cut of a flat and convex surface.
+    /// Returns the line along which the plane cuts the flat and convex surface between `corners`, or `None` if it does
+    /// not cut the surface.
     fn cut_panel(&self, corners: &[Corner]) -> Option<Shape> {
         let mut ends = [(0.0, 0.0); 2];
         let mut count = 0;
@@ -257,7 +259,8 @@ fn polygon(centre: Point, radius: f64) -> [Point; SIDES] {
 /// Number of sides of the polygon that replaces a round post. For a radius of 100 mm, the polygon deviates from the
 /// circle by 2 mm.
 const SIDES: usize = 16;
-/// Maximum distance and height of everything that is measured, in millimeters.
+/// Extent of the floor in each direction, and maximum height of an object, in millimeters. It is beyond the maximum
+/// range of every scanner.
 const MAX_DISTANCE_MM: f64 = 100_000.0;
 
 #[cfg(test)]

@@ -1,8 +1,9 @@
 //! The verb `simulate`, which simulates scanners on ptys or TCP servers until it is stopped.
 //!
-//! Each port has a thread, `PortThread`, which runs scanner and line by their deadlines. It adds the effects of the
-//! host's port: another rate, no host, a host that does not read, an unplugged adapter. [`Truth`] is the log of the
-//! telegrams: one line per telegram, and one per port at the end, in a file or on stdout. The hub never reads it.
+//! Each port has a thread, `PortThread`, which runs scanner and line by their deadlines. The thread adds the effects of
+//! the host's port: another rate, no host, a host that does not read, an unplugged adapter. [`Truth`] is the log of the
+//! telegrams, in a file or on stdout. It has one line per telegram, and at the end one line per port. The hub never
+//! reads it.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -36,15 +37,16 @@ use crate::rplidar::{RplidarSettings, RplidarSimulator, RplidarStart};
 /// A port that is ready to be opened.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SimulatedPort {
-    /// The symlink as the user named it; for a TCP server `tcp:HOST:PORT`, which a hub opens.
+    /// Name with which a hub opens the port: the path of the symlink as the user named it, or `tcp:HOST:PORT` for a TCP
+    /// server.
     pub port: PathBuf,
-    /// The pty; `None` for a TCP server.
+    /// Path of the pty; `None` for a TCP server.
     pub pty: Option<PathBuf>,
 }
 
-/// Simulates the scanners of `options` until `stop` is readable, and returns the summary of each port. `on_ready` is
-/// called once all ports exist, and `on_record` with each telegram from the thread of the port. The symlinks are
-/// removed when this function returns.
+/// Simulates the scanners of `options` until `stop` is readable, and returns the summary of each port. Calls `on_ready`
+/// when all ports exist. The thread of each port calls `on_record` with each telegram that its scanner has sent. The
+/// symlinks are removed when this function returns.
 pub fn simulate(
     options: &SimulateOptions,
     stop: impl AsFd,
@@ -54,8 +56,9 @@ pub fn simulate(
     simulate_with(options, stop, on_ready, on_record, |_| None, |_, _| {})
 }
 
-/// Simulates like [`simulate()`]. The thread of each port repeatedly calls `event`, which returns an event for this
-/// port. `on_report` receives the number of a port and the reports of the encoder of its mount, in time of the clock.
+/// Simulates like [`simulate()`]. The thread of each port repeatedly calls `event`, which returns the next event for
+/// this port, if there is one. `on_report` receives the index of a port and each report of the encoder of its mount.
+/// The times of a report are those of the kernel's clock.
 pub fn simulate_with(
     options: &SimulateOptions,
     stop: impl AsFd,
@@ -66,7 +69,7 @@ pub fn simulate_with(
 ) -> Result<Vec<Summary>, Failure> {
     options.check()?;
     let recording = options.replay.as_ref().filter(|_| options.scanner.is_none());
-    // The ports are LMS, so the bytes of a stream file belong to an LMS.
+    // Without `scanner`, the simulated scanners are LMS, so the bytes of a stream file are those of an LMS.
     let recording = recording.map(|path| Recording::open_as(path, Some(Family::Lms))).transpose()?;
     let truth = options.truth.as_deref().map(|path| Truth::create(path, options.force)).transpose()?;
     let on_record = |record: &Record| {
@@ -114,7 +117,7 @@ pub fn simulate_with(
     Ok(summaries)
 }
 
-/// Runs each port in a separate thread. If one thread fails, the others end too.
+/// Runs each port in a separate thread. If one thread fails, the other threads end, too.
 fn run(threads: Vec<PortThread<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failure> {
     let failed: OwnedFd = eventfd(0, EventfdFlags::CLOEXEC).map_err(|errno| {
         Failure::new(Kind::ResourceExhausted, format!("cannot create an eventfd: {errno}"), "")
@@ -141,7 +144,7 @@ fn run(threads: Vec<PortThread<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary
     })
 }
 
-/// Creates the scanner of the port with this number.
+/// Creates the scanner of the port with the index `number`.
 fn device(
     options: &SimulateOptions,
     recording: Option<&Recording>,
@@ -201,8 +204,8 @@ fn device(
     })
 }
 
-/// Returns the settings of an LMS and its measured values. The settings come from the flags, then from the recording,
-/// and then from the factory settings.
+/// Returns the settings of an LMS and the source of its measured values. Each setting is that of the option, or if
+/// there is none, that of the recording, or otherwise the factory setting.
 fn lms(
     options: &SimulateOptions,
     recording: Option<&Recording>,
@@ -273,7 +276,7 @@ fn scans(
 
 /// A scanner on its line, and the thread that runs them.
 struct PortThread<'a> {
-    /// Number of the port, from 0.
+    /// Index of the port.
     pub(crate) number: usize,
     /// Name of the port: as the user gave it, or the address of a server.
     pub(crate) port: PathBuf,
@@ -288,15 +291,16 @@ struct PortThread<'a> {
     pub(crate) event: &'a (dyn Fn(&Path) -> Option<Event> + Sync),
     /// Encoder of the scanner's mount, if it has one.
     pub(crate) encoder: Option<Encoder>,
-    /// Receives the reports of the encoder, in time of the clock.
+    /// Receives the reports of the encoder, with times of the kernel's clock.
     on_report: &'a (dyn Fn(usize, Report) + Sync),
-    /// Whether bytes wait while the host's buffer is full. Otherwise they are lost, as in a UART that no program reads.
+    /// Whether bytes wait while the host's buffer is full. Otherwise the bytes are lost, as in a UART that no program
+    /// reads.
     pub(crate) lossless: bool,
     /// Whether a host has the port open.
     is_open: bool,
     /// First fault of the current telegram.
     fault: Option<Fault>,
-    /// The port of a host at another rate.
+    /// Receiver that is used while the rate of the host's port differs from the rate of the line.
     mismatch: BaudMismatch,
     /// Number of telegrams that were sent.
     sent: u64,
@@ -309,10 +313,11 @@ struct PortThread<'a> {
 pub enum Event {
     /// The power goes off and on.
     PowerCycle,
-    /// The host's adapter is unplugged for this time in nanoseconds. Afterwards it is another terminal with the same
-    /// name.
+    /// The host's adapter is unplugged for this time in nanoseconds. Afterwards, the port is another terminal with the
+    /// same name.
     Unplug(Nanos),
-    /// The line has these faults from now on, with random numbers of this seed. The times of the faults count from now.
+    /// The line has these faults from now on, with random numbers of this seed. The times in the faults are counted
+    /// from now.
     Faults(Box<Faults>, u64),
 }
 
@@ -329,8 +334,8 @@ impl ScaledClock {
     }
 
     fn of_clock(self, machine_ns: Nanos) -> Nanos {
-        // Add a nanosecond, because the division rounds down, and a deadline must not be before the time that it
-        // represents.
+        // Add a nanosecond, because the conversion rounds down. At the returned time, the scanner's clock must have
+        // reached `machine_ns`.
         self.zero_ns + (machine_ns as f64 / self.speed) as Nanos + 1
     }
 }
@@ -339,7 +344,7 @@ impl PortThread<'_> {
     /// Runs until one of `stops` is readable.
     pub(crate) fn run(mut self, stops: [BorrowedFd<'_>; 2]) -> Result<Summary, Failure> {
         let mut buffer = [0; 64];
-        // Last time at which there was nothing to read, by the kernel's clock.
+        // Last time by the kernel's clock at which the host had written nothing.
         let mut quiet_ns = now_ns();
         loop {
             let read_ns = now_ns();
@@ -400,8 +405,8 @@ impl PortThread<'_> {
         Summary { eeprom_writes: self.machine.eeprom_writes(), port: self.port, sent: self.sent }
     }
 
-    /// Waits until the host has read all held bytes or has closed its side. The clock of the scanner stands still
-    /// during the wait.
+    /// Waits until the bytes in `unsent` fit into the host's buffer, or until the host has closed its side. The clock
+    /// of the scanner stops during the wait.
     fn wait_for_room(&mut self, stops: [BorrowedFd<'_>; 2]) -> Result<WaitResult, Failure> {
         let begun_ns = now_ns();
         while !self.unsent.is_empty() {
@@ -448,8 +453,8 @@ impl PortThread<'_> {
         rate.is_none_or(|rate| same_rate(rate, self.machine.rate()))
     }
 
-    /// Stops the clock of the scanner if this thread has not run for a long time. Otherwise the line would deliver more
-    /// bytes at once than it can carry.
+    /// Sets the clock of the scanner back if this thread is late by more than [`MAX_LAG_NS`]. Otherwise the line would
+    /// deliver more bytes at once than it can carry.
     fn limit_lag(&mut self, now_ns: Nanos) {
         let machine_ns = self.time.of_machine(now_ns);
         let Some(due_ns) = self.line.poll_timeout(&*self.machine, machine_ns) else { return };
@@ -457,7 +462,7 @@ impl PortThread<'_> {
         self.time.zero_ns += now_ns.saturating_sub(latest_ns);
     }
 
-    /// Writes bytes that arrive at the host, and reports a telegram that ends with them.
+    /// Writes bytes to the host. If a telegram ends with these bytes, reports the telegram.
     fn deliver(&mut self, delivery: Delivery) -> Result<(), Failure> {
         let is_telegram = delivery.is_telegram();
         let Delivery { mut bytes, rate, idle_after, part, mut fault } = delivery;
@@ -480,7 +485,7 @@ impl PortThread<'_> {
             }
             None => fault = fault.or(Some(Fault::Unread)),
         }
-        // Read the clock before computing the hash, which takes longer than a host needs to wake for this byte.
+        // Read the clock before computing the hash. The hash takes longer than a host needs to wake for the last byte.
         let sent_ns = now_ns();
         if is_telegram {
             self.fault = self.fault.or(fault);
@@ -501,7 +506,8 @@ impl PortThread<'_> {
     }
 }
 
-/// Returns whether a UART at `a` bits per second can read bytes at `b` bits per second: within 3 %.
+/// Returns whether a UART at `a` bits per second can read bytes that were sent at `b` bits per second. The rates may
+/// differ by 3 %.
 fn same_rate(a: u32, b: u32) -> bool {
     u64::from(a.abs_diff(b)) * 100 <= 3 * u64::from(b)
 }
@@ -511,17 +517,17 @@ fn same_rate(a: u32, b: u32) -> bool {
 pub struct Record {
     /// Name of the port.
     pub port: PathBuf,
-    /// Number of the telegram on this port, from 0. Data and replies are counted together.
+    /// Index of the telegram on this port. Data and replies are counted together.
     pub index: u64,
-    /// Whether it is a reply, and not data of the stream.
+    /// Whether the telegram is a reply. Otherwise it is data of the stream.
     pub is_reply: bool,
     /// Length of the intact telegram in bytes.
     pub length: usize,
     /// SHA-256 of the intact telegram.
     pub sha256: [u8; 32],
-    /// CLOCK_MONOTONIC after its last byte was written, in nanoseconds.
+    /// CLOCK_MONOTONIC after the last byte of the telegram was written, in nanoseconds.
     pub sent_ns: u64,
-    /// First fault that damaged it; `None` if it arrived intact.
+    /// First fault that damaged the telegram; `None` if it arrived intact.
     pub fault: Option<Fault>,
 }
 
@@ -531,7 +537,7 @@ impl Record {
         Sha256::digest(telegram).into()
     }
 
-    /// Returns the JSON line without the line end. The keys have the documented order.
+    /// Returns the line of JSON for the truth file, without the line end. The keys have the documented order.
     pub fn line(&self) -> String {
         let port = json!(self.port.to_string_lossy());
         let kind = if self.is_reply { "reply" } else { "data" };
@@ -551,12 +557,12 @@ pub struct Summary {
     pub port: PathBuf,
     /// Number of telegrams that were sent, including those with a fault.
     pub sent: u64,
-    /// Number of requests that would have written the EEPROM of the scanner.
+    /// Number of requests to write the EEPROM of the scanner, executed or refused.
     pub eeprom_writes: u64,
 }
 
 impl Summary {
-    /// Returns the JSON line without the line end.
+    /// Returns the line of JSON for the truth file, without the line end.
     pub fn line(&self) -> String {
         let port = json!(self.port.to_string_lossy());
         let Summary { sent, eeprom_writes, .. } = self;
@@ -564,16 +570,16 @@ impl Summary {
     }
 }
 
-/// Log that several ports write. Each line is one write.
+/// The truth file, to which the threads of all ports write. Each line is written at once.
 #[derive(Debug)]
 pub struct Truth {
     path: PathBuf,
-    /// `None` for stdout.
+    /// The file; `None` for stdout.
     file: Option<Mutex<File>>,
 }
 
 impl Truth {
-    /// Creates the file at `path`, which replaces an existing one if `force` is set. `-` is stdout.
+    /// Creates the file at `path`. Replaces an existing file if `force` is set. The path `-` selects stdout.
     ///
     /// # Errors
     ///
@@ -589,12 +595,12 @@ impl Truth {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] if it cannot be written.
+    /// Returns [`Kind::Failed`] if the line cannot be written.
     pub fn write(&self, line: &str) -> Result<(), Failure> {
         let line = format!("{line}\n");
         let written = match &self.file {
-            // A thread that panicked while it held the lock has written its whole line or nothing. In both cases, the
-            // next line is intact.
+            // If a thread panicked while it held the lock, it has written its whole line or nothing. In both cases, the
+            // next line is intact, so ignore that the lock is poisoned.
             Some(file) => {
                 file.lock().unwrap_or_else(std::sync::PoisonError::into_inner).write_all(line.as_bytes())
             }
@@ -612,15 +618,17 @@ fn failure(path: &Path, error: &io::Error) -> Failure {
     Failure::new(Kind::Failed, what, "free space on the disk, and keep the reader of stdout running")
 }
 
-/// Maximum lag of the scanner, by its own clock: 5 kB at its highest rate, a quarter of the buffer of a pty.
+/// Maximum time by which the thread of a port may be late, by the scanner's clock. In this time, an LMS sends 5 kB at
+/// its highest rate, a quarter of the buffer of a pty.
 const MAX_LAG_NS: Nanos = 100 * MILLIS;
-/// Maximum time from a write to a pty until the byte can be read. A worker thread of the kernel transfers it.
+/// Maximum time from a host's write to a pty until the simulator can read the byte. It is not 0, because a worker
+/// thread of the kernel transfers the byte.
 const PTY_DELAY_NS: Nanos = 2 * MILLIS;
 /// Interval at which a lossless line checks for room in the host's buffer.
 const ROOM_CHECK_INTERVAL_NS: Nanos = MILLIS;
-/// Interval between polls of the port. The port must be polled, because no event reports that a host opened it. The
-/// interval also limits the uncertainty of the time at which a byte arrived. At 9600, where every host begins, it is so
-/// short that a strict scanner can be sure that a request was written without gaps.
+/// Interval between polls of the port. The port must be polled, because no event reports that a host has opened it. The
+/// interval also limits the uncertainty of the time at which a byte arrived. At 9600, the rate with which every host
+/// starts, the interval is so short that a strict scanner detects every request that was written without gaps.
 const POLL_INTERVAL_NS: Nanos = 4 * MILLIS;
 
 #[cfg(test)]

@@ -75,7 +75,7 @@ impl WorldView {
         object.shapes.iter().map(|shape| shape.transformed(transform)).collect()
     }
 
-    /// Transforms a point of the world to the frame of the scanner: x to its right, y ahead.
+    /// Transforms a point of the world to the frame of the scanner: x to the right of the scanner, y ahead.
     fn in_scanner_frame(&self, point: (f64, f64)) -> (f64, f64) {
         let (ahead, left) = self.sensor.inward(point);
         (-left, ahead)
@@ -114,7 +114,8 @@ impl WorldView {
         view
     }
 
-    /// Returns the view ahead at `time_ns` with additional `shapes`, in the frame of the world. They count as people.
+    /// Returns the view ahead at `time_ns` with additional `shapes`, in the frame of the world. The additional shapes
+    /// count as people.
     pub(crate) fn view_with(&self, time_ns: Nanos, shapes: &[Shape]) -> View {
         let mut view = self.view(time_ns);
         for shape in shapes {
@@ -124,13 +125,13 @@ impl WorldView {
         view
     }
 
-    /// Returns the view of all objects that never change, all around.
+    /// Returns the view of all objects that never change, in all directions.
     pub(crate) fn still(&self) -> &View {
         &self.still
     }
 
-    /// Changes `view` to the surroundings of the beam at `angle_deg` at `time_ns`. At first, `view` must be a clone of
-    /// [`WorldView::still`].
+    /// Changes `view` to the surroundings of the beam at `angle_deg` at `time_ns`. Before the first call, `view` must
+    /// be a clone of [`WorldView::still`].
     pub(crate) fn show_beam(&self, view: &mut View, angle_deg: f64, time_ns: Nanos) {
         view.narrow(&self.still, angle_deg);
         self.draw(view, time_ns);
@@ -180,7 +181,7 @@ impl WorldView {
         }
     }
 
-    /// Returns the middle of each reflector that is visible at `time_ns`. There are none for a tilted scanner.
+    /// Returns the middle of each reflector that is visible at `time_ns`. For a tilted scanner, returns no marks.
     pub(crate) fn marks(&self, time_ns: Nanos) -> Vec<Mark> {
         if self.is_tilted() {
             return Vec::new();
@@ -236,7 +237,7 @@ pub(crate) struct Hit {
     pub(crate) range_mm: f64,
     /// Index of the face.
     face: u32,
-    /// Time at which the last object in front of this surface was removed.
+    /// Time at which the last object in front of this surface was removed; 0 if no object was removed.
     pub(crate) since_ns: Nanos,
 }
 
@@ -252,12 +253,12 @@ impl Hit {
 pub(crate) struct View {
     faces: Vec<Face>,
     hits: Vec<Hit>,
-    /// Index of the first ray in a full circle of rays.
+    /// Index of the first ray of this view in [`DIRECTIONS`].
     first: usize,
 }
 
 impl View {
-    /// Creates a view without surfaces, all around.
+    /// Creates a view without surfaces, in all directions.
     pub(crate) fn empty() -> View {
         let nothing = Hit { range_mm: f64::INFINITY, face: u32::MAX, since_ns: 0 };
         View { faces: Vec::new(), hits: vec![nothing; DIRECTIONS.len()], first: 0 }
@@ -281,7 +282,7 @@ impl View {
         self.first = still.first + middle - SPOT_RAYS;
     }
 
-    /// Draws `face` over the present rays. Each ray ends at the nearest face.
+    /// Adds `face` to the view. Each ray of the view then ends at its nearest face.
     pub(crate) fn draw(&mut self, face: Face) {
         let number = self.faces.len() as u32;
         for ray in rays(&face.shape, self.ray_range()) {
@@ -299,7 +300,7 @@ impl View {
         self.faces.push(face);
     }
 
-    /// Marks the surfaces that `shape` hid until `since_ns`. Call it after everything is drawn.
+    /// Marks the surfaces that `shape` hid until `since_ns`. Call this function after all faces are drawn.
     pub(crate) fn uncover(&mut self, shape: &Shape, since_ns: Nanos) {
         for ray in rays(shape, self.ray_range()) {
             let hit = &mut self.hits[ray - self.first];
@@ -322,7 +323,8 @@ impl View {
         (-90.0..=90.0).contains(&angle_deg) && self.hits[ray - self.first].range_mm > range_mm - 1.0
     }
 
-    /// Returns the range of the nearest ray to `angle_deg`, and the exact range of its face at this angle.
+    /// Returns the range of the ray next to `angle_deg`, and the exact range at this angle of the face that the ray
+    /// hits.
     pub(crate) fn exact(&self, angle_deg: f64) -> (f64, Option<f64>) {
         let hit = &self.hits[ray_index((angle_deg * 1e3) as i32) - self.first];
         let face = self.face(hit).filter(|_| hit.range_mm.is_finite());
@@ -347,7 +349,7 @@ fn ray_index(angle_mdeg: i32) -> usize {
 /// Returns the indices in `range` of the rays that can meet `shape`.
 fn rays(shape: &Shape, range: Range<usize>) -> impl Iterator<Item = usize> + use<> {
     let span = shape.span_deg();
-    // The span may enter the range of rays from either end.
+    // Angles repeat after 360 degrees, so the span of the shape may overlap the range of rays at either end.
     [-360.0, 0.0, 360.0].into_iter().flat_map(move |turn| {
         let Some((first, width)) = span else { return 0..0 };
         let ray = |angle_deg: f64| {
@@ -361,7 +363,7 @@ fn rays(shape: &Shape, range: Range<usize>) -> impl Iterator<Item = usize> + use
 
 /// Number of rays per degree. Neighboring rays are 4 mm apart at 4 m. Each beam of each variant coincides with a ray.
 const RAYS_PER_DEGREE: i32 = 16;
-/// Number of rays that the widest spot covers on each side of its middle. They span more than a degree.
+/// Number of rays that the widest spot covers on each side of its middle. They cover more than a degree on each side.
 pub(crate) const SPOT_RAYS: usize = 20;
 /// Angle between two rays in radians.
 pub(crate) const RAY_STEP: f64 = std::f64::consts::PI / 180.0 / RAYS_PER_DEGREE as f64;

@@ -1,6 +1,6 @@
-//! The available worlds: some that test the scanner itself, built-in scenes, and scenes in TOML files.
+//! The available worlds: artificial ones that test the line and the hub, built-in scenes, and scenes in TOML files.
 //!
-//! The parser checks each value of a file at its position, so that a failure names file, line and column.
+//! The parser keeps the position of each value in a file, so that a failure names file, line and column.
 //! `docs/worlds.md` describes the format.
 
 use std::ops::{Range, RangeInclusive};
@@ -25,10 +25,10 @@ use crate::shape::{Heights, Point, Pose, Shape};
 pub enum World {
     /// No surface within the maximum range.
     Empty,
-    /// A wall around the scanner at which every value is 640. All bytes of the values are `80 02`, so each beam except
-    /// the last ends with the first bytes of a header.
+    /// A wall around the scanner at which every value is 640. The bytes of each value are `80 02`, so the last byte of
+    /// each value and the first byte of the next value look like the start of a header, `02 80`.
     Wall640,
-    /// Random values of all bits that the mode can set.
+    /// Random values, in which all bits that the mode allows may be set.
     Random,
     /// Walls, objects and people.
     Scene(Arc<Scene>),
@@ -77,7 +77,7 @@ impl World {
         }
     }
 
-    /// Returns the mount of sensor number `sensor`, or `None` if the sensor is not tilted.
+    /// Returns the mount of the sensor with the index `sensor`, or `None` if this sensor has no mount.
     pub fn mount(&self, sensor: usize) -> Option<&Mount> {
         match self {
             World::Scene(scene) => scene.sensors.get(sensor)?.mount.as_ref(),
@@ -94,7 +94,7 @@ impl World {
         World::Scene(Arc::new(scene))
     }
 
-    /// Returns the noise, or `None` if the world has none.
+    /// Returns the noise, or `None` if the world is not a scene.
     pub fn noise(&self) -> Option<NoiseModel> {
         match self {
             World::Scene(scene) => Some(scene.noise),
@@ -102,7 +102,7 @@ impl World {
         }
     }
 
-    /// Returns the world with other noise. A world without noise stays as it is.
+    /// Returns the world with `noise` as its noise. A world that is not a scene is returned unchanged.
     pub fn with_noise(self, noise: NoiseModel) -> World {
         match self {
             World::Scene(scene) => World::Scene(Arc::new(Scene { noise, ..Arc::unwrap_or_clone(scene) })),
@@ -114,12 +114,12 @@ impl World {
 impl FromStr for World {
     type Err = Failure;
 
-    /// Returns the world with this name, or in this file.
+    /// Returns the world with the name `text`, or the world in the file at the path `text`.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Input`] if there is neither, and [`Kind::Configuration`], with position and remedy, if the file
-    /// is invalid.
+    /// Returns [`Kind::Input`] if there is no such world and the file cannot be read. Returns [`Kind::Configuration`],
+    /// with position and remedy, if the file is invalid.
     fn from_str(text: &str) -> Result<World, Failure> {
         match text {
             "empty" => Ok(World::Empty),
@@ -172,7 +172,8 @@ fn parse_scene(name: &str, text: &str) -> Result<Scene, Failure> {
     })
 }
 
-/// Pose in the middle of the world, facing along y, so that angles are the same as in a drawing with x to the right.
+/// Pose of a sensor without a configured pose: at the origin of the world, facing along y. Its frame has x to the right
+/// and y ahead, like the world in a drawing.
 const PAGE_POSE: Pose = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
 
 #[derive(Deserialize)]
@@ -264,8 +265,8 @@ enum SpeedFile {
 struct SunFile {
     from_deg: Option<Spanned<f64>>,
     to_deg: Option<Spanned<f64>>,
-    /// Key of an earlier version, whose angle 0 was to the right. The key is refused, because many of its values are
-    /// also valid as angles from ahead.
+    /// Key of an earlier version, whose angle 0 was to the right. The parser refuses it, because most of its values
+    /// would also be valid angles from ahead.
     sector_deg: Option<Spanned<(Number, Number)>>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,
@@ -329,7 +330,7 @@ impl ThingFile {
         })
     }
 
-    /// Returns the time after which `moves` start again.
+    /// Returns the time after which `moves` start again, or `None` if they happen once.
     fn repeat_s(&self, moves: &[Movement], origin: &Origin) -> Result<Option<f64>, Failure> {
         let Some(repeat) = &self.repeat_s else { return Ok(None) };
         let repeat_s = origin.number(&self.repeat_s, 0.0, 0.1..=1e6)?;
@@ -628,7 +629,7 @@ struct Origin<'a> {
 }
 
 impl Origin<'_> {
-    /// Returns a value within `allowed`, or `usual` if there is none.
+    /// Returns `value`, which must be within `allowed`. Returns `usual` if there is no value.
     fn number(
         &self,
         value: &Option<Spanned<f64>>,
@@ -645,7 +646,7 @@ impl Origin<'_> {
         }
     }
 
-    /// Returns start and end of an interval. By default, it is unlimited.
+    /// Returns start and end of an interval. By default, the interval starts at 0 and has no end.
     fn interval(
         &self,
         from: &Option<Spanned<f64>>,
@@ -670,7 +671,8 @@ impl Origin<'_> {
         Failure::new(Kind::Configuration, format!("{}:{line}:{column}: {what}", self.name), remedy)
     }
 
-    /// Returns the failure for an error of the TOML parser. For an unknown key, the remedy names the nearest known one.
+    /// Returns the failure for an error of the TOML parser. For an unknown key, the remedy names the most similar known
+    /// key.
     fn explain(&self, error: &toml::de::Error) -> Failure {
         let (span, message) = (error.span().unwrap_or_default(), error.message());
         let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();

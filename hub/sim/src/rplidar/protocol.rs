@@ -1,8 +1,9 @@
 //! Models of RPLIDARs and their wire format: a decoder of requests, and encoders of responses and packets of points.
 //!
 //! A request is `A5 command`. If the top bit of the command is set, a length, a payload of this length and the XOR of
-//! all bytes follow. A response is a descriptor and its data. Angles and ranges are rounded here to the resolution of
-//! the format. The driver has its own description of the protocol, so that a mistake in one of them is detected.
+//! all bytes follow. A response is a descriptor and its data. The encoders round angles and ranges to the resolution of
+//! the format. The driver does not use this module but its own description of the protocol, so that tests detect a
+//! mistake in one of the two.
 //!
 //! The times in whole microseconds, the names and the response types of the A1 come from a real A1M8 with firmware
 //! 1.29. The values of the other models come from their data sheets and the logs of the vendor's driver, and were not
@@ -29,14 +30,14 @@ pub enum Model {
     C1,
 }
 
-/// Format of the points of a mode, which is the type in the descriptor of the mode.
+/// Format of the packets of a mode. The descriptor of the mode's stream contains it as a type.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PacketFormat {
     /// 0x81: one point in 5 bytes.
     Standard,
     /// 0x82: 32 points in 84 bytes, with a correction of each angle.
     Express,
-    /// 0x84: 96 points in 132 bytes, two of three ranges predicted.
+    /// 0x84: 96 points in 132 bytes. Two of three ranges are sent as differences.
     Ultra,
     /// 0x85: 40 points in 84 bytes.
     Dense,
@@ -51,7 +52,7 @@ pub struct Mode {
     pub name: &'static str,
     /// Time from one point to the next in microseconds, as the scanner reports it. A real A1 takes 0.7 % longer.
     pub sample_us: f64,
-    /// Format of its points.
+    /// Format of the packets.
     pub form: PacketFormat,
     /// Maximum range that the scanner reports, in meters.
     pub reach_m: f64,
@@ -60,16 +61,16 @@ pub struct Mode {
 /// Control of the motor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Motor {
-    /// The signal DTR. A pty does not have it, so the motor runs while the power is on.
+    /// The signal DTR switches the motor. A pty does not have this signal, so the motor runs while the power is on.
     Dtr,
-    /// An accessory board that receives a duty cycle.
+    /// An accessory board controls the motor. Requests to the board contain a duty cycle.
     Pwm,
-    /// The scanner itself, which receives revolutions per minute.
+    /// The scanner itself controls the motor. Requests contain revolutions per minute.
     Rpm,
 }
 
 impl PacketFormat {
-    /// Returns the type in the descriptor.
+    /// Returns the type in the descriptor of a stream in this format.
     pub fn response_type(self) -> u8 {
         match self {
             PacketFormat::Standard => 0x81,
@@ -145,7 +146,7 @@ impl Model {
         }
     }
 
-    /// Returns the modes. The index of each is its number.
+    /// Returns the modes. The index of a mode is the number by which a host requests it.
     pub fn modes(self) -> &'static [Mode] {
         match self {
             Model::A1 | Model::A2m8 => &MODES_8K,
@@ -168,13 +169,13 @@ impl Model {
         }
     }
 
-    /// Returns the revolutions per second with factory settings. A real A1 sent 1,954 points per second, and 264 to 267
-    /// of them per revolution.
+    /// Returns the revolutions per second with factory settings. The value of the A1 follows from a real A1, which sent
+    /// 1,954 points per second and 264 to 267 points per revolution.
     pub fn revolutions_per_second(self) -> f64 {
         if self == Model::A1 { 7.36 } else { 10.0 }
     }
 
-    /// Returns the minimum and maximum range of the data sheet in millimeters.
+    /// Returns the minimum and the maximum range according to the data sheet, in millimeters.
     pub(crate) fn reach_mm(self) -> std::ops::RangeInclusive<f64> {
         match self {
             Model::A1 => 150.0..=12_000.0,
@@ -202,8 +203,8 @@ impl Model {
         }
     }
 
-    /// Returns the version of the firmware as (major, minor), and the number of the hardware. The vendor's driver
-    /// expects 256,000 baud from an A2 or A3 with hardware 6.
+    /// Returns the version of the firmware as (major, minor), and the number of the hardware. An A2 or A3 at 256,000
+    /// baud must have hardware 6, because the vendor's driver expects this rate from it.
     fn versions(self) -> ([u8; 2], u8) {
         match self {
             Model::A1 => ([1, 29], 5),
@@ -214,8 +215,8 @@ impl Model {
         }
     }
 
-    /// Returns how long a microsecond of the scanner's clock takes, in microseconds of the host. A real A1 reported 508
-    /// us per point, and sent 1,954 points per second.
+    /// Returns the duration of a microsecond of the scanner's clock, in microseconds of the host's clock. They differ
+    /// for the A1: a real A1 reported 508 us per point, but sent 1,954 points per second.
     pub(crate) fn clock_ratio(self) -> f64 {
         if self == Model::A1 { 1.0 / (508e-6 * 1_954.0) } else { 1.0 }
     }
@@ -226,7 +227,8 @@ const fn mode(name: &'static str, sample_us: f64, form: PacketFormat, reach_m: f
 }
 
 /// Returns the modes of a scanner that triangulates. A point takes `us` microseconds in the fastest modes, and
-/// `stable_us` in mode Stability.
+/// `stable_us` in mode Stability. The maximum range is `reach_m` in modes Standard and Express, and `fast_reach_m` in
+/// the other modes.
 const fn modes(us: f64, stable_us: f64, reach_m: f64, fast_reach_m: f64) -> [Mode; 5] {
     [
         mode("Standard", 4.0 * us, PacketFormat::Standard, reach_m),
@@ -240,7 +242,7 @@ const fn modes(us: f64, stable_us: f64, reach_m: f64, fast_reach_m: f64) -> [Mod
 const MODES_8K: [Mode; 5] = modes(127.0, 201.0, 12.0, 12.0);
 const MODES_A2M12: [Mode; 5] = modes(63.0, 100.0, 12.0, 12.0);
 const MODES_A3: [Mode; 5] = modes(63.0, 100.0, 16.0, 25.0);
-/// The rate of the line limits the standard mode.
+/// Modes of the S1. In the standard mode, the time per point is longer, because the line carries no more packets.
 const MODES_S1: [Mode; 3] = [
     mode("Standard", 217.0, PacketFormat::Standard, 16.0),
     mode("Express", 108.5, PacketFormat::Express, 16.0),
@@ -264,23 +266,23 @@ pub(crate) enum Request {
     Scan,
     /// Start the standard mode at any speed of the motor.
     Force,
-    /// The number of a mode.
+    /// Start the mode with this number.
     Express(u8),
     Info,
     Health,
     SampleRate,
-    /// The key of a value, and the mode that it describes.
+    /// Report the value of `key` for `mode`.
     Configuration {
         key: u32,
         mode: u16,
     },
-    /// The key of a value to store in the scanner.
+    /// Store a value with this key in the scanner.
     SetConfiguration(u32),
-    /// Duty cycle of the motor, 0 to 1,023.
+    /// Set the duty cycle of the motor, 0 to 1,023.
     Pwm(u16),
-    /// Revolutions per minute.
+    /// Set the revolutions per minute of the motor.
     Rpm(u16),
-    /// Capabilities of the accessory board.
+    /// Report the capabilities of the accessory board.
     Board,
 }
 
@@ -291,8 +293,8 @@ pub(crate) struct Decoder {
 }
 
 impl Decoder {
-    /// Adds a byte, and returns the request that it completes. Requests with a wrong checksum, a wrong length or an
-    /// unknown command are dropped.
+    /// Adds a byte, and returns the request that the byte completes. Requests with a wrong checksum, a wrong length or
+    /// an unknown command are dropped.
     pub(crate) fn receive(&mut self, byte: u8) -> Option<Request> {
         if self.bytes.is_empty() && byte != REQUEST_START {
             return None;
@@ -342,8 +344,8 @@ impl Request {
     }
 }
 
-/// Encodes a descriptor: `A5 5A`, the length of a response in 30 bits, 2 bits that announce further responses, and the
-/// type.
+/// Encodes a descriptor: `A5 5A`, the length of a response's data in 30 bits, 2 bits that announce further responses,
+/// and the type.
 fn descriptor(len: usize, has_more: bool, response_type: u8) -> Vec<u8> {
     let word = len as u32 | u32::from(has_more) << 30;
     [&[0xA5, 0x5A][..], &word.to_le_bytes(), &[response_type]].concat()
@@ -358,7 +360,8 @@ pub(crate) fn stream_descriptor(mode: &Mode) -> Vec<u8> {
     descriptor(mode.form.packet_len(), true, mode.form.response_type())
 }
 
-/// Encodes the number `id` of the model, firmware, hardware, and a serial number that `seed` selects.
+/// Encodes the response to the request for information: the number `id` of the model, the versions of firmware and
+/// hardware, and a serial number that is drawn from `seed`.
 pub(crate) fn info(model: Model, id: u8, seed: u64) -> Vec<u8> {
     let ([major, minor], hardware) = model.versions();
     let mut random = fastrand::Rng::with_seed(seed ^ u64::from(model.id()) << 32);
@@ -372,7 +375,7 @@ pub(crate) fn health(status: u8, code: u16) -> Vec<u8> {
     response(&[status, low, high], 0x06)
 }
 
-/// Encodes the time per point in the standard mode and in the first express mode, in microseconds.
+/// Encodes the times per point in the modes with the numbers 0 and 1, in microseconds.
 pub(crate) fn sample_rate(model: Model) -> Vec<u8> {
     let micros = |number: usize| (model.modes()[number].sample_us.round() as u16).to_le_bytes();
     response(&[micros(0), micros(1)].concat(), 0x15)
@@ -383,7 +386,7 @@ pub(crate) fn configuration(model: Model, typical: usize, key: u32, mode: u16) -
     let of = model.modes().get(usize::from(mode));
     let eighths = |value: f64| ((value * 256.0).round() as u32).to_le_bytes().to_vec();
     let value = match key {
-        // Recommended revolutions per minute, and the duty cycle that leads to this speed.
+        // The recommended revolutions per minute, and the duty cycle that results in this speed.
         0x01 => {
             let rpm = (60.0 * model.revolutions_per_second()).round() as u16;
             [rpm.to_le_bytes(), DEFAULT_PWM.to_le_bytes()].concat()
@@ -425,7 +428,8 @@ pub(crate) fn boot_message(model: Model, id: u8) -> Vec<u8> {
 pub(crate) struct Reading {
     /// Angle of the head, clockwise from its zero, 0 to 360 degrees.
     pub(crate) head_deg: f64,
-    /// Angle of the point, seen from the middle of the head. It differs from `head_deg` if the laser is off-center.
+    /// Clockwise angle of the point, seen from the middle of the head. It differs from `head_deg` if the laser is
+    /// off-center.
     pub(crate) clockwise_deg: f64,
     /// Range in millimeters; 0 means no return.
     pub(crate) range_mm: u16,
@@ -435,8 +439,8 @@ pub(crate) struct Reading {
     pub(crate) begins_revolution: bool,
 }
 
-/// Encodes a packet of type 0x81: quality and the flag of a new revolution with its inverse, the angle in 1/64 degree
-/// with a bit that is always 1, and the range in 1/4 millimeter.
+/// Encodes a packet of type 0x81. The first byte has the quality, the flag of a new revolution, and the inverse of this
+/// flag. The angle in 1/64 degree follows, with a lowest bit that is always 1, and then the range in 1/4 millimeter.
 pub(crate) fn standard(reading: &Reading) -> Vec<u8> {
     let flags = if reading.begins_revolution { 0b01 } else { 0b10 };
     let angle = sixty_fourths(reading.clockwise_deg) << 1 | 1;
@@ -446,8 +450,8 @@ pub(crate) fn standard(reading: &Reading) -> Vec<u8> {
     packet
 }
 
-/// Encodes a packet of type 0x82: 16 pairs of points. Each point has its range, and its lag behind the head's angle, in
-/// 1/8 degree. The lag has 6 bits, and its upper two are the lowest bits of the range's word.
+/// Encodes a packet of type 0x82: 16 pairs of points. Each point has its range, and its lag behind the head's angle in
+/// 1/8 degree. The lag has 6 bits. Its upper two bits are the lowest bits of the word with the range.
 pub(crate) fn express(is_first: bool, readings: &[Reading]) -> Vec<u8> {
     let mut body = start_angle(is_first, readings);
     for pair in readings.chunks(2) {
@@ -463,9 +467,10 @@ pub(crate) fn express(is_first: bool, readings: &[Reading]) -> Vec<u8> {
     with_checksum(body)
 }
 
-/// Encodes a packet of type 0x84: 32 words. Each word has one range of 12 bits, on a scale whose steps grow with the
-/// range. Two differences of 10 bits follow, in steps of that scale: one from this range, and one from the range of the
-/// next word. A range that no difference can encode becomes no return. `next` is the first range of the next packet.
+/// Encodes a packet of type 0x84: 32 words with three ranges each. The first range has 12 bits, on a scale whose steps
+/// grow with the range. The second range is sent as its difference from the first range, and the third range as its
+/// difference from the first range of the next word. Both differences have 10 bits, in steps of that scale. If a range
+/// cannot be encoded as a difference, its point has no return. `next` is the first reading of the next packet.
 pub(crate) fn ultra(is_first: bool, readings: &[Reading], next: &Reading) -> Vec<u8> {
     let mut body = start_angle(is_first, readings);
     let majors: Vec<u16> =
@@ -488,11 +493,12 @@ pub(crate) fn dense(is_first: bool, readings: &[Reading]) -> Vec<u8> {
     with_checksum(body)
 }
 
-/// Encodes a packet of type 0x86: the scanner's clock and state, and 32 pairs of 20 bits. Each point has a scale of 2
-/// to 5 mm, a range on this scale, and the upper bits of the quality.
+/// Encodes a packet of type 0x86: the scanner's clock in microseconds, its state, and 32 pairs of points with 20 bits
+/// each. The bits of a point have the number of a scale with steps of 2 to 5 mm, the range on this scale, and the upper
+/// bits of the quality.
 pub(crate) fn ultra_dense(is_first: bool, clock: u32, readings: &[Reading]) -> Vec<u8> {
     let mut body = clock.to_le_bytes().to_vec();
-    // The state of the scanner. The vendor's headers name it, without its values.
+    // The state of the scanner. The vendor's headers have this field, but do not describe its values.
     body.extend([0, 0]);
     body.extend(start_angle(is_first, readings));
     for pair in readings.chunks(2) {
@@ -503,13 +509,14 @@ pub(crate) fn ultra_dense(is_first: bool, clock: u32, readings: &[Reading]) -> V
     with_checksum(body)
 }
 
-/// Encodes the angle of the head at the first point, and whether the stream begins with this packet.
+/// Encodes the angle of the head at the first point, and the flag of the first packet of a stream.
 fn start_angle(is_first: bool, readings: &[Reading]) -> Vec<u8> {
     let start = sixty_fourths(readings[0].head_deg) | u16::from(is_first) << 15;
     start.to_le_bytes().to_vec()
 }
 
-/// Returns `body` with its checksum in front: the XOR of all its bytes, with four bits after each of the marks A and 5.
+/// Returns `body` with its checksum in front. The checksum is the XOR of all bytes of `body`. It takes two bytes: `A`
+/// and its lower four bits, and `5` and its upper four bits.
 fn with_checksum(body: Vec<u8>) -> Vec<u8> {
     let sum = body.iter().fold(0, |sum, byte| sum ^ byte);
     [vec![0xA0 | sum & 0x0F, 0x50 | sum >> 4], body].concat()
@@ -520,12 +527,13 @@ fn sixty_fourths(degrees: f64) -> u16 {
     (degrees * 64.0).round() as u16 % (360 * 64)
 }
 
-/// Converts millimeters to 1/4 millimeter. A range that does not fit becomes no return.
+/// Converts millimeters to 1/4 millimeter. A range that does not fit becomes 0, which means no return.
 fn quarter_mm(range_mm: u16) -> u16 {
     range_mm.checked_mul(4).unwrap_or(0)
 }
 
-/// Start of each scale of the 12-bit ranges: the first number, its range in millimeters, and the logarithm of a step.
+/// Scales of the 12-bit ranges. Each scale has the first 12-bit number on it, the range of this number in millimeters,
+/// and the binary logarithm of a step in millimeters.
 const SCALES: [(u16, u16, u32); 5] =
     [(3_328, 1 << 14, 4), (1_792, 1 << 12, 3), (1_280, 1 << 11, 2), (512, 1 << 9, 1), (0, 0, 0)];
 
@@ -537,19 +545,21 @@ fn scaled(range_mm: u16) -> u16 {
     if number < 1 << 12 { number } else { 0 }
 }
 
-/// Returns the range of a 12-bit number in millimeters, and the logarithm of a step there.
+/// Returns the range of a 12-bit number in millimeters, and the binary logarithm of a step on the scale of this number.
 fn unscaled(number: u16) -> (i32, u32) {
     let scale = SCALES.into_iter().find(|(from, ..)| number >= *from);
     let (from, from_mm, level) = scale.unwrap_or_default();
     (i32::from(from_mm) + (i32::from(number - from) << level), level)
 }
 
-/// Returns half of a step. Adding it before a shift rounds to the nearest step.
+/// Returns half of a step whose binary logarithm is `level`. A caller that adds it before a shift rounds to the nearest
+/// step.
 fn half(level: u32) -> i32 {
     (1 << level) / 2
 }
 
-/// Returns the 10 bits of the difference of `range_mm` from `base`. The lowest number means no return.
+/// Returns the 10 bits of the difference of `range_mm` from a base, which has a range and the binary logarithm of a
+/// step. The lowest number means no return.
 fn predicted(range_mm: u16, (base_mm, level): (i32, u32)) -> u32 {
     const NO_RETURN: i32 = -512;
     let steps = (i32::from(range_mm) - base_mm + half(level)) >> level;
@@ -570,9 +580,9 @@ fn twenty_bits(reading: &Reading) -> u32 {
 
 /// First byte of every request.
 const REQUEST_START: u8 = 0xA5;
-/// The bit of a command that has a payload.
+/// The bit that is set in a command with a payload.
 const PAYLOAD_FLAG: u8 = 0x80;
-/// Duty cycle for the recommended speed, of 1,023. It is the vendor's default.
+/// Duty cycle for the recommended speed, where 1,023 is the maximum. It is the vendor's default.
 pub(crate) const DEFAULT_PWM: u16 = 660;
 /// Length of the boot message in bytes.
 const BOOT_MESSAGE_LEN: usize = 64;

@@ -1,5 +1,5 @@
-//! A simulator in a thread, a directory for its files, and a host. The host opens the simulator's port, writes
-//! requests, and finds the telegrams in the received bytes.
+//! A bench for tests of the verb `simulate`: a simulator in a thread, a directory for its files, and a host. The host
+//! opens the simulator's port, writes requests, and finds the telegrams in the received bytes.
 
 use std::io::Write;
 use std::os::fd::OwnedFd;
@@ -79,7 +79,7 @@ impl Simulator {
         panic!("no such telegram was sent");
     }
 
-    /// Returns the numbers and faults of the telegrams since the last call that did not arrive intact.
+    /// Returns index and fault of each telegram that did not arrive intact, of all telegrams since the last call.
     pub(crate) fn faults(&self) -> Vec<(u64, Fault)> {
         self.records.try_iter().filter_map(|record| Some((record.index, record.fault?))).collect()
     }
@@ -91,7 +91,7 @@ impl Simulator {
     }
 }
 
-/// A host with the port open.
+/// A host that has the simulator's port open.
 pub(crate) struct Host {
     pub(crate) port: OwnedFd,
     framer: Framer,
@@ -102,7 +102,7 @@ impl Host {
         Host::try_open(path, rate).unwrap()
     }
 
-    /// Opens a port that may be unplugged at any time.
+    /// Opens a port, or fails if the port is unplugged.
     pub(crate) fn try_open(path: &Path, rate: u32) -> Result<Host, Errno> {
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let host = Host { port: open(path, flags, Mode::empty())?, framer: Framer::default() };
@@ -127,7 +127,8 @@ impl Host {
         assert_eq!(rustix::io::write(&self.port, encoded.bytes()), Ok(encoded.bytes().len()));
     }
 
-    /// Returns the next telegram that arrives within `timeout`, or `None` if there is none or the port is unplugged.
+    /// Returns the next telegram that arrives within `timeout`. Returns `None` if no telegram arrives or the port is
+    /// unplugged.
     pub(crate) fn telegram(&mut self, timeout: Duration) -> Option<Vec<u8>> {
         let end = Instant::now() + timeout;
         loop {
@@ -157,7 +158,7 @@ impl Host {
         }
     }
 
-    /// Sends `request`, and returns its reply. Drops the telegrams before the reply.
+    /// Sends `request`, and returns the reply to it. Drops the telegrams before the reply.
     pub(crate) fn ask(&mut self, request: Request) -> Vec<u8> {
         self.write(request);
         loop {

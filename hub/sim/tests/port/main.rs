@@ -1,5 +1,6 @@
-//! Tests of the verb `simulate` on real ptys. A host opens the port, sends requests, reads, and compares the received
-//! bytes with the truth. Every wait ends with an event. The timeout of a wait is far longer than the event needs.
+//! Tests of the verb `simulate` on real ptys. A host opens the port, sends requests, and compares the received bytes
+//! with the telegrams that the simulator reports. The tests wait for events, and never for a fixed time. The timeout of
+//! a wait is far longer than the event needs.
 
 #![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
 
@@ -130,7 +131,7 @@ fn wrong_rate_garbles_both_directions() {
     let mut host = Host::open(&port, 500_000);
     host.ask(Request::Stream);
     host.set_rate(250_000);
-    // The record of the reply to the previous request comes before the record of the first garbled scan.
+    // Skip the record of the reply to the previous request. The record of the first garbled scan follows.
     while simulator.record().fault != Some(Fault::Baud) {}
     host.write(Request::Status);
     let mut garbled = 1;
@@ -139,7 +140,7 @@ fn wrong_rate_garbles_both_directions() {
         assert!(!record.is_reply, "replied at the wrong rate");
         garbled += usize::from(record.fault == Some(Fault::Baud));
     }
-    // The bytes in the host's buffer are garbled, except for a scan that arrived before the change.
+    // Drop the bytes in the host's buffer. They are garbled, except for a scan that arrived before the change of rate.
     let mut buffer = vec![0; 30_000];
     assert!(rustix::io::read(&host.port, &mut buffer).unwrap() > 0);
     host.set_rate(500_000);
@@ -203,7 +204,7 @@ fn replay_is_sent_once_in_order_then_line_is_silent() {
         let telegram = host.telegram(WAIT_TIMEOUT).expect("a scan");
         assert!(&telegram == scan, "not scan {number}; sent: {:?}", simulator.faults());
     }
-    // The scanner still replies. The count below proves that the scanner sent nothing else.
+    // The scanner still replies to a request. The counts below prove that it sent no more scans.
     host.ask(Request::Status);
     let (summaries, records) = simulator.end();
     assert_eq!(records.iter().filter(|record| is_data(record)).count(), 100);
@@ -287,7 +288,7 @@ fn unplugged_port_disappears_and_returns_by_name() {
     let simulator = Simulator::start(SimulateOptions { faults, state, ..options(port.clone()) });
     let first = fs::read_link(&port).unwrap();
     for _ in 0..2 {
-        // On a busy machine, the port may be unplugged before a scan is complete.
+        // On a busy machine, the port may be unplugged before a scan is complete, so open it until a scan arrives.
         let mut plugged = None;
         wait_until("a scan", || {
             plugged = Host::try_open(&port, 500_000).ok();

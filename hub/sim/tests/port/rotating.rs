@@ -1,4 +1,4 @@
-//! Tests of rotating scanners on a real pty: a host reads the telegrams that the truth lists.
+//! Tests of rotating scanners on a real pty: a host receives the packets that the truth file lists.
 
 use std::fs;
 use std::time::{Duration, Instant};
@@ -20,7 +20,7 @@ use scanhub_sim::simulate::Record;
 use crate::WAIT_TIMEOUT;
 use crate::bench::{Host, Simulator, TestFolder};
 
-/// Reads bytes until there are `len` of them.
+/// Reads bytes until at least `len` bytes have arrived.
 fn read(host: &Host, len: usize) -> Vec<u8> {
     let (end, mut bytes) = (Instant::now() + WAIT_TIMEOUT, Vec::new());
     while bytes.len() < len {
@@ -77,7 +77,8 @@ fn received_packets_match_the_truth_file() {
     }
 }
 
-/// The host opens the port after both restarts, so a delay of the host has no influence.
+/// The scanner restarts after a dip of the voltage, and after a power cycle. The host opens the port after both
+/// restarts, so it does not matter when the host runs.
 #[test]
 fn rplidar_restarts_after_brownout_and_power_cycle() {
     for model in [Model::A1, Model::S2] {
@@ -129,7 +130,8 @@ fn wrong_rate_garbles_and_unsupported_options_fail() {
     assert!(refused(SimulateOptions { state, ..of(Model::A1) }).message.contains("no state"));
 }
 
-/// Runs `session` on the port of `host` until it has delivered `revolutions`, and returns the received packets.
+/// Runs `session` on the port of `host` until the session has delivered this number of `revolutions`. Returns the
+/// packets that it received.
 fn receive(session: &mut LdSession, host: &Host, revolutions: usize) -> Vec<[u8; PACKET_LEN]> {
     let (end, mut packets, mut delivered) = (Instant::now() + WAIT_TIMEOUT, Vec::new(), 0);
     while delivered < revolutions {

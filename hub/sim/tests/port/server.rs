@@ -45,7 +45,7 @@ fn every_family_sends_true_telegrams_over_tcp() {
         (Some(Scanner::Ld(ld::Model::Ld19)), Vec::new()),
         (Some(rplidar), vec![0xA5, 0x82, 5, 1, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 5 ^ 1]),
     ] {
-        // At this speed, an LMS at 9,600 baud sends some scans in a short time.
+        // At four times the speed, even an LMS at 9,600 baud soon sends several scans.
         let simulator = Simulator::start(SimulateOptions { speed: 4.0, ..options(scanner) });
         let mut host = connect(&simulator);
         host.write_all(&request).expect("written");
@@ -78,7 +78,7 @@ fn second_host_is_refused_until_the_first_leaves() {
     let mut third = loop {
         let mut host = connect(&simulator);
         host.set_read_timeout(Some(Duration::from_millis(50))).expect("set");
-        // The server closes a new connection until it has detected that the first host has left.
+        // The server closes new connections until it has detected that the first host has disconnected.
         let is_away = matches!(host.read(&mut [0; 1]), Ok(0));
         if !is_away {
             break host;

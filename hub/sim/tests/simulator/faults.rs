@@ -1,8 +1,8 @@
-//! Tests of every fault of the table with a real session, in virtual time. The session delivers intact telegrams once,
-//! in order and bit for bit. It marks telegrams that the scanner did not send. Every byte is counted, and no request
-//! writes the EEPROM. At the end, the session streams.
+//! Tests of every fault of `simulate` with a real session, in virtual time. The session delivers each intact telegram
+//! once, in order and bit for bit. If it delivers a telegram that the scanner did not send, it marks the telegram as
+//! suspect. It counts every byte, and sends no request that writes the EEPROM. At the end, the session streams.
 //!
-//! A failure prints the flags for `simulate` that create the same scanner on a pty.
+//! If a test fails, it prints the flags for `simulate` that create the same scanner on a pty.
 
 use std::collections::HashMap;
 
@@ -19,7 +19,7 @@ use scanhub_sim::room::Room;
 
 use crate::session::{Bench, ReceivedTelegram, SentTelegram};
 
-/// Runs `faults` with `seeds` seeds, and returns the sum of the results.
+/// Runs a scene with `faults` for each of `seeds` seeds, and returns the sum of the results.
 fn run_scene(faults: &str, span_ms: u64, seeds: u64) -> SceneResult {
     let all = run_seeds(&FaultScene::new(faults.parse().expect("faults"), span_ms), seeds);
     println!("{faults}: {all:?}");
@@ -36,7 +36,7 @@ fn run_seeds(scene: &FaultScene, seeds: u64) -> SceneResult {
     all
 }
 
-/// Number of seeds for each scene.
+/// Number of seeds with which each scene runs.
 const SEED_COUNT: u64 = 100;
 
 macro_rules! scenes {
@@ -50,7 +50,7 @@ macro_rules! scenes {
             }
         )*
 
-        /// Faults, their duration in milliseconds, and the check that they had an effect.
+        /// Scenes: the faults, their duration in milliseconds, and a function that checks that they had an effect.
         const SCENES: &[(&str, u64, fn(&SceneResult) -> bool)] = &[$(($faults, $span_ms, $least)),*];
     };
 }
@@ -74,8 +74,9 @@ fn every_fault_scene_has_an_effect() {
     }
 }
 
-/// Returns whether the session delivered only telegrams that the scanner sent. Faults that change or insert bytes are
-/// an exception. The checksum is valid for 1.19e-3 of all pairs of flipped bits, and such telegrams need no mark.
+/// Returns whether the session delivered only telegrams that the scanner sent. If faults change or insert bytes, it may
+/// deliver a few wrong telegrams with a suspect mark. If they flip bits, these telegrams need no mark, because the
+/// checksum stays valid for 1.19e-3 of all pairs of flipped bits.
 fn is_sound(all: &SceneResult, faults: &str) -> bool {
     let flips = faults.starts_with("flip");
     let changes = ["flip=", "insert=", "double=", "length=", "flood=", "wall="];
@@ -83,7 +84,7 @@ fn is_sound(all: &SceneResult, faults: &str) -> bool {
     all.wrong <= maximum && (flips || all.unmarked == 0)
 }
 
-// Minimum effect of each fault.
+// Each line has a name, faults, their duration in milliseconds, and their minimum effect.
 scenes! {
     nothing: "", 300, |all| all.intact > 600;
     bytes_lost: "loss=0.00135,burst=1.89", 320, |all| all.faulty > 120;
@@ -120,7 +121,7 @@ scenes! {
     nobody_answers: "mute=1", 300, |all| all.effects.unacknowledged >= 100 && all.recovery_ms > 100;
 }
 
-/// Faults and their duration, for one run.
+/// A scene: faults, their duration, and the state of the scanner at the start.
 struct FaultScene {
     faults: Faults,
     span_ms: u64,
@@ -128,16 +129,16 @@ struct FaultScene {
     is_idle: bool,
 }
 
-/// Result of a run.
+/// Result of one run of a scene, or the sum of several results.
 #[derive(Debug, Default)]
 struct SceneResult {
     /// Number of telegrams that arrived as sent while the session streamed. The session delivered all of them.
     intact: usize,
     /// Number of telegrams that did not arrive as sent.
     faulty: usize,
-    /// Number of delivered telegrams that the scanner did not send; and number of these telegrams without a suspect
-    /// mark.
+    /// Number of delivered telegrams that the scanner did not send.
     wrong: usize,
+    /// Number of these telegrams that had no suspect mark.
     unmarked: usize,
     resyncs: u64,
     /// Longest time from the end of the faults until the session streams.
@@ -158,7 +159,8 @@ impl SceneResult {
 }
 
 impl FaultScene {
-    /// Creates a scene. Protocol quirks affect replies to requests, so a scanner with quirks is idle.
+    /// Creates a scene. A scanner with protocol quirks is idle at the start, because quirks affect the replies to
+    /// requests.
     fn new(faults: Faults, span_ms: u64) -> FaultScene {
         FaultScene { faults, span_ms, is_idle: faults.quirks() != ProtocolQuirks::default() }
     }
@@ -179,8 +181,8 @@ impl FaultScene {
         let healed = bench.now;
         let streams = |bench: &Bench| bench.is_streaming() && !bench.received_scans(healed).is_empty();
         let back = bench.run_until(&self.name(seed), SEARCH_TIMEOUT, streams);
-        // The session releases telegrams that were held back after damage when some intact ones have followed. It
-        // releases the last one after a pause.
+        // After damage, the session holds telegrams back until some intact telegrams have followed. It releases the
+        // last telegram after a pause.
         bench.run(80 * MILLIS);
         bench.to_host = Box::new(|_, _| Vec::new());
         bench.run(40 * MILLIS);
@@ -191,7 +193,7 @@ impl FaultScene {
         SceneResult { effects, resyncs: bench.session.stats().resyncs, recovery_ms: back / MILLIS, ..verdict }
     }
 
-    /// Compares the delivered telegrams with those that were sent.
+    /// Compares the telegrams that the session delivered with those that the scanner sent.
     fn compare(&self, bench: &Bench, seed: u64) -> SceneResult {
         let is_due = |sent: &SentTelegram| sent.was_streaming && !sent.damaged;
         let unmatched = align(&bench.sent, &bench.received, is_due);
@@ -228,27 +230,28 @@ fn world(seed: u64) -> &'static str {
     WORLDS[seed as usize % WORLDS.len()]
 }
 
-/// Maximum time until a session that must search for its scanner finds it.
+/// Maximum time until a session that searches for its scanner streams.
 const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
 
 /// Number of occurrences of each effect.
 #[derive(Debug, Default)]
 struct Effects {
-    /// Requests that reached the scanner and were not acknowledged.
+    /// Requests that reached the scanner, but that it did not acknowledge.
     unacknowledged: usize,
     naks: usize,
-    /// Number of replies to an ACK in addition to the first one.
+    /// Replies after an ACK, except the first reply after each ACK.
     extra_replies: usize,
     /// Replies 92h.
     refused: usize,
-    /// Acknowledgements and replies that are later than usual.
+    /// Acknowledgements that were later than usual.
     late_acknowledgements: usize,
+    /// Replies that were later than usual.
     late_replies: usize,
-    /// Number of scans whose time of arrival does not match the mirror's revolutions.
+    /// Scans that did not arrive a whole number of scan periods after the previous scan.
     unaligned_scans: usize,
     /// Telegrams that arrived twice.
     copies: usize,
-    /// Bytes between telegrams that the scanner did not send.
+    /// Bytes that arrived between telegrams, although the scanner did not send them.
     foreign: usize,
 }
 
@@ -303,22 +306,23 @@ fn last_before(times: &[Nanos], at: Nanos) -> Nanos {
     times.iter().rev().copied().find(|&time| time <= at).unwrap_or(at)
 }
 
-/// Telegrams without a partner after the pairing.
+/// Telegrams for which [`align`] found no partner.
 struct Unmatched<'a> {
-    /// Telegrams that were sent and due, but not delivered.
+    /// Telegrams that the scanner sent and that are due, but that the session did not deliver.
     lost: Vec<&'a SentTelegram>,
-    /// Telegrams that were delivered, but not sent.
+    /// Telegrams that the session delivered, but that the scanner did not send.
     unsent: Vec<&'a ReceivedTelegram>,
 }
 
-/// Pairs `received` with `sent`. Telegrams that are due must have a partner.
+/// Pairs equal telegrams in `received` and `sent`, in order, so that as few telegrams as possible have no partner.
+/// A telegram in `sent` needs a partner only if `is_due` returns true for it.
 fn align<'a>(
     sent: &'a [SentTelegram],
     received: &'a [ReceivedTelegram],
     is_due: impl Fn(&SentTelegram) -> bool,
 ) -> Unmatched<'a> {
     let same = |s: usize, r: usize| sent[s].telegram == received[r].telegram;
-    // best[s][r] has two numbers for the telegrams from `s` and `r` on: lost telegrams and wrong telegrams.
+    // best[s][r] is for the telegrams from `s` and `r` on: the minimum numbers of lost telegrams and wrong telegrams.
     let mut best = vec![vec![(0, 0); received.len() + 1]; sent.len() + 1];
     for s in (0..=sent.len()).rev() {
         for r in (0..=received.len()).rev() {

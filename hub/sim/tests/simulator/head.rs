@@ -1,6 +1,6 @@
-//! Tests of LDROBOT scanners in simulated rooms. The session reports the points that the scanners measured. If no model
-//! is configured, the number of beams is the number of points that the scanner measures per revolution, even after
-//! power failures.
+//! Tests of LDROBOT scanners in simulated rooms. The session reports the points that the scanner measured. If no model
+//! is configured, the session measures how many points a revolution has, and uses this number as the number of beams.
+//! The number stays right after power failures.
 
 use scanhub_drivers::ld::packet::PACKET_LEN;
 use scanhub_drivers::ld::{LdSession, Model, Problem};
@@ -40,7 +40,7 @@ struct Bench {
     intact: bool,
     sent: Vec<SentPacket>,
     packets: Vec<[u8; PACKET_LEN]>,
-    /// Reported time of arrival of each packet.
+    /// Time of arrival that the session reports for each packet.
     stamps: Vec<Nanos>,
     revolutions: Vec<Revolution>,
 }
@@ -108,7 +108,7 @@ impl Bench {
     fn transmit(&mut self) {
         while let Some(carried) = self.line.poll_transmit(&mut self.scanner, self.now) {
             self.intact &= carried.fault.is_none();
-            // The host cannot read bytes at another rate.
+            // A host at another rate than the line does not receive the bytes.
             if carried.rate == self.session.rate() {
                 self.inbox.extend(carried.bytes);
             }
@@ -119,7 +119,8 @@ impl Bench {
         }
     }
 
-    /// Returns the end of the session's wait, and whether it waits for bytes.
+    /// Carries out the session's actions until it waits. Returns the end of the wait, and whether the arrival of bytes
+    /// ends it.
     fn drain(&mut self) -> (Nanos, bool) {
         loop {
             match self.session.poll_action() {
@@ -150,7 +151,7 @@ impl Bench {
         self.scanner.brown_out(self.now);
     }
 
-    /// Checks that every intact packet arrived once and in order.
+    /// Checks that the session delivered every intact packet, in order.
     fn check_packets(&self) {
         let mut arrived = self.packets.iter();
         let due = self.sent.iter().filter(|sent| sent.intact && sent.at + 20 * MILLIS < self.now);
@@ -159,9 +160,10 @@ impl Bench {
         }
     }
 
-    /// Compares each revolution with the measurements of the head since `start`. The points of a revolution belong to
-    /// one revolution of the head and are in order. Without a mark, no point is missing, and the error of each point is
-    /// at most `angle_deg` and `range_mm`. Returns the largest error of a stamp.
+    /// Compares each revolution with the measurements of the head since `start`. The points of a revolution must belong
+    /// to one revolution of the head, and must be in order. If the revolution is not marked as incomplete, no point may
+    /// be missing, and the errors of each point may be at most `angle_deg` and `range_mm`. Returns the largest error of
+    /// a stamp.
     fn check_revolutions(&mut self, start: Nanos, angle_deg: f64, range_mm: f64) -> Nanos {
         let rate = f64::from(self.settings.model.points_per_second());
         let mut worst = 0;
@@ -217,7 +219,7 @@ fn every_point_matches_its_simulated_measurement() {
         let due = 9 * model.revolutions_per_second() as usize;
         assert!(bench.revolutions.len() >= due, "{model:?}: {} revolutions", bench.revolutions.len());
         assert!(bench.revolutions.iter().all(|revolution| !revolution.incomplete));
-        // Rounding hides half a millimeter of a range and a hundredth of a degree of an angle.
+        // Rounding alone causes errors of half a millimeter in a range and a hundredth of a degree in an angle.
         let worst = bench.check_revolutions(0, 0.05, 2.0);
         assert!(worst < 2 * MILLIS, "{model:?}: {worst}");
         bench.check_packets();
@@ -270,8 +272,8 @@ fn other_line_faults_cost_no_intact_packet() {
         bench.run(8 * ONE_SECOND);
         bench.check_packets();
         let worst = bench.check_revolutions(0, 0.05, 2.0);
-        // In this simulation, the bytes of a flood arrive at once, which is impossible on a real line. Bytes before
-        // them seem to have arrived at the time of the last read.
+        // In this simulation, all bytes of a flood arrive at once, which is impossible on a real line. The session
+        // computes the stamps of earlier bytes as if the line had carried the flood, so these stamps are too early.
         let early = if faults.contains("every") { 5 * MILLIS } else { 0 };
         assert!(worst < 5 * MILLIS + early, "{faults}: {worst}");
         let stats = bench.session.stats();
@@ -317,14 +319,15 @@ fn every_brown_out_is_a_restart() {
         let mut bench = Bench::new(LdSettings::of(model), &noiseless_world("wall640"), "", 3);
         bench.run(4 * ONE_SECOND);
         for restarts in 1..=12 {
-            // A falling voltage first makes the head slower.
+            // Simulate a voltage that falls: the head first becomes slower.
             let revolutions_per_second = f64::from(model.revolutions_per_second());
             for slow in 0..restarts {
                 bench.scanner.set_speed(revolutions_per_second * (1.0 - 0.03 * slow as f64));
                 bench.run(bench.now + 30 * MILLIS);
             }
             bench.brown_out();
-            // The times are odd, so that the clock has a different value each time. It wraps after 30 s.
+            // Wait for an uneven time, so that the scanner's clock, which wraps after 30 s, has another value at each
+            // restart.
             bench.run(bench.now + 2 * ONE_SECOND + restarts * 417 * MILLIS);
             assert_eq!(bench.session.stats().restarts, restarts, "{model:?}");
             assert_eq!(
@@ -353,7 +356,7 @@ fn line_faults_are_not_counted_as_restarts() {
         "flood=2000,flood_every=0.3",
         "abort=0.1,repeat=0.1",
     ] {
-        // The clock wraps three times.
+        // In 100 s, the scanner's clock wraps three times.
         let mut bench = Bench::new(LdSettings::of(Model::Ld19), &noiseless_world("bare"), faults, 11);
         bench.run(100 * ONE_SECOND);
         assert_eq!(bench.session.stats().restarts, 0, "{faults}");
@@ -388,7 +391,7 @@ fn points_stay_accurate_when_the_speed_changes() {
     let periods: Vec<_> = revolutions.windows(2).map(|pair| pair[1].first - pair[0].first).collect();
     let (shortest, longest) = (periods.iter().min().unwrap(), periods.iter().max().unwrap());
     assert!(*shortest < 87 * MILLIS && *longest > 155 * MILLIS, "{shortest} {longest}");
-    // The true points are only available since the last change of speed.
+    // The simulator returns true points only since the last change of speed, so drop the earlier revolutions.
     let after = revolutions.into_iter().filter(|revolution| revolution.first > 8_100 * MILLIS);
     bench.revolutions = after.collect();
     assert!(bench.revolutions.len() > 18, "{}", bench.revolutions.len());
@@ -426,7 +429,7 @@ fn same_seed_repeats_and_recording_replays_packets() {
     }
 }
 
-/// Byte loss that was measured on a real line at 500 kBd.
+/// Faults with the loss of bytes that was measured on a real line at 500,000 baud.
 const LOSS_FAULTS: &str = "loss=0.00135,burst=1.89";
 
 const SPIN_UP_TIMES_S: [f64; 4] = [0.0, 0.5, 1.5, 3.0];
@@ -438,7 +441,7 @@ fn new_bench(settings: LdSettings, seed: u64) -> Bench {
     bench
 }
 
-/// Returns the numbers of beams of the revolutions in order. Consecutive equal numbers occur once.
+/// Returns the numbers of beams of the revolutions in order. Equal consecutive numbers are listed once.
 fn beam_counts(bench: &Bench) -> Vec<usize> {
     let mut numbers: Vec<usize> = bench.revolutions.iter().map(|revolution| revolution.beams).collect();
     numbers.dedup();
@@ -492,7 +495,7 @@ fn beam_count_matches_points_per_revolution() {
             bench.run(10 * ONE_SECOND);
             let numbers = beam_counts(&bench);
             assert!(numbers.len() == 1 && numbers[0].abs_diff(beams) * 100 <= beams, "{numbers:?}");
-            // A configured number does not change.
+            // A configured number of beams does not change.
             let configured = Settings { beams: Some(300), ..Settings::default() };
             let mut bench = new_bench(settings, seed);
             bench.session = LdSession::new(configured, 0);

@@ -1,6 +1,6 @@
-//! Tests of the simulated scanners in virtual time. They are one binary with a module for each subject, so that their
-//! common dependencies are linked only once. The tests on ptys are in `tests/port`, because they must not compete with
-//! these tests for processors.
+//! Tests of the simulated scanners in virtual time. All these tests are one binary, with a module for each subject, so
+//! that the dependencies are linked only once. The tests on ptys are in `tests/port`, because they run in real time and
+//! must not compete with the tests of this binary for processors.
 
 mod faults;
 mod head;

@@ -1,5 +1,5 @@
-//! Tests that the bytes of a stream are sufficient to recognize the scanner's family. They cover every simulated
-//! scanner in every mode, from any byte on, also on a line that loses bytes.
+//! Tests that the bytes of a stream are sufficient to recognize the scanner's family. The tests cover every simulated
+//! scanner in every mode, streams that start at any byte, and lines that lose bytes.
 
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_drivers::recognize::{EXAMINED_BYTES, family_of};
@@ -14,7 +14,7 @@ use scanhub_sim::operating::ScanSource;
 use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{self, RplidarSettings, RplidarSimulator, RplidarStart};
 
-/// Returns the first bytes that arrive from `device` within 30 s. There are at most `len` of them.
+/// Returns the first `len` bytes that arrive from `device`. After 30 s, returns fewer bytes.
 fn first_bytes(device: &mut dyn Device, faults: &str, len: usize) -> Vec<u8> {
     let mut wire = LineModel::new(&faults.parse::<Faults>().expect("faults"), 3);
     let (mut now, mut bytes): (Nanos, _) = (0, Vec::new());

@@ -1,6 +1,6 @@
 //! Tests of conversions from a recording to a stream file (`.bin`) and back. For every model and mode of the rotating
-//! scanners, the stream file yields the same scans, wherever the recording starts. A stream file has no stamps, so
-//! stamps are not compared.
+//! scanners, reading the stream file gives the scans of the recording, at whatever point of the stream the recording
+//! starts. A stream file has no stamps, so the tests do not compare stamps.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -23,17 +23,17 @@ use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
 use tempfile::TempDir;
 
 const ONE_SECOND: Nanos = 1_000 * MILLIS;
-/// Length of a recording. The motor of an RPLIDAR takes 1.6 s to reach its speed.
+/// Duration of a recording. It includes the 1.6 s that the motor of an RPLIDAR needs to reach its speed.
 const RECORDING_LEN: Nanos = 9 * ONE_SECOND;
 /// Start of a recording that lacks the start of the stream.
 const LATE_START: Nanos = 4 * ONE_SECOND;
-/// Start of the clock of a file that is read.
+/// Time at which the clock of a session starts that reads a file.
 const FILE_CLOCK_START: Nanos = 10 * ONE_SECOND;
 /// Length of a packet of one point, in bytes.
 const POINT_PACKET_LEN: u64 = 5;
 const WALL_NS: u64 = 1_700_000_000_000_000_000;
 
-/// Telegrams, scans and status that a hub published of a scanner.
+/// Telegrams, scans and status of a scanner, as a hub publishes them.
 struct LiveStream {
     family: Family,
     telegrams: Vec<(Header, Vec<u8>)>,
@@ -100,7 +100,8 @@ impl LiveStream {
         live
     }
 
-    /// Writes the default topics of a recorder that is attached at `from`, or only the telegrams and the scans.
+    /// Writes the recording of a recorder that attached at `from`: telegrams and a foreground, and also the status if
+    /// `has_status` is set.
     fn record(&self, folder: &TempDir, from: Nanos, has_status: bool) -> PathBuf {
         let mut writer = Writer::begin(Vec::new(), "", BTreeMap::new()).unwrap();
         let mut room = vec![0; 32_768];
@@ -174,13 +175,13 @@ fn is_same(a: &Scan, b: &Scan) -> bool {
         && angles(a).iter().zip(&angles(b)).all(is_near)
 }
 
-/// Checks that `path` has the scans of `live` that began after `from`. If the recording starts in the middle of the
-/// stream, the first one may be missing.
+/// Checks that the file at `path` has the scans of `live` that began after `from`. If the recording starts in the
+/// middle of the stream, the first scan may be missing.
 fn check(name: &str, live: &LiveStream, from: Nanos, path: &Path) {
     let expected: Vec<_> = live.scans.iter().filter(|(first, _)| *first >= from).collect();
     let read = scans_of(path);
-    // A file that contains the time per point may yield an earlier first scan, because the live session had to measure
-    // that time first.
+    // If the file contains the time per point, its first scan may be earlier than that of the live session, which had
+    // to measure this time first.
     let earlier = (0..read.len().min(2)).find(|&number| is_same(&expected[0].1, &read[number])).unwrap_or(0);
     let read = &read[earlier..];
     let first = read.first().unwrap_or_else(|| panic!("{name}: no scan"));
@@ -195,7 +196,7 @@ fn check(name: &str, live: &LiveStream, from: Nanos, path: &Path) {
     assert!(read.len() > 20, "{name}: {}", read.len());
 }
 
-/// Checks that a stream file yields the scans of `live`, wherever the recording starts.
+/// Checks that a stream file has the scans of `live`, at whatever point of the stream the recording starts.
 fn check_stream_files(name: &str, live: &LiveStream) {
     let folder = TempDir::new().unwrap();
     for from in [0, LATE_START] {
@@ -206,9 +207,10 @@ fn check_stream_files(name: &str, live: &LiveStream) {
         assert_eq!(result.telegrams, recording.contents().telegrams, "{name}");
         let read = Recording::open(&stream).unwrap();
         assert_eq!((read.contents().form, read.family()), (Form::Telegrams, Some(live.family)), "{name}");
-        // A point without a checksum counts only if another one follows.
+        // In a format without a checksum, a packet is accepted only if another packet follows. The last packet
+        // therefore counts as damage.
         assert!(read.contents().damage.bytes <= POINT_PACKET_LEN, "{name}: {}", read.contents().damage);
-        // Several models of LDROBOT have the same rate and number of beams.
+        // Compare only rate and number of beams, because several models of LDROBOT share both and cannot be told apart.
         let model = |recording: &Recording| recording.model().unwrap().map(|model| (model.baud, model.beams));
         assert_eq!(model(&read), model(&recording), "{name}");
         let scanner_ns = read.contents().scanner_ns.expect("a clock of the scanner");
@@ -221,7 +223,7 @@ fn check_stream_files(name: &str, live: &LiveStream) {
                 .unwrap();
         assert!(scanner_ns.abs_diff(expected) < ONE_SECOND, "{name}: {scanner_ns} {expected}");
         check(&name, live, from, &stream);
-        // Convert the stream file to a file of packets with stamps, and that to a stream file.
+        // Convert the stream file to a recording, which has packets with stamps, and this recording to a stream file.
         let (again, _) = convert_file(&stream, "b.mcap");
         check(&format!("{name}, in MCAP"), live, from, &again);
         let (twice, _) = convert_file(&again, "c.bin");
@@ -265,8 +267,8 @@ fn ldrobot_stream_files_have_the_same_scans() {
     }
 }
 
-/// The packets alone do not determine the model or the time per point. The responses at the start of a stream do, and
-/// so does the topic `status`.
+/// The packets of an RPLIDAR alone do not determine the model or the time per point. The conversion takes both from the
+/// responses at the start of a stream, or from the topic `status`.
 #[test]
 fn refuses_stream_file_without_status_and_responses() {
     for model in Model::ALL {
@@ -289,8 +291,8 @@ fn refuses_stream_file_without_status_and_responses() {
     }
 }
 
-/// A stream file without the responses of the scanner can be read: its packets are found. Its scans need the model or
-/// the mode if the packets may be of two kinds.
+/// A stream file without the responses of the scanner can be read, because the reader finds the packets. If the packets
+/// may have two formats, the reader needs the model or the mode to form scans.
 #[test]
 fn ambiguous_stream_requires_model_or_mode() {
     let folder = TempDir::new().unwrap();

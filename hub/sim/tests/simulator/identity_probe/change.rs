@@ -1,5 +1,5 @@
 //! Tests of changes of permanent settings with the user's consent. The host writes the settings once and reads them
-//! back, and the stream resumes. If a step fails, the outcome states what is known.
+//! back, and the stream resumes. If a step fails, the outcome states which step, and which settings the scanner has.
 
 use scanhub_drivers::lms::IdentityProbe;
 use scanhub_drivers::lms::command::Password;
@@ -14,8 +14,8 @@ use scanhub_sim::operating::OperatingMode;
 
 use super::{Bench, machine, make_stream, sensor};
 
-/// Requests the scanner's identity. Returns a plan that changes nothing, the scanner, and the time at which the plan
-/// was complete.
+/// Requests the scanner's identity and settings. Returns a plan that changes no setting, the scanner, and the time at
+/// which the plan was complete.
 pub(crate) fn probe_and_plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {
     let mut bench = Bench::new(IdentityProbe::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
@@ -23,7 +23,7 @@ pub(crate) fn probe_and_plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSim
     (plan, bench.machine, bench.now)
 }
 
-/// Sets unit cm and mode 4.
+/// Changes `plan` so that it sets unit cm and mode 4.
 pub(crate) fn set_other_values(plan: &mut Plan) {
     plan.new.set(5, 4);
     plan.new.set(6, Unit::Cm.code());
@@ -148,12 +148,12 @@ fn lost_write_reply_causes_no_second_write() {
     let (mut plan, machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
     set_other_values(&mut plan);
     let mut bench = change(plan, machine, now);
-    // All bytes of the reply to the write are lost, including its ACK.
+    // The line loses all bytes of the reply to the write, including the ACK before it.
     let mut received = 0;
     bench.to_host = Box::new(move |bytes| {
         received += bytes.len();
-        // The bytes before the loss are an ACK and F4h of 42 bytes, and an ACK and A0h of 9 bytes. The lost bytes are
-        // an ACK and F7h of 43 bytes.
+        // Before the loss, the scanner sends an ACK and F4h with 42 bytes, and an ACK and A0h with 9 bytes. The lost
+        // bytes are an ACK and F7h with 43 bytes.
         if received > 53 && received <= 53 + 44 { Vec::new() } else { bytes }
     });
     bench.finish(120_000 * MILLIS);
@@ -220,7 +220,7 @@ fn outcome_is_right_despite_quirks_and_losses() {
     assert!(done >= 45, "{done} of 60");
 }
 
-/// Returns a filter that loses the first `count` requests to stop on the line.
+/// Returns a filter for bytes from the host that drops the end of the first `count` requests to stop the stream.
 fn losing_stops(mut count: usize) -> Box<dyn FnMut(Vec<u8>) -> Vec<u8>> {
     let mut last = [0; 6];
     Box::new(move |bytes| {
@@ -255,8 +255,8 @@ fn leaves_installation_mode_although_stops_are_lost() {
 
 #[test]
 fn stray_nak_does_not_repeat_an_eeprom_write() {
-    // In the first case, the change fails before the first reply. In the second case, it fails while the scanner
-    // writes: after an ACK and F4h of 42 bytes, and an ACK and A0h of 9 bytes.
+    // In the first case, a NAK arrives before the first reply. In the second case, it arrives while the scanner writes:
+    // after an ACK and F4h with 42 bytes, and an ACK and A0h with 9 bytes.
     for after in [0, 53] {
         let (mut plan, mut machine, now) = probe_and_plan(sensor(Baud::B38400), 0);
         set_other_values(&mut plan);
@@ -287,7 +287,8 @@ fn unreadable_write_reply_is_no_refusal() {
     bench.to_host = Box::new(move |bytes| {
         let before = received;
         received += bytes.len();
-        // The bytes are an ACK and F4h of 42 bytes, an ACK and A0h of 9 bytes, and an ACK. F7h of 43 bytes follows.
+        // The first 54 bytes are an ACK and F4h with 42 bytes, an ACK and A0h with 9 bytes, and an ACK. Replace the
+        // next telegram, F7h with 43 bytes.
         match before {
             54 => short.bytes().to_vec(),
             55..97 => Vec::new(),

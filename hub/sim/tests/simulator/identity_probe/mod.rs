@@ -1,6 +1,6 @@
-//! Tests of requests for the identity of a simulated scanner, in virtual time. The probe finds a scanner that replies
-//! at any rate and in any mode, and leaves it in the same state. The line may lose bytes. The scanner may overlook
-//! requests or be missing.
+//! Tests of requests for the identity of a simulated scanner, in virtual time. The probe finds a scanner at any rate
+//! and in any mode, and leaves the scanner in the state in which it was. Some tests have a line that loses bytes, a
+//! scanner that overlooks requests, or no scanner.
 
 mod change;
 mod random;
@@ -21,10 +21,10 @@ use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings, StartState};
 use scanhub_sim::operating::{OperatingMode, ScanSource};
 use scanhub_sim::room::Room;
 
-/// Change of bytes on the line.
+/// Changes bytes on the line: returns the bytes that arrive if the given bytes are sent.
 pub(crate) type ByteFilter = Box<dyn FnMut(Vec<u8>) -> Vec<u8>>;
 
-/// Both ends and the line.
+/// A host that runs a protocol, a scanner, and the line between them.
 pub(crate) struct Bench<C> {
     pub(crate) protocol: C,
     pub(crate) machine: LmsSimulator,
@@ -42,7 +42,7 @@ pub(crate) struct Bench<C> {
     last: Nanos,
 }
 
-/// Creates a scanner in a room, at this rate.
+/// Creates a scanner in a room. Its line has the rate `baud`.
 pub(crate) fn sensor(baud: Baud) -> LmsSimulator {
     machine(Settings { baud, seed: 1, ..Settings::default() })
 }
@@ -52,7 +52,7 @@ pub(crate) fn machine(settings: Settings) -> LmsSimulator {
     LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
-/// Sends `request` to `machine` like a previous host, and returns the time.
+/// Sends `request` to `machine`, as a previous host. Returns the time on the machine's clock afterwards.
 pub(crate) fn send(machine: &mut LmsSimulator, request: &EncodedTelegram) -> Nanos {
     let mut now = 10 * MILLIS;
     for &byte in request.bytes() {
@@ -64,7 +64,7 @@ pub(crate) fn send(machine: &mut LmsSimulator, request: &EncodedTelegram) -> Nan
     now
 }
 
-/// Makes `machine` stream.
+/// Makes `machine` stream. Returns the time on the machine's clock afterwards.
 pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
     send(machine, &Request::Stream.encode(0))
 }
@@ -193,7 +193,7 @@ impl<C: Protocol> Bench<C> {
     }
 }
 
-/// Time from an event until the host runs.
+/// Time from an event, such as the arrival of bytes, until the host runs.
 const WAKE_DELAY: Nanos = 50 * MICROS;
 
 /// Returns the request 20h 00h with the factory password.
@@ -223,7 +223,7 @@ fn identifies_scanner_at_each_rate_and_in_each_mode() {
                 let configuration = report.configuration().expect("was requested");
                 assert_eq!((configuration.mode(), configuration.unit()), (Mode(1), Some(Unit::Mm)));
                 println!("port at {first:?}, {word} at {baud:?}: {} ms", elapsed / MILLIS);
-                // The scanner is in its previous state.
+                // The scanner is in the same state as before the probe.
                 assert_eq!((bench.machine.baud(), bench.machine.eeprom_writes()), (baud, 0));
                 let scans = bench.collect_telegrams(2_000 * MILLIS);
                 assert_eq!(scans.is_empty(), mode != 0x24, "{word}");
@@ -364,7 +364,7 @@ fn repeats_an_overlooked_request() {
         let mut machine = sensor(baud);
         let now = make_stream(&mut machine);
         let mut bench = Bench::new(IdentityProbe::new(Baud::B500000, now), Baud::B500000, machine, now);
-        // A request without its first byte is invalid.
+        // Lose the first byte of some requests, which makes them invalid.
         let mut random = fastrand::Rng::with_seed(seed);
         bench.to_scanner =
             Box::new(move |bytes| if bytes[0] == 0x02 && random.f64() < 0.3 { Vec::new() } else { bytes });

@@ -1,6 +1,6 @@
-//! Tests of probes and changes with random bytes, random sequences of events and the fault table. Probes and
-//! changes do not panic, they end, and their results are true. A change writes no more often than permitted, and
-//! reports every write.
+//! Tests of probes and changes of settings with random bytes, random sequences of events, and faults of the scanner and
+//! the line. Probes and changes never panic, always end, and report what is true. A change writes no more often than
+//! permitted, and reports every write.
 
 use scanhub_drivers::line::{Action, Protocol};
 use scanhub_drivers::lms::IdentityProbe;
@@ -67,7 +67,8 @@ fn drive<C: Protocol>(protocol: &mut C, seed: u64) -> Vec<Vec<u8>> {
     panic!("no end, seed {seed}");
 }
 
-/// Returns noise, acknowledgements, or a telegram that a scanner may send, often the reply to `request`.
+/// Returns noise, acknowledgements, or a telegram that a scanner may send. The telegram is often the reply to
+/// `request`.
 fn random_bytes_or_reply(request: Option<u8>, random: &mut fastrand::Rng) -> Vec<u8> {
     let noise = |random: &mut fastrand::Rng, maximum| {
         (0..random.usize(..maximum)).map(|_| random.u8(..)).collect::<Vec<u8>>()
@@ -150,8 +151,8 @@ fn writes_the_plan_and_leaves_installation_mode() {
     assert!((1..=3).contains(&maximum), "{maximum} writes");
 }
 
-/// Faults. Each has the minimum number of 8 probes and the minimum number of 8 changes that must succeed despite the
-/// fault.
+/// Faults, each with the number of probes that must succeed despite the fault, and the number of changes that must
+/// succeed. Each test runs 8 probes and 8 changes.
 const SCENES: &[(&str, [usize; 2])] = &[
     ("loss=0.001,burst=3", [7, 7]),
     ("flip=0.001", [7, 7]),
@@ -174,7 +175,7 @@ const SCENES: &[(&str, [usize; 2])] = &[
     ("overlook=0.2,nak=0.1", [7, 7]),
 ];
 
-/// Returns a scanner for `seed`, idle or streaming, together with its rate and the time.
+/// Returns a scanner whose rate and state depend on `seed`: its rate, the scanner, the time, and whether it streams.
 fn any_scanner(seed: u64) -> (Baud, LmsSimulator, u64, bool) {
     let baud = Baud::ALL[seed as usize % 4];
     let mut machine = sensor(baud);
@@ -204,7 +205,7 @@ fn probe_report_is_right_despite_faults() {
             let report = bench.protocol.report();
             if let Some(status) = report.status() {
                 found += 1;
-                // The power may have failed after the report.
+                // If the faults contain power cycles, the power may have failed after the report.
                 if faults.power_every == 0.0 {
                     let mode = if is_streaming { 0x24 } else { 0x25 };
                     assert_eq!((report.baud, status.operating_mode()), (Some(baud), mode), "{text}, {seed}");
@@ -259,5 +260,5 @@ fn change_outcome_is_right_despite_faults() {
     }
 }
 
-/// Number of seeds. There is one for each rate, idle and streaming.
+/// Number of seeds. For each of the four rates, one scanner is idle and one streams.
 const SEED_COUNT: u64 = 8;

@@ -46,7 +46,7 @@ impl Bench {
         self.now = end;
     }
 
-    /// Sends `bytes` with idle time of `gap` before each of them.
+    /// Sends `bytes` to the scanner. The line is idle for `gap` before each byte.
     pub(crate) fn send(&mut self, bytes: &[u8], gap: Nanos) {
         for &byte in bytes {
             self.run_until(self.now + line_time(1, self.machine.baud().rate()) + gap);
@@ -75,7 +75,7 @@ impl Bench {
     }
 }
 
-/// Decodes the reply in `bytes`, which are an ACK and one telegram.
+/// Decodes the reply in `bytes`, which must be an ACK and one telegram.
 pub(crate) fn reply(bytes: &[u8]) -> Reply<'_> {
     assert_eq!(bytes[0], ACK);
     Reply::decode(Telegram::check(&bytes[1..]).expect("a whole telegram")).expect("a reply")
@@ -153,7 +153,8 @@ fn stream_keeps_its_grid_and_pauses_with_the_mirror() {
     let (first, last) = (sent[0].0, sent[sent.len() - 1].0);
     assert_eq!(last - first, (sent.len() as Nanos - 1) * 2 * MIRROR_PERIOD, "drifts");
     assert!(sent.iter().all(|(_, sent)| !sent.aborted && Telegram::check(&sent.telegram).is_some()));
-    // The last telegram consists of 508 bytes in 10.16 ms, a pause, and the rest in the next revolution of the mirror.
+    // The scanner sends 508 bytes of the last telegram in 10.16 ms, pauses, and sends the rest in the next revolution
+    // of the mirror.
     let start = last - MIRROR_PERIOD - line_time(224, 500_000);
     let mut through = 0;
     let mut pauses = 0;
@@ -189,7 +190,7 @@ fn period_at_each_rate_and_variant_is_as_listed() {
 fn request_aborts_the_scan_then_a_full_one_is_sent() {
     let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
-    // The request arrives in the middle of the first burst.
+    // The request arrives while the scanner sends the first 508 bytes of a scan.
     let next = bench.sent().last().unwrap().0 + 2 * MIRROR_PERIOD - 17_800 * MICROS;
     bench.run_until(next + 3 * MILLIS);
     let (before, sent_before) = (bench.chunks.len(), bench.sent().len());
@@ -198,7 +199,7 @@ fn request_aborts_the_scan_then_a_full_one_is_sent() {
     assert_eq!((sent[0].1.is_reply, sent[0].1.aborted), (false, true));
     assert_eq!((sent[1].1.is_reply, sent[1].1.aborted), (true, false));
     assert!(sent[2..].iter().all(|(_, sent)| !sent.is_reply && !sent.aborted));
-    // The bytes are the start of the scan, an ACK, the whole reply, and a whole scan.
+    // The received bytes are the start of the aborted scan, an ACK, the whole reply, and a whole scan.
     let broken = &sent[0].1.telegram;
     let head = bench.chunks[..before].iter().rev().take_while(|(_, chunk)| chunk.part == ChunkKind::Telegram);
     let head: usize = head.map(|(_, chunk)| chunk.bytes.len()).sum();
@@ -216,7 +217,7 @@ fn request_aborts_the_scan_then_a_full_one_is_sent() {
 fn request_between_bursts_also_aborts_the_scan() {
     let mut bench = Bench::new(fast_settings());
     bench.ask(Request::Stream.encode(0).bytes());
-    // The line has transmitted 508 bytes. The other bytes wait for the mirror.
+    // The scanner has sent 508 bytes, and waits for the next revolution of the mirror with the rest.
     let next = bench.sent().last().unwrap().0 + 2 * MIRROR_PERIOD - 17_800 * MICROS;
     bench.run_until(next + 11 * MILLIS);
     let sent_before = bench.sent().len();
@@ -281,7 +282,7 @@ fn counts_refused_and_executed_eeprom_writes() {
     let centimetres = Writer::new(0, 0x77).slice(&[0, 0, 0x70, 0, 0, 4, 0]).finish();
     let before = bench.chunks.len();
     bench.ask(centimetres.bytes());
-    // A change of the unit takes longer.
+    // A change of the unit takes longer than other requests.
     bench.run_until(bench.now + 1_000 * MILLIS);
     let written = bench.bytes_from(before);
     assert_eq!((written[5], written[6], written.len()), (0xF7, 1, 44));
@@ -311,8 +312,8 @@ fn recording_is_sent_once_despite_host_requests() {
 }
 
 proptest! {
-    /// Without faults, everything that the scanner sends is intact, byte for byte. This is true for any settings, even
-    /// if the scanner is polled late.
+    /// Without faults, every telegram that the scanner sends arrives intact, for any settings, even if the test polls
+    /// the scanner late.
     #[test]
     fn sent_telegrams_without_faults_are_intact(
         seed in any::<u64>(),
@@ -357,14 +358,14 @@ proptest! {
     }
 }
 
-/// A telegram, the bytes that arrived for it, and its fault.
+/// A telegram that the scanner sent, the bytes that arrived while the scanner sent it, and its fault.
 struct TransmittedTelegram {
     telegram: Vec<u8>,
     arrived: Vec<u8>,
     fault: Option<Fault>,
 }
 
-/// Returns everything that a scanner sends within `span` over a line with `faults`.
+/// Returns all telegrams that a scanner sends within `span` over a line with `faults`.
 fn transmit(faults: &str, seed: u64, chunk: ChunkSize, span: Nanos) -> Vec<TransmittedTelegram> {
     let settings = Settings {
         baud: Baud::B500000,

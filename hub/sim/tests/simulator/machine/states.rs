@@ -1,5 +1,5 @@
-//! Tests of the states of a simulated LMS. The states are operating modes that a previous host selected, power cycles
-//! and resets, and quirks.
+//! Tests of a simulated LMS in operating modes that a previous host selected, after power cycles and resets, and with
+//! protocol quirks.
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Password;
@@ -17,7 +17,7 @@ use scanhub_sim::{Arrival, DroppedRequest};
 
 use super::{Bench, fast_settings, reply};
 
-/// Returns the telegrams of a scanner in mode `operating` within a second, with the times of their last bytes.
+/// Returns the telegrams that a scanner in mode `operating` sends within a second, with the times of their last bytes.
 fn streamed_telegrams(operating: OperatingMode, settings: Settings) -> Vec<(Nanos, Vec<u8>)> {
     let code = operating.code();
     let mut bench = Bench::new(Settings { start: StartState::Operating(operating), ..settings });
@@ -30,7 +30,8 @@ fn streamed_telegrams(operating: OperatingMode, settings: Settings) -> Vec<(Nano
     sent.into_iter().map(|(at, sent)| (at, sent.telegram)).collect()
 }
 
-/// Checks that all `telegrams` have this length, this command, and this interval in revolutions of the mirror.
+/// Checks that all `telegrams` have the command `command` and the length `len`, and that `mirror_turns` revolutions of
+/// the mirror pass between two of them.
 fn assert_stream(telegrams: &[(Nanos, Vec<u8>)], command: u8, len: usize, mirror_turns: u64) {
     assert!(telegrams.len() > 3, "{}", telegrams.len());
     for pair in telegrams.windows(2) {
@@ -129,7 +130,7 @@ fn single_telegrams_can_be_requested() {
         let answer = bench.ask(request.finish().bytes());
         assert_eq!((answer[5], answer.len() - 1), (command, len));
     }
-    // An LMS 211 measures no more than 100 degrees.
+    // An LMS 211 refuses 180 degrees, because it measures no more than 100 degrees.
     let type_name = "LMS211;301063;V02.30 ".into();
     let mut bench = Bench::new(Settings { type_name, variant: Variant::ALL[3], ..fast_settings() });
     let kept = bench.ask(Writer::new(0, 0x3B).word(180).word(50).finish().bytes());
@@ -264,7 +265,8 @@ fn bench_with_quirks(quirks: ProtocolQuirks) -> Bench {
     Bench::new(Settings { quirks, ..fast_settings() })
 }
 
-/// Returns the number of type requests, out of 200, whose reply starts with the byte `first`.
+/// Sends 200 requests for the type to a scanner with `quirks`. Returns the number of replies that start with the byte
+/// `first`, or of missing replies if `first` is `None`.
 fn replies_of_200(quirks: ProtocolQuirks, first: Option<u8>) -> usize {
     let mut bench = bench_with_quirks(quirks);
     let request = Request::Type.encode(0);
@@ -326,7 +328,8 @@ fn mode_change_is_slow_but_status_is_immediate() {
         bench.run_until(bench.now + 2_000 * MILLIS);
         assert_eq!(bench.sent().len(), before + 1, "{request:?}");
     }
-    // A host that does not wait gets a reply, and never receives the confirmation of the change.
+    // If a host does not wait for the confirmation of a change and sends another request, it receives the reply to this
+    // request, but never the confirmation.
     assert_eq!(bench.ask(Request::Stop.encode(0).bytes()), [ACK]);
     let before = bench.sent().len();
     assert!(matches!(reply(&bench.ask(Request::Status.encode(0).bytes())), Reply::Status(_)));
@@ -381,8 +384,8 @@ fn installation_mode_blocks_measuring_if_strict() {
     }
 }
 
-/// Returns the number of requests, out of 100, that get a reply. Each request is written at once or with 55 us between
-/// its bytes.
+/// Sends 100 requests, half of them at once and half of them with one byte every 55 us. Returns the number of requests
+/// to which the scanner replies.
 fn unspaced_replies_of_100(bench: &mut Bench) -> usize {
     let request = Request::Stop.encode(0);
     let mut count = 0;

@@ -1,7 +1,7 @@
-//! Tests of the search. It finds scanners of all models and states in time, and sends no byte that a scanner should not
-//! receive. It finds a saved scanner nearly as soon as a session of the scanner's family. If a scanner gets power late,
-//! the search finds it soon after the scanner can reply. Bytes that no scanner sent never end a search. No scanner
-//! accepts a request at another rate.
+//! Tests of the search. The search finds scanners of all models in all states in time, and sends no byte that an
+//! unknown scanner should not receive. If the previous hub has saved the scanner, the search finds it nearly as soon as
+//! a session of its family does. If a scanner is switched on late, the search finds it soon after it can reply. Bytes
+//! that no scanner sent never end a search. No scanner accepts a request that was sent at another rate.
 
 use scanhub_drivers::line::{Action, KnownRate, Protocol as _, ScannerSession as _};
 use scanhub_drivers::lms::variant::{Baud, Variant};
@@ -21,7 +21,8 @@ use super::Bench;
 /// Creates a scanner with a seed.
 type CreateScanner = Box<dyn Fn(u64) -> Box<dyn Device>>;
 
-/// Returns all models and states: the name, the expected result, and a function that creates the scanner.
+/// Returns scanners of all models in all states: the name, the expected result, and a function that creates the
+/// scanner.
 pub(super) fn scanners() -> Vec<(String, FoundScanner, CreateScanner)> {
     let mut all: Vec<(String, FoundScanner, CreateScanner)> = Vec::new();
     for baud in Baud::ALL {
@@ -88,7 +89,8 @@ fn finds_every_scanner_behind_a_server() {
     assert!(times[times.len() - 1] <= 6_000 * MILLIS);
 }
 
-/// Returns the times at which rounds start, since the port was opened. Each round starts with a step at 230,400 baud.
+/// Returns the times from the open of the port to the start of each round of the search. A round starts with a step at
+/// 230,400 baud.
 fn round_starts(bench: &Bench) -> Vec<Nanos> {
     let begins = bench.rates.iter().filter(|(_, rate)| *rate == 230_400).map(|(at, _)| at - bench.opened_at);
     [0].into_iter().chain(begins).collect()
@@ -101,7 +103,7 @@ fn search_rounds_have_pauses_on_a_silent_line() {
     let begins = round_starts(&bench);
     println!("silent: rounds begin at {:?} ms", begins.iter().map(|at| at / MILLIS).collect::<Vec<_>>());
     assert!(begins[1].abs_diff(1_200 * MILLIS) < 60 * MILLIS);
-    // These are a longer round with a pause of 0.5 s, and a round with a pause of 1 s.
+    // The second round is longer, and a pause of 0.5 s follows it. A pause of 1 s follows the third round.
     assert!((begins[2] - begins[1]).abs_diff(3_060 * MILLIS) < 60 * MILLIS);
     assert!((begins[3] - begins[2]).abs_diff(2_200 * MILLIS) < 60 * MILLIS);
     let message = bench.host.problem().unwrap().message("/dev/ttyUSB0");
@@ -133,7 +135,7 @@ fn passes_all_reads_of_the_last_step_to_the_session() {
                 let read: Vec<_> =
                     bench.read.iter().filter(|(_, bytes)| !bytes.is_empty()).cloned().collect();
                 if found.family == Family::Rplidar {
-                    // Only the reply is passed to the session.
+                    // The search passes only the reply to the session.
                     assert!(
                         reads[0].1.starts_with(&[0xA5, 0x5A, 0x14, 0, 0, 0, 0x04]),
                         "{name}: {reads:02X?}"
@@ -192,7 +194,8 @@ fn restricted_search_sends_only_its_familys_requests() {
     }
 }
 
-/// Compares the search with a session of the family. Returns the maximum time by which the search is slower.
+/// Compares the search with a session of the scanner's family. Returns the maximum time by which the search finds the
+/// scanner later.
 fn max_extra_time(
     name: &str,
     memory: Memory,
@@ -235,7 +238,8 @@ fn finds_a_saved_lms_soon() {
         }
     };
     for baud in Baud::ALL {
-        // After a restart of the hub, and after a power cycle of a scanner that starts at this rate.
+        // `baud` is the rate at which the scanner starts after a power cycle. The first test is a restart of the hub,
+        // and the second test is a power cycle.
         let restarted = max_extra_time(
             "lms streams",
             memory(500_000, baud),
@@ -314,8 +318,9 @@ fn finds_a_replaced_scanner_despite_saved_state() {
 
 const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
-/// Returns the longest time from when scanners can reply until the search finds them. `create` creates the scanners.
-/// They get power `after` the port was opened, and then boot for `boot`.
+/// Returns the longest time from when a scanner can reply until the search finds the scanner. `create` creates
+/// scanners with several seeds. Each scanner is switched on `after` the port was opened, or a little later, and then
+/// boots for `boot`.
 fn worst_find_time(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -> Box<dyn Device>) -> Nanos {
     let times = (0..10).map(|seed| {
         let after = after + seed * 317 * MILLIS;
@@ -403,7 +408,7 @@ fn garbage_is_not_a_scanner() {
     for port in [PortKind::Serial, PortKind::Server, PortKind::Recording] {
         for seed in 0..6 {
             count += feed_search(port, seed, 200, 20, |random| random.u8(..));
-            // Frequent bytes are those that start telegrams and packets of the families.
+            // Send only bytes with which telegrams and packets of the families start.
             let heads = [0x02, 0x80, 0x81, 0xB0, 0xBA, 0x06, 0x54, 0x2C, 0xA5, 0x5A, 0x14, 0x04, 0x00, 0xFF];
             count += feed_search(port, seed, 200, 20, |random| heads[random.usize(..heads.len())]);
             count += feed_search(
@@ -424,7 +429,7 @@ fn garbage_is_not_a_scanner() {
 const LMS: [&[u8]; 2] = [&[0x02, 0, 1, 0, 0x3A, 0x1E, 0x12], &[0x02, 0, 1, 0, 0x31, 0x15, 0x12]];
 const RPLIDAR: [&[u8]; 3] = [&[0xA5, 0x25], &[0xA5, 0x50], &[0xA5, 0x25, 0xA5, 0x50]];
 
-/// Returns the requests of the search with their rates, and the time between two bytes.
+/// Returns each request of the search with its rate in bits per second and the gap between two bytes in nanoseconds.
 fn requests() -> Vec<(&'static [u8], u32, Nanos)> {
     let lms = Baud::ALL.into_iter().flat_map(|baud| LMS.map(|request| (request, baud.rate(), 120_000)));
     let rates = [115_200, 256_000, 460_800, 1_000_000];
@@ -432,7 +437,7 @@ fn requests() -> Vec<(&'static [u8], u32, Nanos)> {
     lms.chain(rplidar).collect()
 }
 
-/// Returns scanners by name, each idle and streaming. The flag is set for an LMS.
+/// Returns all scanners with their names, each once idle and once streaming. The flag is set for an LMS.
 fn receivers() -> Vec<(String, bool, Box<dyn Device>)> {
     let mut all: Vec<(String, bool, Box<dyn Device>)> = Vec::new();
     for streams in [false, true] {
@@ -449,8 +454,8 @@ fn receivers() -> Vec<(String, bool, Box<dyn Device>)> {
     all
 }
 
-/// Returns the bytes of `request` that a scanner at `rate` receives. The host sends the request at `sent_at`, with an
-/// error of `drift` percent and with `gap` between the bytes.
+/// Returns the bytes that a scanner at `rate` receives if the host sends `request` at the rate `sent_at`. The actual
+/// rate of the host differs from `sent_at` by `drift` percent. The line is idle for `gap` between the bytes.
 fn received_bytes(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f64) -> Vec<u8> {
     let rate_of_host = (f64::from(sent_at) * (1.0 + drift / 100.0)) as u32;
     let mut receiver = UartReceiver::new(rate_of_host, rate);
@@ -484,7 +489,7 @@ fn count_reactions(device: &mut dyn Device, now: &mut Nanos, end: Nanos) -> usiz
     count
 }
 
-/// Sends the requests of the search to an RPLIDAR at its own rate, and returns whether it replies.
+/// Sends the requests of the search to an RPLIDAR at the rate of its line, and returns whether the RPLIDAR replies.
 fn is_answered(device: &mut dyn Device, now: &mut Nanos) -> bool {
     for byte in [0xA5, 0x25, 0xA5, 0x50] {
         *now += line_time(1, device.rate());
@@ -532,8 +537,8 @@ fn no_request_is_accepted_at_another_rate() {
 
 #[test]
 fn stop_for_an_lms_would_disturb_an_rplidar() {
-    // The search never sends this request to an unknown scanner, because an RPLIDAR takes its bytes for the start of a
-    // long request.
+    // The search never sends this request to an unknown scanner, because an RPLIDAR can take the received bytes for the
+    // start of a long request.
     let stop = [0x02, 0x00, 0x02, 0x00, 0x20, 0x25, 0x35, 0x08];
     let is_disturbed = |tenths: i32| {
         let mut device = super::rplidar(Model::C1, false, 0, 1);

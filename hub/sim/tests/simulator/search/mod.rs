@@ -1,5 +1,5 @@
-//! Bench and tests of a search: a search and a simulated scanner at the two ends of a line, in virtual time. If port
-//! and scanner have different rates, bytes are garbled in both directions.
+//! Bench and tests of a search: a search and a simulated scanner at the two ends of a line, in virtual time. If the
+//! rates of port and scanner differ, bytes in both directions arrive garbled.
 
 mod finding;
 mod port;
@@ -21,7 +21,7 @@ use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
 use scanhub_sim::{Arrival, machine};
 
-/// Host at the end of the line: a search, or a session that the search is compared with.
+/// Host at the end of the line: a search, or a session with which the tests compare the search.
 pub(crate) trait Host {
     type Result;
 
@@ -44,7 +44,8 @@ pub(crate) enum HostAction<R> {
 }
 
 impl<R> HostAction<R> {
-    /// Returns the next action that `protocol` requests. `event` handles its events, and returns a result to end with.
+    /// Returns the next action that `protocol` requests. `event` handles the events of `protocol`. If it returns a
+    /// result, the host ends with this result.
     pub(crate) fn next_action(
         protocol: &mut impl Protocol,
         mut event: impl FnMut(line::Event<'_>) -> Option<R>,
@@ -78,7 +79,7 @@ impl Host for Search {
     }
 }
 
-/// A session of a named family. It ends when anything from the scanner arrives.
+/// A session of a named family. The host ends when the session delivers the first telegram or scan.
 pub(crate) struct NamedFamily<S>(pub(crate) S);
 
 impl<S: line::ScannerSession> Host for NamedFamily<S> {
@@ -93,10 +94,10 @@ impl<S: line::ScannerSession> Host for NamedFamily<S> {
     }
 }
 
-/// Both ends, the line, and what the host did.
+/// A host, a scanner, the line between them, and records of the host's actions.
 pub(crate) struct Bench<H = Search> {
     pub(crate) host: H,
-    /// `None` if no scanner is connected.
+    /// The scanner; `None` if no scanner is connected.
     pub(crate) device: Option<Box<dyn Device>>,
     line: LineModel,
     /// Time at which the scanner gets power.
@@ -110,11 +111,13 @@ pub(crate) struct Bench<H = Search> {
     pub(crate) unsupported_rates: Vec<u32>,
     to_host: BaudMismatch,
     to_device: BaudMismatch,
-    /// Time at which the last byte of the host has left, and whether the line was idle since then.
+    /// Time at which the line has carried the last byte of the host.
     last_sent_at: Nanos,
+    /// Whether the scanner's receiver was informed that the line is idle since then.
     is_flushed: bool,
     inbox: VecDeque<u8>,
-    /// Additional random bytes: the time of the next one, and the mean time between them.
+    /// Additional random bytes: the time of the next byte, and the mean time between two bytes. `None` without such
+    /// bytes.
     noise: Option<(Nanos, Nanos)>,
     random: fastrand::Rng,
     /// Bytes that the search has sent, with their times and rates.
@@ -129,7 +132,7 @@ pub(crate) fn room(seed: u64) -> Room {
     Room::new(&"random".parse().expect("a world"), seed)
 }
 
-/// Creates an LMS at `baud` that streams or not.
+/// Creates an LMS at `baud`, which streams if `streams` is set and is idle otherwise.
 pub(crate) fn lms(baud: Baud, streams: bool, seed: u64) -> Box<dyn Device> {
     let operating = if streams { OperatingMode::All } else { OperatingMode::OnRequest };
     let settings = machine::Settings {
@@ -146,7 +149,7 @@ pub(crate) fn ld(model: ld::Model, seed: u64) -> Box<dyn Device> {
     Box::new(LdSimulator::new(settings, room(seed)))
 }
 
-/// Creates an RPLIDAR that streams or not, and reports this health.
+/// Creates an RPLIDAR, which streams if `streams` is set, and reports the health status `health`.
 pub(crate) fn rplidar(model: Model, streams: bool, health: u8, seed: u64) -> Box<dyn Device> {
     let start = if streams { RplidarStart::Streaming } else { RplidarStart::Idle };
     let settings = RplidarSettings { start, health: (health, 1), seed, ..RplidarSettings::of(model) };
@@ -154,7 +157,7 @@ pub(crate) fn rplidar(model: Model, streams: bool, health: u8, seed: u64) -> Box
 }
 
 impl Bench {
-    /// Opens a port with a scanner that has run for some time, which `seed` selects.
+    /// Opens a port with a scanner that has been on for a time that depends on `seed`.
     pub(crate) fn new(
         device: Option<Box<dyn Device>>,
         port: PortKind,
@@ -181,8 +184,8 @@ impl Bench {
 }
 
 impl<S: line::ScannerSession> Bench<NamedFamily<S>> {
-    /// Opens a serial port for a session of a named family, which `begin` creates. Returns the time until something of
-    /// the scanner arrives.
+    /// Opens a serial port for a session of a named family, which `begin` creates. Returns the time until the session
+    /// delivers the first telegram or scan.
     pub(crate) fn find_named(begin: impl FnOnce(Nanos) -> S, device: Box<dyn Device>, seed: u64) -> Nanos {
         let mut rate = 0;
         let begin = |now| {
@@ -244,19 +247,19 @@ impl<H: Host> Bench<H> {
         }
     }
 
-    /// Switches the scanner on when this time has passed since the port was opened.
+    /// Switches the scanner on when the time `after` has passed since the port was opened.
     pub(crate) fn powered_after(mut self, after: Nanos) -> Self {
         (self.power_at, self.is_powered) = (self.now + after, false);
         self
     }
 
-    /// Adds random bytes, with this mean time between them.
+    /// Adds random bytes to the bytes of the scanner, with the mean time `mean` between two random bytes.
     pub(crate) fn with_noise(mut self, mean: Nanos) -> Self {
         self.noise = Some((self.now, mean));
         self
     }
 
-    /// Runs until the scanner is found, or for `span`. Returns the result and the time since the open.
+    /// Runs until the host finds the scanner, or for `span`. Returns the result and the time since the port was opened.
     pub(crate) fn find(&mut self, span: Nanos) -> Option<(H::Result, Nanos)> {
         let end = self.now + span;
         let found = self.run(end).map(|found| (found, self.now - self.opened_at));
@@ -264,7 +267,7 @@ impl<H: Host> Bench<H> {
         found
     }
 
-    /// Runs until `end`.
+    /// Runs until the host has a result, or until `end`.
     pub(crate) fn run(&mut self, end: Nanos) -> Option<H::Result> {
         while self.now < end {
             let until = match self.drain() {
@@ -332,7 +335,7 @@ impl<H: Host> Bench<H> {
         }
     }
 
-    /// Reports to the scanner that the line is idle.
+    /// Informs the scanner's receiver that the line is idle, so that it completes a garbled byte.
     fn flush(&mut self) {
         if !std::mem::replace(&mut self.is_flushed, true) {
             self.deliver(&[], true);
@@ -386,7 +389,8 @@ impl<H: Host> Bench<H> {
         self.now = self.now.max(to);
     }
 
-    /// Checks that the search sent only requests that an unknown scanner may get, and none just after the open.
+    /// Checks that the search sent only requests that an unknown scanner may receive, and no request just after the
+    /// port was opened.
     fn check_requests(&self) {
         const ALLOWED: [(&[u8], &[u32]); 4] = [
             (&[0x02, 0x00, 0x01, 0x00, 0x3A, 0x1E, 0x12], &[9_600, 19_200, 38_400, 500_000]),

@@ -11,11 +11,11 @@ use scanhub_sim::rplidar::Model;
 
 use super::{Bench, Host, HostAction};
 
-/// A host whose result is the first scan.
+/// A host that runs a session without a configured family, and ends when it has received enough scans.
 pub(crate) struct AutoHost {
     pub(crate) session: PortSession,
     scans: u64,
-    /// Number of scans at which the host returns.
+    /// Number of scans after which the host ends.
     wanted_scans: u64,
     bytes: u64,
 }
@@ -82,7 +82,7 @@ fn open(device: Option<Box<dyn Device>>, memory: Option<Memory>, seed: u64) -> B
     Bench::with_search(|now| host(memory, now), device, memory, seed)
 }
 
-/// Runs until the next scan. Returns the time that it took.
+/// Runs until the next scan arrives. Returns the time until then.
 fn next_scan(bench: &mut Bench<AutoHost>, context: &str) -> Nanos {
     let begin = bench.now;
     bench.host.wanted_scans = bench.host.scans + 1;
@@ -137,7 +137,7 @@ fn finds_every_family_and_saves_the_scanner() {
 #[test]
 fn telegrams_of_the_search_reach_the_session() {
     for seed in 0..20 {
-        // Both scanners are found by their streams, so they get no byte before the session starts.
+        // The search recognizes both scanners by their streams, so it sends no byte before the session starts.
         for (name, device, most_lost) in [
             ("lms", super::lms(Baud::B500000, true, seed), 814),
             ("ld", super::ld(ld::Model::Ld19, seed), 2 * 47),
@@ -146,7 +146,7 @@ fn telegrams_of_the_search_reach_the_session() {
             next_scan(&mut bench, name);
             let at_rate: u64 = bench.read.iter().map(|(_, bytes)| bytes.len() as u64).sum();
             let stats = bench.host.session.stats();
-            // All bytes of the last rate are in telegrams, except a fragment of the first one.
+            // All bytes that were read at the last rate are in telegrams, except those of an incomplete first telegram.
             let lost = at_rate - stats.in_telegrams - stats.buffered;
             assert!(lost < most_lost, "{name}, seed {seed}: {lost} of {at_rate}");
             assert_eq!(bench.written.is_empty(), name == "ld", "{name}, seed {seed}");
@@ -193,7 +193,7 @@ fn scans_arrive_at_a_port_that_rejects_rates() {
             let session = &bench.host.session;
             assert_eq!(session.family(), Some(family), "{name}");
             if family == Family::Lms && impossible.contains(&500_000) {
-                // The session did not switch the scanner to a rate that the port does not support.
+                // The session did not switch the scanner to 500,000 baud, because the port does not support this rate.
                 assert_eq!(session.rate(), 38_400, "{name}");
                 let problem = session.problem().map(|problem| problem.to_string()).unwrap_or_default();
                 assert!(problem.starts_with("the port does not support 500000 baud"), "{name}: {problem}");

@@ -1,4 +1,4 @@
-//! Tests of requests of a user to a running session: pause, resume, resync.
+//! Tests of the requests of a user to a running session: pause, resume and resync.
 
 use scanhub_drivers::line::{Control, ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -15,7 +15,7 @@ impl Bench {
     }
 }
 
-/// Returns the number of telegrams that arrived from the scanner after `since`.
+/// Returns the number of telegrams that the scanner sent after `since`.
 fn bytes_sent_since(bench: &Bench, since: Nanos) -> usize {
     bench.sent.iter().filter(|sent| sent.at > since).count()
 }
@@ -40,7 +40,7 @@ fn pause_stops_the_stream_and_a_resume_starts_it() {
         bench.run(200 * MILLIS);
         assert!(bench.is_streaming(), "{round}: {bench}");
     }
-    // Only the scans that the three stops aborted were not delivered.
+    // The session delivered all scans except those that the three stops aborted.
     let mut intact = bench.intact_scans(0);
     intact.truncate(bench.received_scans(0).len());
     assert_eq!(bench.received_scans(0), intact, "{bench}");
@@ -88,7 +88,7 @@ fn paused_session_sends_nothing_to_absent_scanner() {
     bench.run(60_000 * MILLIS);
     assert_eq!((bench.session.state(), bench.sent_bytes.len()), (State::Paused, sent_count));
     assert_eq!(bench.session.problem(), None);
-    // The time of a pause does not count as time without a reply.
+    // The session does not count the duration of the pause as time without a reply.
     bench.control(Control::Resume);
     bench.run_until("reported", 3_000 * MILLIS, |bench| bench.session.problem().is_some());
     assert!(matches!(bench.session.problem(), Some(Problem::NoReply { seconds: 0..=3, .. })), "{bench}");
@@ -116,7 +116,7 @@ fn delivers_unstoppable_stream_and_limits_stops() {
     let mut bench = Bench::new(machine, started);
     bench.run_until("streaming", 100 * MILLIS, Bench::is_streaming);
     bench.run(300 * MILLIS);
-    // The line to the scanner fails, and the line back does not.
+    // The line loses all bytes to the scanner, but carries the bytes from the scanner.
     bench.to_scanner = Box::new(|_, _| None);
     let paused = bench.now;
     bench.control(Control::Pause);
@@ -132,7 +132,7 @@ fn delivers_unstoppable_stream_and_limits_stops() {
     bench.control(Control::Resume);
     bench.run_until("streaming", 100 * MILLIS, Bench::is_streaming);
     bench.run(5_000 * MILLIS);
-    // The session requests the type as often as from any other scanner.
+    // The session repeats its requests no more often than with any other scanner that does not reply.
     assert!(bench.is_streaming() && bench.sent_bytes.len() <= sent_count + 15 * 7, "{bench}");
 }
 

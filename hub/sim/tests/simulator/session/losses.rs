@@ -1,5 +1,5 @@
-//! Tests of losses and delays of the line and the host. The session delivers intact telegrams and counts losses. Its
-//! stamps are right even if the host did not run for a while, or reads only when a telegram is due.
+//! Tests of losses on the line, and of delays of the host. The session delivers intact telegrams and counts losses. The
+//! stamps are right even if the host did not run for a while, or if it reads only when a telegram is due.
 
 use scanhub_drivers::line::{Control, ScannerSession as _};
 use scanhub_drivers::lms;
@@ -13,7 +13,7 @@ use scanhub_sim::room::Room;
 
 use super::{Bench, ReceivedTelegram, SESSION_SETTINGS, SentTelegram, make_stream, sensor};
 
-/// Runs with these losses, and compares the received telegrams with the intact ones that were sent.
+/// Runs with the losses of `faults`, and checks that the session delivers exactly the scans that arrived intact.
 fn run_with_losses(faults: Faults, seed: u64, span: Nanos) -> (usize, usize) {
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
     bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
@@ -27,7 +27,8 @@ fn run_with_losses(faults: Faults, seed: u64, span: Nanos) -> (usize, usize) {
         bytes
     });
     bench.run(span);
-    // Telegrams that were held back after damage are released after some intact ones, and the last one after a pause.
+    // After damage, the session holds telegrams back until some intact telegrams have followed. It releases the last
+    // telegram after a pause.
     bench.run(200 * MILLIS);
     bench.to_host = Box::new(|_, _| Vec::new());
     bench.run(60 * MILLIS);
@@ -59,7 +60,7 @@ fn long_and_single_losses_cost_only_some_scans() {
     }
 }
 
-/// Returns a bench that streams, with replies to all requests.
+/// Returns a bench whose session streams and has received the replies to all its requests.
 fn streaming(baud: Baud) -> Bench {
     let mut bench = Bench::with_settings(lms::Settings { baud, ..SESSION_SETTINGS }, sensor(baud), 0);
     bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);
@@ -67,7 +68,7 @@ fn streaming(baud: Baud) -> Bench {
     bench
 }
 
-/// Returns the number of scans that were sent after `since`, and the number of those that the line damaged.
+/// Returns the number of scans that the scanner sent after `since`, and how many of them the line damaged.
 fn sent_and_damaged(bench: &Bench, since: Nanos) -> (u64, u64) {
     let scans = || bench.sent.iter().filter(|sent| sent.at > since && !sent.is_reply && !sent.aborted);
     (scans().count() as u64, scans().filter(|sent| sent.damaged).count() as u64)
@@ -96,7 +97,8 @@ fn counts_lost_scans_over_ten_minutes_of_bursts() {
 
 #[test]
 fn counts_lost_scans_at_slower_rates() {
-    // At the lower rate, more consecutive losses would count as a silence.
+    // At the lower rate, the share of lost bytes is lower. With the same share, more scans in a row would be lost, and
+    // the session would handle them as a silence.
     for (baud, loss, minutes) in [(Baud::B38400, 0.0003, 10), (Baud::B9600, 0.00008, 40)] {
         let mut bench = streaming(baud);
         let started = bench.now;
@@ -126,14 +128,14 @@ fn control_requests_and_silence_count_no_loss() {
         assert!(well(&bench), "{control:?}: {bench}");
     }
     assert!(bench.is_streaming(), "{bench}");
-    // A silence of more than a second does not count as a loss.
+    // The session does not count scans as lost during a silence of more than a second.
     bench.to_host = Box::new(|_, _| Vec::new());
     bench.run(10_000 * MILLIS);
     bench.to_host = Box::new(|_, bytes| bytes);
     bench.run_until("streaming", 10_000 * MILLIS, Bench::is_streaming);
     bench.run(5_000 * MILLIS);
     assert!(well(&bench), "{bench}");
-    // One telegram is lost.
+    // The line loses one telegram.
     let (started, due) = (bench.now, bench.session.stats().due);
     bench.to_host = Box::new(move |at, bytes| if at < started + 27 * MILLIS { Vec::new() } else { bytes });
     bench.run(5_000 * MILLIS);
@@ -141,7 +143,7 @@ fn control_requests_and_silence_count_no_loss() {
     assert!((185..190).contains(&(bench.session.stats().due - due)));
 }
 
-/// Returns a bench that has streamed for some seconds, and the time from the first to the last byte of a scan.
+/// Returns a bench whose session has streamed for some seconds, and the time from the first to the last byte of a scan.
 fn streaming_variant(baud: Baud, variant: Variant) -> (Bench, Nanos) {
     let settings = Settings { baud, variant, ..Settings::default() };
     let machine = LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 5)));
@@ -156,12 +158,14 @@ fn streaming_variant(baud: Baud, variant: Variant) -> (Bench, Nanos) {
     (bench, scan_time)
 }
 
-/// Returns the time at which the last byte of `telegram` left the line.
+/// Returns the time at which the line had carried the last byte of `telegram`, or `None` if the scanner did not send
+/// this telegram.
 fn sent_at(bench: &Bench, telegram: &[u8]) -> Option<Nanos> {
     bench.sent.iter().rev().find(|sent| sent.telegram == telegram).map(|sent| sent.at)
 }
 
-/// Returns the errors of the stamps of scans that arrived after `since`, and whether they are estimates.
+/// Returns the error of the stamp of each scan that arrived after `since`, and whether the stamp is marked as
+/// estimated. The line carries a scan in `scan_time`.
 fn errors(bench: &Bench, since: Nanos, scan_time: Nanos) -> Vec<(Nanos, bool)> {
     let scans = bench.received.iter().filter(|got| got.at > since && got.telegram.len() > 300);
     let error = |got: &super::ReceivedTelegram| {
@@ -189,7 +193,7 @@ fn stamps_of_backlogged_scans_are_within_5_ms() {
             bench.run(2_000 * MILLIS);
             let errors = errors(&bench, stopped, scan_time);
             assert!(errors.len() as u64 * 1_000 > span, "{} scans", errors.len());
-            // No byte was lost, so all stamps are right, with or without the mark of an estimate.
+            // No byte was lost, so all stamps are right, whether they are marked as estimated or not.
             let maximum = errors.iter().map(|(error, _)| *error).max();
             assert!(maximum <= Some(5 * MILLIS), "{baud:?} {variant:?} {span} ms: {maximum:?}");
             all.extend(errors.into_iter().filter(|(_, estimated)| *estimated).map(|(error, _)| error));
@@ -232,7 +236,7 @@ fn stop_between_scans_does_not_stamp_backlog_as_new() {
             bench.run(MILLIS);
         }
         let stopped = bench.now;
-        // Stops the host for as long as a tty has room.
+        // Stop the host, but not so long that the buffer of a tty becomes full.
         bench.stop_host(140 * MILLIS);
         let continued = bench.now;
         bench.run(5 * MILLIS);
@@ -246,8 +250,8 @@ fn stop_between_scans_does_not_stamp_backlog_as_new() {
     }
 }
 
-/// Returns whether the end of a telegram could be the start of the next one. Such a telegram is held until the line is
-/// idle (framing, rule 4).
+/// Returns whether the end of `telegram` could be the start of another telegram. The framer holds such a telegram until
+/// the line is idle (framing, rule 4).
 fn is_held(telegram: &[u8]) -> bool {
     (1..=6).any(|len| telegram.ends_with(&telegram[..len]))
 }
@@ -283,7 +287,8 @@ fn telegram_is_delivered_soon_after_its_last_byte() {
     }
 }
 
-/// Number of telegrams that the session reads as their bytes arrive, before it defers reads.
+/// Number of telegrams at the start of a stream whose bytes the session reads as they arrive. Afterwards, it defers
+/// reads until a telegram is due.
 const TELEGRAMS_BEFORE_TIMING: usize = 6;
 
 #[test]
@@ -299,7 +304,7 @@ fn reads_a_scan_only_when_it_is_nearly_complete() {
         bench.run(MILLIS - MILLIS / 7);
         exposed += u32::from(bench.session.stats().buffered > 0);
     }
-    // The line is polled during 0.6 ms and the time of a chunk in every 26.64 ms.
+    // In every period of 26.64 ms, the host polls the line only for 0.6 ms and for the duration of a chunk.
     assert!(exposed * 100 < polls * 6, "{exposed} of {polls}");
 }
 
@@ -308,7 +313,8 @@ fn replies_during_a_stream_are_received_within_2_ms() {
     let mut machine = sensor(Baud::B500000);
     let now = make_stream(&mut machine);
     let mut bench = Bench::new(machine, now);
-    // The scanner overlooks the first requests. The session estimates the duration of a telegram from the others.
+    // The line loses the first requests. When the first reply arrives, the session has therefore already estimated the
+    // duration of the stream's telegrams, and defers reads.
     bench.to_scanner = Box::new(|number, byte| (number >= 60).then_some(byte));
     bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(3_000 * MILLIS);

@@ -1,5 +1,5 @@
-//! Bench and tests of a session: a session and a simulated scanner at the two ends of a line, in virtual time. Tests
-//! define how the line changes bytes; the bench checks the invariants at every step.
+//! Bench and tests of a session: a session and a simulated scanner at the two ends of a line, in virtual time. Each
+//! test defines how the line changes bytes. The bench checks the invariants of a session at every step.
 
 mod control;
 mod losses;
@@ -29,7 +29,7 @@ pub(crate) type HostFilter = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
 /// Changes the byte with the given index from host to scanner. If it returns `None`, the byte is lost.
 pub(crate) type SensorFilter = Box<dyn FnMut(usize, u8) -> Option<u8>>;
 
-/// Both ends, the line, and everything that the line transmitted.
+/// A session, a scanner, the line between them, and records of the bytes and telegrams on the line.
 pub(crate) struct Bench {
     pub(crate) session: LmsSession,
     pub(crate) machine: LmsSimulator,
@@ -44,21 +44,21 @@ pub(crate) struct Bench {
     pub(crate) request_times: Vec<Nanos>,
     /// Received ACKs and NAKs with their times.
     pub(crate) acknowledged: Vec<(Nanos, u8)>,
-    /// Number of received bytes outside of telegrams that the scanner did not send.
+    /// Number of bytes that the host received between telegrams, although the scanner did not send them.
     pub(crate) foreign: usize,
     pub(crate) sent: Vec<SentTelegram>,
     pub(crate) received: Vec<ReceivedTelegram>,
-    /// Every state of the session in order, without repetitions.
+    /// States of the session in order. Equal consecutive states are listed once.
     pub(crate) states: Vec<State>,
     port: Baud,
-    /// Size of the input buffer in bytes. As in a tty, bytes beyond it are lost.
+    /// Size of the host's input buffer in bytes. As in a tty, bytes that arrive while the buffer is full are lost.
     pub(crate) buffer_len: usize,
-    /// Bytes in the input buffer.
+    /// Bytes in the host's input buffer.
     inbox: VecDeque<u8>,
     baud_mismatch: BaudMismatch,
     damaged: bool,
     fault: Option<Fault>,
-    /// Whether the session streamed since the telegram on the line began.
+    /// Whether the session has streamed since the start of the telegram on the line.
     was_streaming: bool,
     read: u64,
     reads: u32,
@@ -69,17 +69,17 @@ pub(crate) struct Bench {
 /// A telegram as the scanner sent it.
 #[derive(Clone, Debug)]
 pub(crate) struct SentTelegram {
-    /// Time at which its last byte had left the line.
+    /// Time at which the line had carried the last byte of the telegram.
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
     pub(crate) is_reply: bool,
     pub(crate) aborted: bool,
-    /// Whether the line damaged it.
+    /// Whether the line damaged the telegram.
     pub(crate) damaged: bool,
-    /// Fault that the line applied.
+    /// Fault that the line applied to the telegram.
     #[allow(dead_code, reason = "for the tests of faults")]
     pub(crate) fault: Option<Fault>,
-    /// Whether the session streamed when it arrived, so that only the line can have lost it.
+    /// Whether the session streamed while the telegram arrived, so that only the line can have lost it.
     #[allow(dead_code, reason = "for the tests of faults")]
     pub(crate) was_streaming: bool,
 }
@@ -89,12 +89,13 @@ pub(crate) struct SentTelegram {
 pub(crate) struct ReceivedTelegram {
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
-    /// Range bits of its values, if it is a scan whose mode was known when it was delivered.
+    /// Number of range bits in the values of a scan. `None` if the session did not know the measuring mode at the time
+    /// of delivery, or if the telegram is not a scan.
     pub(crate) range_bits: Option<u8>,
-    /// Reasons why it is suspect; 0 if it is clean.
+    /// Reasons why the telegram is suspect; 0 if it is clean.
     #[allow(dead_code, reason = "for the tests of faults")]
     pub(crate) reasons: u8,
-    /// Reported time of its first byte.
+    /// Time that the session reported for the first byte of the telegram.
     #[allow(dead_code, reason = "for the tests of stamps")]
     pub(crate) first: Nanos,
     #[allow(dead_code, reason = "for the tests of stamps")]
@@ -113,7 +114,7 @@ pub(crate) const SESSION_SETTINGS: Settings = Settings {
     mode: None,
 };
 
-/// Creates a scanner in a room, at this rate.
+/// Creates a scanner in a room. Its line has the rate `baud`.
 pub(crate) fn sensor(baud: Baud) -> LmsSimulator {
     let settings = machine::Settings { baud, seed: 1, ..machine::Settings::default() };
     LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 1)))
@@ -124,21 +125,21 @@ pub(crate) fn sensor_with(settings: machine::Settings) -> LmsSimulator {
     LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
-/// Makes `machine` stream like a previous host, and returns the time.
+/// Makes `machine` stream, as a previous host. Returns the time on the machine's clock afterwards.
 pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
     let mut now = 10 * MILLIS;
     for &byte in Request::Stream.encode(0).bytes() {
         now += line_time(1, machine.baud().rate()) + 60 * MICROS;
         machine.receive(byte, Arrival::at(now));
     }
-    // The reply and some scans have been sent.
+    // Wait until the scanner has sent the reply and some scans.
     now += 2_000 * MILLIS;
     while machine.poll_transmit(now).is_some() {}
     now
 }
 
 impl Bench {
-    /// Creates a session that starts at `now` of the machine's time, on a line without faults.
+    /// Creates a session that starts at the time `now` of the machine's clock, on a line without faults.
     pub(crate) fn new(machine: LmsSimulator, now: Nanos) -> Bench {
         Bench::with_settings(SESSION_SETTINGS, machine, now)
     }
@@ -173,7 +174,7 @@ impl Bench {
         }
     }
 
-    /// Makes the session try `baud` first, like a hub that has found the scanner there before.
+    /// Makes the session try `baud` first, as in a hub that has found the scanner at this rate before.
     pub(crate) fn set_first_probe_rate(&mut self, baud: Baud) {
         let silent_switches = self.session.silent_switches();
         self.session.hint_rate(KnownRate { baud: baud.rate(), silent_switches });
@@ -184,7 +185,7 @@ impl Bench {
         self.session.known_rate().and_then(|known| Baud::of_rate(known.baud))
     }
 
-    /// Connects the machine to a session that has run before and has no partly sent request.
+    /// Connects the machine to a session that has run before. The session must not be in the middle of a request.
     pub(crate) fn with_session(session: LmsSession, machine: LmsSimulator, now: Nanos) -> Bench {
         let (port, read) = (session.baud(), session.framer_counters().read);
         Bench { port, read, session, ..Bench::new(machine, now) }
@@ -217,26 +218,27 @@ impl Bench {
         self.session.state() == State::Streaming
     }
 
-    /// Returns the scans that were sent whole and undamaged, with their last byte after `since`.
+    /// Returns the scans that the scanner sent whole, that the line did not damage, and that ended after `since`.
     pub(crate) fn intact_scans(&self, since: Nanos) -> Vec<&[u8]> {
         let intact =
             |sent: &&SentTelegram| sent.at > since && !(sent.is_reply || sent.aborted || sent.damaged);
         self.sent.iter().filter(intact).map(|sent| &sent.telegram[..]).collect()
     }
 
-    /// Returns the scans that were delivered after `since`.
+    /// Returns the scans that the session delivered after `since`.
     pub(crate) fn received_scans(&self, since: Nanos) -> Vec<&[u8]> {
         self.scans(since).map(|got| &got.telegram[..]).collect()
     }
 
-    /// Returns scans that were delivered after `since`, with their stamps and reasons.
+    /// Returns the scans that the session delivered after `since`, with their stamps and the reasons why they are
+    /// suspect.
     pub(crate) fn scans(&self, since: Nanos) -> impl Iterator<Item = &ReceivedTelegram> {
         let is_scan =
             move |got: &&ReceivedTelegram| got.at > since && got.telegram[4] == lms::measured::MEASURED;
         self.received.iter().filter(is_scan)
     }
 
-    /// Stops the host for `span`.
+    /// Stops the host for `span`, while the scanner and the line continue.
     #[allow(dead_code, reason = "for the tests of stamps")]
     pub(crate) fn stop_host(&mut self, span: Nanos) {
         self.advance(self.now + span);
@@ -355,7 +357,8 @@ impl Bench {
         }
     }
 
-    /// Advances the time to `to`, unless it is later already.
+    /// Advances the time to `to`, and delivers the bytes that arrive until then. If the time is already later, it does
+    /// not change.
     fn advance(&mut self, to: Nanos) {
         while let Some(at) = self.line.poll_timeout(&self.machine, self.now).filter(|&at| at <= to) {
             self.now = self.now.max(at);
@@ -419,5 +422,5 @@ impl std::fmt::Display for Bench {
     }
 }
 
-/// Time from an event to a running host.
+/// Time from an event, such as the arrival of bytes, until the host runs.
 const WAKE_DELAY: Nanos = 50 * MICROS;

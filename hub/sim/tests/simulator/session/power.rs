@@ -1,6 +1,6 @@
-//! Tests of power cycles and restarts, during a scan, at the start of a session, and of a scanner that takes a minute
-//! to boot. They also cover a scanner on RS-232, which carries nothing at 500,000 baud: after a switch to that rate,
-//! the scanner is lost until its power is cycled.
+//! Tests of power cycles and restarts during a scan and at the start of a session, and of a scanner that takes a minute
+//! to boot. They also test a scanner on an RS-232 line, which carries nothing at 500,000 baud. After a switch to this
+//! rate, no reply arrives until the power of the scanner is cycled.
 
 use scanhub_drivers::line::{Control, ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -19,8 +19,8 @@ use super::{Bench, SESSION_SETTINGS, make_stream, sensor, sensor_with};
 /// Time after the boot message within which a session must stream.
 const STREAM_TIMEOUT: Nanos = 5_000 * MILLIS;
 
-/// Maximum time if the session first waits for a change of mode that the restarted scanner has dropped, and then
-/// searches for the rate.
+/// Maximum time until the session streams if it first waits for the reply to a change of mode, which the scanner has
+/// dropped because of the restart, and then searches for the rate.
 const SEARCH_TIMEOUT: Nanos = 6_000 * MILLIS;
 
 fn booting(boot_ns: Nanos) -> Settings {
@@ -77,8 +77,8 @@ fn recovers_from_power_loss_during_startup() {
 
 #[test]
 fn boot_message_causes_a_request_at_once() {
-    // The power fails during a stream at 9600, and during the search, which is at 9600 in the pauses between its
-    // rounds.
+    // In the first case, the power fails during a stream at 9600. In the second case, the scanner boots during the
+    // search, which receives at 9600 in the pauses between its rounds.
     let slow_settings = lms::Settings { baud: Baud::B9600, ..super::SESSION_SETTINGS };
     let mut bench = Bench::with_settings(slow_settings, sensor_with(booting(300 * MILLIS)), 0);
     bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming);
@@ -209,14 +209,14 @@ fn bench_on_rs232(session_settings: lms::Settings, settings: Settings) -> Bench 
     bench
 }
 
-/// Returns how many times `request` was sent.
+/// Returns how many times the session has sent `request`.
 fn count(bench: &Bench, request: Request) -> usize {
     let sent: Vec<u8> = bench.sent_bytes.iter().map(|&(_, byte)| byte).collect();
     let encoded = request.encode(0);
     sent.windows(encoded.bytes().len()).filter(|window| *window == encoded.bytes()).count()
 }
 
-/// Runs until the scanner has switched to 500,000 baud and is lost.
+/// Runs until the scanner has switched to 500,000 baud, and the session receives nothing from it.
 fn lose_scanner(bench: &mut Bench) {
     let is_fast = |bench: &Bench| bench.machine.baud() == Baud::B500000;
     bench.run_until("switched", STREAM_TIMEOUT, is_fast);
@@ -280,7 +280,8 @@ fn restored_switch_count_makes_38400_the_first_rate() {
     lose_scanner(&mut bench);
     let (rate, counted) = (bench.discovered_rate(), bench.session.silent_switches());
     assert_eq!((rate, counted), (Some(Baud::B38400), 2));
-    // The scanner still streams for the previous hub, is idle at that rate, or has had a power cycle.
+    // Test three scanners: one that still streams for the previous hub, one that is idle at 38400, and one that has had
+    // a power cycle.
     let streaming = || {
         let mut machine = sensor(Baud::B38400);
         let now = make_stream(&mut machine);
@@ -315,7 +316,7 @@ fn configured_rate_is_kept_and_message_names_rs422() {
         lose_scanner(&mut bench);
         assert_eq!((bench.session.problem(), bench.discovered_rate()), (KEEPS_RATE, Some(Baud::B9600)));
     }
-    // The line was rewired.
+    // Replace the line by an RS-422 line, which carries 500,000 baud.
     bench.line = LineModel::new(&Faults::default(), 0);
     bench.run_until("streaming", STREAM_TIMEOUT, Bench::is_streaming);
     assert_eq!((bench.session.problem(), bench.session.silent_switches()), (None, 0));
@@ -324,12 +325,13 @@ fn configured_rate_is_kept_and_message_names_rs422() {
 
 #[test]
 fn telegram_at_500000_resets_count_and_limit() {
-    // One switch was silent because the power failed at that moment.
+    // One switch to 500,000 baud got no reply, for example because the power failed at that moment.
     let mut bench = Bench::new(sensor(Baud::B9600), 0);
     bench.session.restore_silent_switches(1);
     bench.run_until("streaming", STREAM_TIMEOUT, Bench::is_streaming);
     assert_eq!((bench.session.silent_switches(), bench.session.baud()), (0, Baud::B500000));
-    // A stream that is received without a search resets it, too, and reports a rate to save it with.
+    // A stream that the session receives without a search resets the count, too. The session then also reports a rate,
+    // because the hub saves the count together with a rate.
     let mut machine = sensor(Baud::B500000);
     let now = make_stream(&mut machine);
     let mut bench = Bench::new(machine, now);
@@ -337,7 +339,7 @@ fn telegram_at_500000_resets_count_and_limit() {
     bench.session.restore_silent_switches(1);
     bench.run_until("streaming", STREAM_TIMEOUT, Bench::is_streaming);
     assert_eq!((bench.session.silent_switches(), bench.discovered_rate()), (0, Some(Baud::B9600)));
-    // A scanner that answers at 500,000 baud proves that the line was rewired.
+    // If a scanner replies at 500,000 baud, the line carries this rate.
     for streams in [false, true] {
         let mut machine = sensor(Baud::B500000);
         let now = if streams { make_stream(&mut machine) } else { 0 };

@@ -1,5 +1,5 @@
-//! Tests of scanners that refuse or overlook requests or reply wrongly, of lines that lose requests or replies, and of
-//! streams that stop. The session streams anyway, and reports the scanner's messages about itself.
+//! Tests of scanners that refuse or overlook requests or send wrong replies, of lines that lose requests or replies,
+//! and of streams that stop. The session streams anyway, and reports what the scanner reports about its own condition.
 
 use scanhub_drivers::line::{ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -41,7 +41,7 @@ fn refused_variant_is_reported_again_after_silence() {
     bench.run_until("silent", 1_040 * MILLIS, |bench| bench.session.state() == State::Silent);
     assert_eq!(bench.session.problem(), Some(Problem::Silence));
     bench.states.clear();
-    // The mode is unknown for some time, because the scanner sends no replies.
+    // The scanner sends no replies, so the session does not know the measuring mode for some time.
     let mute = ProtocolQuirks { is_mute: true, ..ProtocolQuirks::default() };
     bench.machine.set_quirks(mute);
     bench.run_until("streaming", 200 * MILLIS, Bench::is_streaming);
@@ -71,7 +71,8 @@ fn any_byte_of_the_requests_may_be_lost_or_damaged() {
                 None => None,
                 Some(bits) => Some(byte ^ bits),
             });
-            // After three attempts and a search, the session detects that the scanner did not receive a change of rate.
+            // If the scanner did not receive a change of rate, the session detects this after three attempts and a
+            // search.
             bench.run_until("streaming", 6_000 * MILLIS, Bench::is_streaming);
             bench.run(200 * MILLIS);
             assert!(bench.is_streaming(), "byte {wrong} {damage:?}: {bench}");
@@ -87,7 +88,7 @@ fn any_reply_may_be_lost_or_damaged() {
         bench.sent.iter().filter(|sent| sent.is_reply).count()
     };
     assert!(replies >= 4);
-    // Replies and their acknowledgements are the first chunks.
+    // Damage each of the first chunks, which are the replies and their acknowledgements.
     for wrong in 0..replies * 8 {
         for damage in [None, Some(0x04)] {
             let mut bench = Bench::new(sensor(Baud::B9600), 0);
@@ -159,7 +160,7 @@ fn streams_after_variant_request_fails() {
         Settings { variant: Variant { angle_deg: 180, resolution_cdeg: 100 }, ..Settings::default() };
     let mut bench =
         Bench::new(LmsSimulator::new(settings, ScanSource::Room(Room::new(&"room".parse().unwrap(), 1))), 0);
-    // Every request to switch arrives damaged, and is answered with NAK.
+    // Damage every request to change the variant, so that the scanner answers it with NAK.
     let mut sent = Vec::new();
     bench.to_scanner = Box::new(move |_, byte| {
         sent.push(byte);
@@ -186,7 +187,8 @@ fn accepts_replaced_scanner_with_another_address() {
     assert_eq!(bench.session.sensor().address, Some(0x82));
 }
 
-/// Checks that scanners with these quirks, idle and streaming at each rate, stream as configured within `limit` ms.
+/// Checks that scanners with `quirks` stream as configured within `limit` milliseconds. At the start, the scanners are
+/// idle or streaming, at each rate.
 fn assert_all_stream(quirks: ProtocolQuirks, seeds: std::ops::Range<u64>, limit: u64) {
     let mut longest = 0;
     for seed in seeds {
@@ -232,7 +234,7 @@ fn streams_although_replies_are_repeated() {
 
 #[test]
 fn streams_although_acks_and_replies_are_late() {
-    // The delays are as long as the listing allows, and longer.
+    // The first delay is the maximum that the listing allows. The other delays are longer.
     for late in [52, 100, 300] {
         let late_ns = late * MILLIS;
         assert_all_stream(
@@ -264,7 +266,8 @@ fn streams_despite_refused_requests_or_reports_them() {
         assert!(bench.is_streaming(), "{command:02X}: {bench}");
         assert_eq!(bench.session.problem(), problem, "{command:02X}");
     }
-    // Without 20h there is no stream. The session reports that, and repeats the request at long intervals.
+    // A scanner that refuses 20h does not stream. The session reports the refusal, and repeats the request at long
+    // intervals.
     let quirks = ProtocolQuirks { refused_commands: vec![0x20], ..ProtocolQuirks::default() };
     let mut bench = Bench::new(sensor_with(Settings { quirks, ..Settings::default() }), 0);
     bench.run(2_000 * MILLIS);
@@ -324,8 +327,8 @@ fn takes_over_the_stream_of_a_mute_scanner() {
     bench.run(5_000 * MILLIS);
     assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
     assert_eq!(bench.session.problem(), Some(Problem::ModeUnknown));
-    // The session sends three requests five times each. After that it repeats them rarely, because scans cannot be
-    // published without a reply.
+    // The session sends three requests five times each. Afterwards, it repeats them at long intervals. It never stops
+    // trying, because the hub cannot publish scans without a reply.
     assert_eq!(bench.sent_bytes.len(), 15 * 7);
     bench.run(25_000 * MILLIS);
     assert!(bench.sent_bytes.len() <= (15 + 3 * 3) * 7, "{} bytes sent", bench.sent_bytes.len());
@@ -396,8 +399,8 @@ fn intermittent_condition_is_reported_continuously() {
     bench.run_until("cleared", 10_000 * MILLIS, |bench| bench.session.sensor().notices().next().is_none());
 }
 
-/// Returns a filter that passes on whole scans of 361 beams after `change` has changed them by their number and bytes.
-/// The rest of the scan on the line is lost.
+/// Returns a filter that collects whole scans of 361 beams, and passes them on after `change` has changed them.
+/// `change` receives the index and the bytes of a scan. The rest of the scan that is on the line at first is lost.
 fn scan_filter(change: impl Fn(u32, Vec<u8>) -> Vec<u8> + 'static) -> HostFilter {
     let mut count = 0;
     let mut held = Vec::new();
@@ -414,7 +417,7 @@ fn scan_filter(change: impl Fn(u32, Vec<u8>) -> Vec<u8> + 'static) -> HostFilter
     })
 }
 
-/// Returns `scan` with a valid checksum. If it `is_dirty`, the scan reports a dirty window.
+/// Returns `scan`. If `is_dirty` is set, the scan is changed so that it reports a dirty window, with a valid checksum.
 fn with_dirty_window(mut scan: Vec<u8>, is_dirty: bool) -> Vec<u8> {
     if is_dirty {
         scan[729] |= 0x80;
@@ -435,7 +438,7 @@ fn single_report_on_a_damaging_line_is_ignored() {
         bench.run(27 * MILLIS);
         assert_eq!(bench.session.sensor().notices().next(), None, "{bench}");
     }
-    // A condition that the scanner reports repeatedly is a notice.
+    // If the scanner reports a condition repeatedly, the session reports it as a notice.
     bench.to_host = scan_filter(|count, scan| match count % 4 {
         0 => scan[..700].to_vec(),
         _ => with_dirty_window(scan, true),

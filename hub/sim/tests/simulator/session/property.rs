@@ -1,5 +1,5 @@
-//! Property test of a session with random events: it never panics, every byte is counted, no request writes the EEPROM,
-//! and once a healthy scanner is connected, it streams. One seed reproduces a run.
+//! Property test of a session with random events. The session never panics, counts every byte, and sends no request
+//! that writes the EEPROM. Once a healthy scanner is connected, the session streams. A seed reproduces a run.
 
 use scanhub_drivers::line::{Action, Event, Protocol as _, ScannerSession as _};
 use scanhub_drivers::line::{Control, State};
@@ -83,7 +83,8 @@ impl RandomHost {
         }
     }
 
-    /// Executes the actions of the session until it waits. With `is_partial`, it may stop at a write.
+    /// Carries out the actions of the session until the session waits. If `is_partial` is set, it may return early,
+    /// before a write.
     fn drain(&mut self, is_partial: bool) {
         loop {
             match self.session.poll_action() {
@@ -111,7 +112,7 @@ impl RandomHost {
         assert_eq!(tally.telegrams, self.telegrams);
     }
 
-    /// Returns noise, or a telegram of a scanner, whole or truncated.
+    /// Returns noise, or a whole or truncated telegram of a scanner.
     fn bytes(&mut self) -> Vec<u8> {
         let random = &mut self.random;
         let address = if random.u8(..8) == 0 { random.u8(..128) } else { 0 };
@@ -167,7 +168,7 @@ fn any_baud(random: &mut fastrand::Rng) -> Baud {
     Baud::ALL[random.usize(..4)]
 }
 
-/// Returns every telegram at any position in `bytes`.
+/// Returns the valid telegrams in `bytes`, wherever they start.
 fn telegrams(bytes: &[u8]) -> impl Iterator<Item = Telegram<'_>> {
     (0..bytes.len()).filter_map(|at| {
         let [STX, _, low, high, ..] = bytes[at..] else { return None };

@@ -1,5 +1,5 @@
-//! Tests of the start of a session, from the first request to the stream. The scanner is idle at some rate, streams
-//! already, streams in another mode or is in installation mode. The line may have a fixed rate.
+//! Tests of the start of a session, from the first request to the stream. At the start, the scanner is idle at some
+//! rate, streams already, streams in another mode, or is in installation mode. The line may have a fixed rate.
 
 use scanhub_drivers::line::{Control, ScannerSession as _, State};
 use scanhub_drivers::lms;
@@ -30,9 +30,9 @@ fn streams_from_each_rate_within_3_s() {
         assert_eq!((bench.session.problem(), bench.session.stats().resyncs), (None, 0));
         let scans = bench.received_scans(since);
         assert!(scans.len() >= 36 && scans == bench.intact_scans(since)[..scans.len()], "{bench}");
-        // The session changes the rate only if necessary.
+        // The session changes the rate only if it is not the configured rate.
         assert_eq!(bench.states.contains(&State::Switching), baud != Baud::B500000, "{bench}");
-        // After all replies have arrived, the session sends no further request.
+        // A request during the stream would abort a scan. The session sends none after all replies have arrived.
         let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
         assert_eq!(aborted, 0, "{bench}");
     }
@@ -53,7 +53,7 @@ fn sets_the_configured_variant() {
 
 #[test]
 fn reports_missing_scanner_and_keeps_searching() {
-    // The scanner gets power at some time in two rounds and the pauses after them.
+    // The scanner is switched on at different times in two rounds of the search and in the pauses after them.
     for moment in 0..60 {
         let mut bench = Bench::new(sensor(Baud::B9600), 0);
         bench.to_scanner = Box::new(|_, _| None);
@@ -76,7 +76,7 @@ fn fast_settings(baud: Baud, start: StartState) -> Settings {
 
 #[test]
 fn scanner_just_powered_on_streams_within_500_ms() {
-    // The rate is unknown, or saved from the last time.
+    // The rate of the scanner is unknown, or saved from the previous session.
     for (seed, first, within) in (0..20).flat_map(|seed| [(seed, None, 500), (seed, Some(Baud::B9600), 500)])
     {
         let settings =
@@ -88,7 +88,7 @@ fn scanner_just_powered_on_streams_within_500_ms() {
         assert!(bench.received.last().is_some_and(|got| got.range_bits == Some(13)), "{elapsed}: {bench}");
         let known = bench.session.sensor();
         assert_eq!((known.kind(), known.unit), (&b"LMS200;301063;V02.30"[..], Some(Unit::Mm)));
-        // At 9600, the session requests nothing with a long reply: only a type and a change of rate.
+        // At 9600, the session sends only requests with short replies: for the type, and to change the rate.
         let replies: Vec<u8> =
             bench.sent.iter().filter(|sent| sent.is_reply).map(|sent| sent.telegram[4]).collect();
         assert_eq!(replies, [0xBA, 0xA0, 0xB1, 0xA0], "{bench}");
@@ -128,7 +128,7 @@ fn saved_rate_is_tried_first_but_not_assumed() {
             let now = make_stream(&mut machine);
             let mut bench = Bench::new(machine, now);
             bench.set_first_probe_rate(first);
-            // The session receives a stream at the configured rate before it sends any request.
+            // A session receives a stream at the configured rate before it sends its first request.
             let within = if baud == Baud::B500000 { 60 } else { 4_000 };
             bench.run_until("streaming", within * MILLIS, Bench::is_streaming);
             assert_eq!(bench.discovered_rate().is_none(), baud == Baud::B500000);
@@ -136,15 +136,15 @@ fn saved_rate_is_tried_first_but_not_assumed() {
     }
 }
 
-/// The scanner does not reply to a request for its type, although other scanners refuse this request. The session
-/// therefore also requests the status at every rate.
+/// The scanner does not reply at all to a request for its type, although even a refusal would show its rate. The
+/// session therefore also requests the status at every rate.
 #[test]
 fn finds_scanner_by_status_if_type_is_unanswered() {
     for baud in Baud::ALL {
         let mut bench =
             Bench::new(sensor_with(fast_settings(baud, StartState::Operating(OperatingMode::OnRequest))), 0);
         let mut sent = Vec::new();
-        // Every request for the type is lost.
+        // The line loses the command byte of every request for the type.
         bench.to_scanner = Box::new(move |_, byte| {
             sent.push(byte);
             (!sent.ends_with(&[0x02, 0x00, 0x01, 0x00, 0x3A])).then_some(byte)
@@ -155,8 +155,8 @@ fn finds_scanner_by_status_if_type_is_unanswered() {
     }
 }
 
-/// The scanner does not accept a change of rate in its current mode, which the session has not requested yet. The
-/// session stops the scanner first.
+/// The scanner refuses a change of rate in its current operating mode, which the session does not know. The session
+/// therefore stops the scanner before it changes the rate.
 #[test]
 fn scanner_that_refuses_a_rate_is_stopped_first() {
     for baud in [Baud::B9600, Baud::B19200, Baud::B38400] {
@@ -171,7 +171,7 @@ fn scanner_that_refuses_a_rate_is_stopped_first() {
         bench.run_until("streaming", 2_000 * MILLIS, Bench::is_streaming);
         bench.run(500 * MILLIS);
         assert!(bench.is_streaming() && bench.session.problem().is_none(), "{bench}");
-        // If a scanner always refuses, the session reports it and repeats the request.
+        // If a scanner always refuses the request, the session reports the refusal and repeats the request.
         let quirks = ProtocolQuirks { refused_commands: vec![0x20], ..ProtocolQuirks::default() };
         let settings = fast_settings(baud, StartState::Operating(OperatingMode::OnRequest));
         let mut bench = Bench::new(sensor_with(Settings { quirks, ..settings }), 0);
@@ -187,7 +187,7 @@ fn scanner_that_refuses_a_rate_is_stopped_first() {
 
 #[test]
 fn takes_over_stream_at_target_rate_without_requests() {
-    // The session starts at different times within the period of a scan.
+    // Start the session at different times within the period of a scan.
     for phase in 0..28 {
         let mut machine = sensor(Baud::B500000);
         let started = make_stream(&mut machine) + phase * 970 * MICROS;
@@ -199,11 +199,11 @@ fn takes_over_stream_at_target_rate_without_requests() {
             "sent a byte before it received one"
         );
         assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
-        // Two requests abort a scan: for the measuring mode and the type.
+        // Only two requests abort a scan: the requests for the measuring mode and for the type.
         let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
         assert!(aborted <= 2, "{aborted} scans were aborted");
         assert!(bench.session.sensor().mode.is_some() && !bench.session.sensor().kind().is_empty());
-        // The session does not deliver the scan that was on the line at its start, but all others.
+        // The session delivers all scans except the one that was on the line at its start.
         let (scans, intact) = (bench.received_scans(0), bench.intact_scans(started));
         let skipped = intact.iter().position(|scan| scans.first() == Some(scan)).expect("was sent");
         assert_eq!(scans, intact[skipped..][..scans.len()], "{bench}");
@@ -234,11 +234,11 @@ fn telegrams_at_another_rate_give_no_scans() {
     let started = make_stream(&mut machine);
     let mut bench = Bench::new(machine, started);
     bench.set_first_probe_rate(SESSION_SETTINGS.baud);
-    // The session sends requests at the configured and at the current rate. The scanner returns its status and ignores
-    // all later requests, so it cannot be stopped.
+    // The session requests the status at the configured rate and at the scanner's rate. The scanner replies once and
+    // receives no later requests, so the session cannot stop it.
     let request_len = 2 * Request::Status.encode(0).bytes().len();
     bench.to_scanner = Box::new(move |number, byte| (number < request_len).then_some(byte));
-    // The host stops at times, so that several scans are buffered when it changes its rate.
+    // The host stops from time to time, so that several scans are in its buffer when it changes its rate.
     for pause in 1..60 {
         bench.run(pause * 70 * MILLIS);
         bench.stop_host(1_700 * MILLIS);
@@ -255,7 +255,7 @@ fn telegrams_at_another_rate_give_no_scans() {
 
 #[test]
 fn waits_for_a_telegram_on_a_slow_line() {
-    // A telegram takes 0.19 s at 38400 and 0.76 s at 9600, and the period is 0.21 s and 0.77 s.
+    // A telegram takes 0.19 s at 38400, where the period is 0.21 s, and 0.76 s at 9600, where the period is 0.77 s.
     for baud in [Baud::B9600, Baud::B38400] {
         let mut machine = sensor(baud);
         let started = make_stream(&mut machine) + 100 * MILLIS;
@@ -287,7 +287,7 @@ fn restored_identity_gives_scans_without_waiting() {
         assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
         assert_eq!(bench.session.sensor().kind(), b"LMS200;301063;V02.30");
         assert_eq!((bench.session.sensor().defective, bench.session.identity()), (Some(false), Some(known)));
-        // The session requests its status anyway.
+        // Although the identity is known, the session requests the status, which may abort one scan.
         let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
         assert!(aborted <= 1, "{aborted} scans were aborted");
     }
@@ -298,7 +298,7 @@ fn restored_identity_of_another_scanner_is_replaced() {
     let mut last = Bench::new(sensor(Baud::B500000), 0);
     last.run_until("known", 4_000 * MILLIS, |bench| bench.session.identity().is_some());
     let known = last.session.identity().expect("it streams");
-    // The scans of the other scanner start with other bytes.
+    // The saved identity is that of another scanner, whose scans start with other bytes than those of this scanner.
     let centimetres = Settings { baud: Baud::B500000, unit: Unit::Cm, mode: Mode(4), ..Settings::default() };
     let mut other = sensor_with(centimetres);
     let started = make_stream(&mut other);
@@ -307,13 +307,14 @@ fn restored_identity_of_another_scanner_is_replaced() {
     bench.run_until("its mode", 2_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
     bench.run(200 * MILLIS);
     assert!(bench.received.iter().filter_map(|got| got.range_bits).all(|bits| bits == 14), "{bench}");
-    // The scans start with the same bytes, but have another meaning, which the status reveals.
+    // Now the scans of both scanners start with the same bytes, but their values have different meanings. The session
+    // detects this from the status.
     let mut other = sensor_with(Settings { baud: Baud::B500000, mode: Mode(4), ..Settings::default() });
     let started = make_stream(&mut other);
     let mut bench = Bench::new(other, started);
     bench.session.restore_identity(known);
     bench.run_until("its mode", 600 * MILLIS, |bench| bench.session.sensor().mode == Some(Mode(4)));
-    // No scanner streams, so a reply replaces the saved identity.
+    // A scanner that does not stream must reply first. The reply makes the session drop the saved identity.
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
     bench.session.restore_identity(known);
     bench.run_until("a reply", 4_000 * MILLIS, |bench| !bench.received.is_empty());
@@ -370,7 +371,7 @@ fn modes() -> [OperatingMode; 9] {
     ]
 }
 
-/// Returns a scanner that has been streaming in this mode since time 0, at the time `since`.
+/// Returns a scanner that has streamed in mode `operating` from time 0 until `since`, and this time.
 fn streaming(settings: Settings, operating: &OperatingMode, since: Nanos) -> (LmsSimulator, Nanos) {
     let mut machine =
         sensor_with(Settings { start: StartState::Operating(operating.clone()), seed: since, ..settings });
@@ -380,7 +381,7 @@ fn streaming(settings: Settings, operating: &OperatingMode, since: Nanos) -> (Lm
     (machine, since)
 }
 
-/// Returns the time from the start of the session to the configured stream, which then continues.
+/// Returns the time from the start of the session to the configured stream. Checks that the stream continues.
 fn takeover_time(bench: &mut Bench, limit: Nanos) -> Nanos {
     let elapsed = bench.run_until("streaming", limit, Bench::is_streaming);
     let since = bench.now;
@@ -505,12 +506,12 @@ fn permanent_rate_is_found_and_kept() {
         let mut bench = Bench::new(sensor_with(settings), 0);
         bench.run_until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         bench.run(500 * MILLIS);
-        // The permanent rate is a notice and not a problem.
+        // The session reports another permanent rate than 9600 as a notice, and not as a problem.
         let is_noticed = bench.session.sensor().notices().eq([Notice::PermanentBaud]);
         assert_eq!(is_noticed, permanent != Baud::B9600, "{permanent:?}: {bench}");
         assert_eq!(bench.session.sensor().permanent_baud, Some(is_noticed));
         assert_eq!(bench.session.problem(), None);
-        // The scanner restarts at its own rate, and the session finds it again.
+        // After a power cycle, the scanner starts at its permanent rate, and the session finds it again.
         let now = bench.now;
         bench.machine.power_cycle(now);
         bench.run_until("silent", 1_200 * MILLIS, |bench| !bench.is_streaming());
@@ -568,7 +569,7 @@ fn every_rate_and_state_streams_within_5_s() {
             for seed in 0..10 {
                 let start = StartState::Operating(operating.clone());
                 let settings = Settings { baud, start, seed, ..Settings::default() };
-                // The session starts at different times within a scan.
+                // Start the session at different times within a scan.
                 let started = seed * 83 * MILLIS;
                 let mut bench = Bench::new(sensor_with(settings), started);
                 let ms = bench.run_until("streaming", 5_000 * MILLIS, Bench::is_streaming) / MILLIS;

@@ -14,12 +14,12 @@ use scanhub_sim::world::World;
 
 pub(crate) const ONE_SECOND: Nanos = 1_000 * MILLIS;
 
-/// A telegram that was sent.
+/// A response or a packet that the scanner sent.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct SentMessage {
     pub(crate) bytes: Vec<u8>,
     pub(crate) is_reply: bool,
-    /// Fault that the line applied.
+    /// Fault that the line applied to it.
     pub(crate) fault: Option<&'static str>,
     pub(crate) at: Nanos,
 }
@@ -28,7 +28,7 @@ pub(crate) struct Bench {
     pub(crate) unit: RplidarSimulator,
     line_model: LineModel,
     pub(crate) now: Nanos,
-    /// Received bytes.
+    /// Bytes that the host received.
     pub(crate) received: Vec<u8>,
     pub(crate) sent: Vec<SentMessage>,
     fault: Option<&'static str>,
@@ -49,7 +49,7 @@ impl Bench {
         }
     }
 
-    /// Runs until `until`.
+    /// Runs until the time `until`.
     pub(crate) fn run(&mut self, until: Nanos) {
         loop {
             while let Some(carried) = self.line_model.poll_transmit(&mut self.unit, self.now) {
@@ -74,7 +74,7 @@ impl Bench {
         self.run(self.now + span);
     }
 
-    /// Sends `request` at the rate of the line, and returns the replies of the next 20 ms.
+    /// Sends `request` at the rate of the line, and returns the responses that arrive within the next 20 ms.
     pub(crate) fn ask(&mut self, request: &[u8]) -> Vec<Vec<u8>> {
         let before = self.sent.len();
         for &byte in request {
@@ -85,12 +85,12 @@ impl Bench {
         self.sent[before..].iter().filter(|sent| sent.is_reply).map(|sent| sent.bytes.clone()).collect()
     }
 
-    /// Requests the value of `key` of mode `mode`, and returns the replies.
+    /// Requests the value of `key` for mode number `mode`, and returns the responses.
     pub(crate) fn configuration(&mut self, key: u8, mode: u8) -> Vec<Vec<u8>> {
         self.ask(&with_payload(0x84, &[key, 0, 0, 0, mode, 0]))
     }
 
-    /// Returns the data in the order in which it was sent.
+    /// Returns the packets of the stream in the order in which the scanner sent them.
     pub(crate) fn data(&self) -> Vec<Vec<u8>> {
         self.sent.iter().filter(|sent| !sent.is_reply).map(|sent| sent.bytes.clone()).collect()
     }
@@ -105,7 +105,7 @@ impl Bench {
     }
 }
 
-/// Returns a request with a payload, which follows its length and precedes the XOR of all bytes.
+/// Returns a request with a payload: the command, the length of the payload, the payload, and the XOR of all bytes.
 pub(crate) fn with_payload(command: u8, payload: &[u8]) -> Vec<u8> {
     let mut bytes = vec![0xA5, command, payload.len() as u8];
     bytes.extend(payload);
@@ -113,7 +113,7 @@ pub(crate) fn with_payload(command: u8, payload: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Returns the request for the stream of mode number `mode`.
+/// Returns the request that starts a stream in mode number `mode`.
 pub(crate) fn stream_request(mode: usize) -> Vec<u8> {
     match mode {
         0 => vec![0xA5, 0x20],
@@ -125,7 +125,7 @@ fn bench(model: Model) -> Bench {
     Bench::new(RplidarSettings::of(model), &World::Empty, "")
 }
 
-/// Returns the only reply.
+/// Returns the response in `replies`, which must contain exactly one.
 fn only_reply(mut replies: Vec<Vec<u8>>) -> Vec<u8> {
     assert_eq!(replies.len(), 1, "{replies:02X?}");
     replies.pop().expect("one")
@@ -135,7 +135,8 @@ fn only_reply(mut replies: Vec<Vec<u8>>) -> Vec<u8> {
 fn every_request_is_answered_byte_for_byte() {
     let mut bench = bench(Model::A1);
     let info = only_reply(bench.ask(&[0xA5, 0x50]));
-    // Model 18h, firmware 1.29, hardware 5, and sixteen bytes that depend on the seed.
+    // The response has model 18h, firmware 1.29, hardware 5, and a serial number of sixteen bytes, which depends on the
+    // seed.
     assert_eq!(info[..11], [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04, 0x18, 29, 1, 5]);
     assert_eq!(info.len(), 7 + 20);
     assert_eq!(only_reply(bench.ask(&[0xA5, 0x52])), [0xA5, 0x5A, 3, 0, 0, 0, 0x06, 0, 0, 0]);
@@ -150,7 +151,7 @@ fn every_request_is_answered_byte_for_byte() {
     assert_eq!(only_reply(bench.configuration(0x75, 2)), conf(0x75, &[0x84]));
     assert_eq!(only_reply(bench.configuration(0x7C, 0)), conf(0x7C, &[3, 0]));
     assert_eq!(only_reply(bench.configuration(0x7F, 4)), conf(0x7F, b"Stability\0"));
-    // The vendor's driver sends 32 more bytes after the key.
+    // The vendor's driver sends 32 more bytes after the key. The scanner accepts them.
     let mut long = vec![0x7F, 0, 0, 0];
     long.extend([0; 32]);
     assert_eq!(only_reply(bench.ask(&with_payload(0x84, &long))), conf(0x7F, b"Standard\0"));
@@ -227,7 +228,7 @@ fn motor_control_depends_on_the_model() {
             bench.run_for(ONE_SECOND);
             bench.sent.len() > sent
         };
-        // The descriptor arrives at once, and points when the motor has reached its speed.
+        // The descriptor arrives at once. Points arrive when the motor has reached its speed.
         assert_eq!(bench.ask(&stream_request(1)).len(), 1);
         assert_eq!(flows(&mut bench), turns, "{model:?}");
         if stop.is_empty() {
@@ -238,7 +239,8 @@ fn motor_control_depends_on_the_model() {
         assert!(flows(&mut bench), "{model:?}");
         bench.ask(&stop);
         assert!(!flows(&mut bench), "{model:?}");
-        // FORCE does not wait for the motor, so every point has the same direction.
+        // After FORCE, the scanner does not wait for the motor. The motor is off, so all points have the same
+        // direction.
         bench.ask(&[0xA5, 0x21]);
         assert!(flows(&mut bench), "{model:?}");
         let angles: Vec<f64> =
@@ -254,7 +256,7 @@ fn accepts_requests_only_after_the_boot_message() {
     bench.run_for(ONE_SECOND);
     let requested_at = bench.now;
     assert!(bench.ask(&[0xA5, 0x40]).is_empty());
-    // The scanner is booting.
+    // The scanner boots, so it does not respond.
     assert!(bench.ask(&[0xA5, 0x50]).is_empty());
     bench.run_for(ONE_SECOND);
     let boot_message = bench.sent.last().expect("a boot message").clone();
@@ -273,7 +275,7 @@ fn accepts_requests_only_after_the_boot_message() {
     assert!(bench.sent[0].bytes.len() == 64 && bench.sent[0].at > 2 * ONE_SECOND);
 }
 
-/// Returns a scanner that streams in mode number `mode` from the start.
+/// Returns a bench with a scanner that streams in mode number `mode` from the start.
 fn streaming(model: Model, mode: usize, faults: &str) -> Bench {
     let settings = RplidarSettings {
         typical: mode,
@@ -304,7 +306,7 @@ fn records_the_line_fault_of_each_packet() {
         bench.run(6 * ONE_SECOND);
         let hit = bench.sent.iter().filter(|sent| sent.fault == Some(name)).count();
         assert!(hit > 0, "{faults}");
-        // Packets that are marked as intact are on the line, whole and in order.
+        // Every packet without a fault is in the received bytes, whole and in order.
         let mut rest = &bench.received[..];
         for sent in bench.sent.iter().filter(|sent| sent.fault.is_none()) {
             let at = rest.windows(sent.bytes.len()).position(|window| window == sent.bytes);
@@ -336,7 +338,7 @@ fn brown_out_sends_boot_message_during_a_stream() {
         "the scanner sends nothing after that"
     );
     assert!(bench.sent[boot_message].bytes.starts_with(b"RP LIDAR"));
-    // The motor has power all the time.
+    // The motor has run all the time, so points follow soon.
     assert_eq!(bench.ask(&stream_request(3)).len(), 1);
     let sent = bench.sent.len();
     bench.run_for(ONE_SECOND);
@@ -348,7 +350,7 @@ fn points_after_a_power_cycle_need_a_running_motor() {
     let mut bench = streaming(Model::A1, 1, "");
     bench.run(ONE_SECOND);
     bench.cycle_power();
-    // The scanner boots for two seconds and then accepts requests at once. Its motor has been running since power-on.
+    // The scanner boots for two seconds, and accepts requests immediately afterwards. Its motor has run since power-on.
     bench.run(3 * ONE_SECOND + ONE_SECOND / 10);
     assert_eq!(bench.ask(&stream_request(1)).len(), 1);
     let before = bench.data().len();
@@ -399,7 +401,7 @@ fn held_head_sends_no_points_and_spins_up_again() {
     assert_eq!(gaps.len(), 1);
     let (last, first) = (gaps[0][0].at, gaps[0][1].at);
     assert!(last < 2 * ONE_SECOND + ONE_SECOND / 20, "{last}");
-    // The head is blocked for one second, and needs 1.6 s to reach its speed.
+    // The head is blocked from second 2 to second 3, and then needs 1.6 s to reach its speed.
     assert!((46 * ONE_SECOND / 10..47 * ONE_SECOND / 10).contains(&first), "{first}");
     let mut bench = streaming(Model::A1, 1, "hold=5,hold_at=1");
     bench.run(2 * ONE_SECOND);

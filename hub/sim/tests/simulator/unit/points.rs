@@ -1,5 +1,6 @@
-//! Tests of the points against the true measurements, for each packet format of each model, and of the properties of an
-//! A1. A second, slow decoder, written directly from the published formulas, decodes the packets of the simulator.
+//! Tests that compare the points in packets with the true measurements, for each packet format of each model, and tests
+//! of properties of a real A1. The packets are decoded here by a slow decoder that follows the published formulas, and
+//! not by the decoder of the driver.
 
 use scanhub_schema::Nanos;
 use scanhub_sim::beam::NoiseModel;
@@ -17,7 +18,7 @@ pub(crate) struct DecodedPoint {
     pub(crate) range_mm: f64,
     /// Quality, if the packet has one.
     pub(crate) quality: Option<u8>,
-    /// Flag of a new revolution, for formats that have it.
+    /// Flag of a new revolution. In formats without this flag, it is false.
     pub(crate) starts_revolution: bool,
 }
 
@@ -44,7 +45,7 @@ pub(crate) fn standard(packet: &[u8]) -> DecodedPoint {
     }
 }
 
-/// Returns the points of all packets except the last one, for the response type `answer`.
+/// Returns the points of all packets except the last one. The packets have the response type `answer`.
 pub(crate) fn capsules(answer: u8, packets: &[Vec<u8>]) -> Vec<DecodedPoint> {
     packets.windows(2).flat_map(|pair| capsule(answer, &pair[0], &pair[1])).collect()
 }
@@ -104,7 +105,7 @@ fn capsule(answer: u8, packet: &[u8], next: &[u8]) -> Vec<DecodedPoint> {
     (0..count as usize).map(point).collect()
 }
 
-/// Decodes range number `k` of a packet of 32 words.
+/// Decodes the range with index `k` in a packet of 32 words, in millimeters.
 fn ultra(body: &[u8], next: &[u8], k: usize) -> f64 {
     let at = |cabin: usize| if cabin < 32 { &body[4 * cabin..] } else { next };
     let bits = |cabin: usize| u32::from_le_bytes(at(cabin)[..4].try_into().expect("four bytes"));
@@ -132,7 +133,8 @@ fn ultra(body: &[u8], next: &[u8], k: usize) -> f64 {
     })
 }
 
-/// Returns the correction of an angle by the vendor's decoder of type 0x84, in degrees.
+/// Returns the angle in degrees by which the vendor's decoder of type 0x84 corrects the angle of a point at `mm`
+/// millimeters.
 fn angle_correction_deg(mm: f64) -> f64 {
     if mm < 50.0 {
         return 7.5;
@@ -146,7 +148,7 @@ fn noiseless_world(world: &str) -> World {
     world.parse::<World>().expect("a world").with_noise(NoiseModel::NONE)
 }
 
-/// Streams in mode `mode` for `span` in `world`. Returns the points that were sent.
+/// Streams in mode number `mode` for `span` in `world`. Returns the points that the scanner sent.
 fn stream_points(
     settings: RplidarSettings,
     mode: usize,
@@ -183,7 +185,7 @@ fn every_point_of_every_mode_matches_its_truth() {
             let seconds = (bench.now - begin) as f64 / 1e9;
             let due = seconds * 1e6 / mode.sample_us;
             assert!((points.len() as f64 / due - 1.0).abs() < 0.05, "{model:?} {number}: {}", points.len());
-            // Maximum errors of angle and range that result from their numbers of bits.
+            // Maximum errors of angle and range that result from rounding in this format.
             let (deg, mm) = match mode.form {
                 PacketFormat::Standard => (0.01, 0.6),
                 PacketFormat::Express => (0.08, 0.8),
@@ -199,7 +201,8 @@ fn every_point_of_every_mode_matches_its_truth() {
                 }
                 let range = truth.range_mm.expect("something is there");
                 ranges += 1;
-                // If a coarse range is near a step of the shift, the decoder's angle is one step off.
+                // The decoder computes the shift from the range. If a coarse range is near a step of the shift, the
+                // decoded angle is off by this step.
                 let is_off = difference_deg(point.clockwise_deg, truth.clockwise_deg).abs() > deg;
                 edges += usize::from(is_off);
                 assert!(
@@ -251,7 +254,7 @@ fn simulated_a1_points_match_a_real_a1() {
     assert!((9.0..15.0).contains(&share(backward, in_all)));
     // A real A1 had 264 to 267 points per revolution.
     assert!(counts[0] >= 263 && counts[counts.len() - 1] <= 268 && counts[0] + 2 <= counts[counts.len() - 1]);
-    // If a person stands right before zero, the first point of a revolution is after zero.
+    // If a person stands at an angle just below zero, the first point of a revolution is at an angle above zero.
     let usual = flags.iter().filter(|deg| (351.0..=359.5).contains(*deg)).count();
     assert!(share(usual, flags.len()) > 97.0, "{usual} of {}", flags.len());
 }

@@ -1,4 +1,5 @@
-//! Tests of the session for RPLIDARs: its revolutions are compared with the true measurements of the scanner.
+//! Tests of the session for RPLIDARs. They compare the revolutions that the session delivers with the true measurements
+//! of the scanner.
 
 use scanhub_drivers::Settings;
 use scanhub_drivers::line::NO_RETURN;
@@ -16,7 +17,7 @@ use super::{Bench, ONE_SECOND};
 struct DeliveredRevolution {
     first: Nanos,
     period: Nanos,
-    /// Whether the session marked points as missing, or bytes next to it as damaged.
+    /// Whether the session marked the revolution as incomplete, or bytes next to it as damaged.
     is_marked: bool,
     /// Clockwise angles in degrees, and ranges in millimeters; 0 means no return.
     points: Vec<(f64, u16)>,
@@ -93,8 +94,8 @@ impl SessionBench {
         }
     }
 
-    /// Returns the number of points in complete revolutions, the number of those that match no measurement, and the
-    /// largest error of a stamp.
+    /// Returns the number of points in revolutions without a mark, the number of these points that match no true
+    /// measurement, and the largest error of a stamp.
     fn check_points(&mut self, from: usize) -> (usize, usize, Nanos) {
         let begin = self.bench.unit.begin_ns().expect("it streams");
         let seconds = (self.bench.now - begin) as f64 / 1e9;
@@ -108,7 +109,7 @@ impl SessionBench {
             .iter()
             .filter(|revolution| revolution.first > begin && !revolution.is_marked)
         {
-            // The angle of a point without a return is not exact.
+            // Skip points without a return, because their angles are not exact.
             for (deg, mm) in revolution.points.iter().filter(|(_, mm)| *mm > 0) {
                 let about = at(revolution.first + (deg / 360.0 * revolution.period as f64).max(0.0) as Nanos);
                 let reach = 40.max(revolution.points.len() / 12);
@@ -131,7 +132,7 @@ impl SessionBench {
     }
 }
 
-/// Returns all modes that a session can request, and `None` for the default.
+/// Returns all modes that a session can request, and `None` for the default mode.
 fn selectable_modes(model: Model) -> impl Iterator<Item = Option<Mode>> {
     let named = model.modes().iter().map(|mode| Some(Mode::from_name(mode.name).expect(mode.name)));
     named.chain([None])
@@ -189,15 +190,17 @@ fn brown_outs_and_power_cycles_count_as_restarts() {
             SessionBench::new(settings, RplidarSettings::of(model), "brownout_at=4,brownout_every=5");
         bench.run(30 * ONE_SECOND);
         let banners = bench.bench.sent.iter().filter(|sent| sent.bytes.starts_with(b"RP LIDAR"));
-        // A boot message that completes the bytes of a packet is recognized once the stream is silent for a second.
+        // If the bytes of a boot message complete a packet, the session recognizes the restart only after the stream
+        // was silent for a second.
         let recognized =
             banners.clone().filter(|sent| sent.at + 1_100 * MILLIS < bench.bench.now).count() as u64;
         let restarts = bench.session.stats().restarts;
         assert!(recognized >= 3, "{model:?}: {recognized}");
-        // One of 256 boot messages completes the bytes to a packet with a valid checksum, and is lost.
+        // One of 256 boot messages completes a packet with a valid checksum. The session then handles it as a part of
+        // this packet, and does not detect the restart.
         assert!((recognized - 1..=banners.count() as u64).contains(&restarts), "{model:?}: {restarts}");
 
-        // A power cycle takes longer than the silence after which the session searches.
+        // After a power cycle, the scanner is silent for longer than the time after which the session searches for it.
         let mut bench = SessionBench::new(settings, RplidarSettings::of(model), "");
         for restarts in 1..=4 {
             bench.run(bench.bench.now + 7 * ONE_SECOND + restarts * 130 * MILLIS);

@@ -1,4 +1,4 @@
-//! Tests that each layer of noise has an effect, and none if it is switched off.
+//! Tests that each layer of noise has an effect, and that it has no effect if it is switched off.
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use scanhub_sim::beam::NoiseModel;
@@ -24,13 +24,13 @@ line = [[6000, 9000], [9000, 2000]]
 
 const NO_NOISE: NoiseModel = NoiseModel::NONE;
 
-/// Returns the values of `count` scans with these layers.
+/// Returns the values of `count` scans of the test world with the noise `layers`.
 fn words(layers: NoiseModel, seed: u64, count: u64) -> Vec<Vec<u16>> {
     let room = Room::new(&world(TEST_WORLD).with_noise(layers), seed);
     (1..=count).map(|scan| scan_at(&room, scan * SCAN_PERIOD_NS).words).collect()
 }
 
-/// Returns the deviations of `words` from the truth, for all beams that have a range in both.
+/// Returns the deviations of `words` from the ranges without noise, for all beams that have both ranges.
 fn deviations_mm(words: &[Vec<u16>]) -> Vec<f64> {
     let exact = &self::words(NO_NOISE, 0, 1)[0];
     let pairs = words.iter().flat_map(|words| words.iter().zip(exact));
@@ -101,19 +101,20 @@ fn heavy_tail_occurs_only_at_edges() {
         readings.extend(off);
     }
     assert!((4..30).contains(&at_edges), "{at_edges} beams");
-    // These are half of a normal distribution of 60 mm, which has 62 % beyond 30 mm.
+    // About half of these readings have a normal distribution with a standard deviation of 60 mm. In this
+    // distribution, 62 % are beyond 30 mm.
     let far = share(&readings, |mm| mm.abs() > 30.0);
     assert!((0.2..0.33).contains(&far), "{far}");
 }
 
-/// In a recording of a scanner that stood still for 18 s, .006 of the readings are off by more than 30 mm.
+/// In a recording of a scanner that stood still for 18 s, a share of .006 of the readings is off by more than 30 mm.
 #[test]
 fn outliers_are_as_frequent_as_in_recordings() {
     let world: World = "fig8".parse().unwrap();
     let (mut off, mut count) = (0, 0);
     for seed in 0..3 {
         let room = Room::new(&world, seed);
-        // These scans end before anything moves.
+        // Measure only before the first object of this world moves.
         let scans: Vec<_> = (1..300).map(|scan| scan_at(&room, scan * SCAN_PERIOD_NS)).collect();
         for beam in 0..361 {
             let valid = scans.iter().filter(|look| look.truth[beam] != BeamTarget::Invalid);
@@ -128,9 +129,9 @@ fn outliers_are_as_frequent_as_in_recordings() {
     assert!((0.004..0.012).contains(&share), "{share}");
 }
 
-/// Measures a post at 1.5 m in front of a wall that is `depth_mm` behind it. The post is measured at several positions,
-/// so that its edges are anywhere between two beams. Returns the share of values between among all readings of the
-/// beams around it, and the mean of their standard deviations at one beam, as a share of the depth.
+/// Measures a post at 1.5 m in front of a wall that is `depth_mm` behind the post. The post is measured at several
+/// positions, so that its edges are anywhere between two beams. Returns the share of the readings around the post that
+/// are between post and wall, and the mean standard deviation of such readings at one beam, as a share of the depth.
 fn values_between(depth_mm: f64, spot: bool) -> (f64, f64) {
     let (mut all, mut between, mut deviations) = (0, 0, Vec::new());
     for x_mm in 0..26 {
@@ -184,7 +185,7 @@ fn errors_replace_ranges_by_codes_and_nothing_else() {
 #[test]
 fn range_beyond_the_maximum_has_its_code() {
     let room = Room::new(&world(TEST_WORLD).with_noise(NO_NOISE), 1);
-    // The far wall is at 8.5 m and 40 degrees.
+    // The far wall is at a range of 8.5 m and an angle of 40 degrees.
     assert_eq!(scan_at(&room, SCAN_PERIOD_NS).words[80], 8191 - 8);
     let cm = room.scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_PERIOD_NS);
     assert!((800..950).contains(&cm[80]), "{}", cm[80]);
@@ -198,7 +199,7 @@ fn dark_and_oblique_surfaces_far_away_are_too_weak() {
         let world = world(&format!("{TEST_WORLD}{far}")).with_noise(NoiseModel { weak, ..NO_NOISE });
         Room::new(&world, 1).scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_PERIOD_NS)[beam]
     };
-    // The wall at 0.9 m, seen at an angle of 4 degrees, is 12.9 m away.
+    // The beam meets the wall, which is 0.9 m to the side, at an angle of 4 degrees and a range of 12.9 m.
     assert_eq!((range_word(true, 8), range_word(false, 8)), (8187, 1290));
     let dark = "[[thing]]\nline = [[-3000, 7900], [3000, 7900]]\nsurface = \"dark\"";
     let range_word = |weak: bool| {
@@ -206,7 +207,7 @@ fn dark_and_oblique_surfaces_far_away_are_too_weak() {
         scan_at(&Room::new(&world, 1), SCAN_PERIOD_NS).words[180]
     };
     assert_eq!((range_word(true), range_word(false)), (7900 + 287, 7900));
-    // At a distance of three meters, the dark board is visible.
+    // At a range of three meters, the dark board returns enough light for a range.
     let near = words(NoiseModel { weak: true, ..NO_NOISE }, 1, 1);
     assert!(board.into_iter().all(|beam| near[0][beam] < 8183));
 }
@@ -230,7 +231,7 @@ fn sun_dazzles_its_sector_during_its_time() {
     );
 }
 
-/// Even beams belong to the first of the two revolutions of the mirror, odd ones to the second.
+/// Even beams are measured in the first of the two revolutions of the mirror, and odd beams in the second one.
 #[test]
 fn half_degrees_are_measured_one_mirror_turn_later() {
     let (comb, straight) = [true, false]
@@ -252,8 +253,8 @@ fn half_degrees_are_measured_one_mirror_turn_later() {
     assert!(moved > 20, "{moved}");
 }
 
-/// A mark that is computed from levels is at the reflector, because the levels of neighboring beams depend on their
-/// light.
+/// The level of a beam depends on how much of its light falls on the reflector. A mark that is computed from the levels
+/// of neighboring beams is therefore at the middle of the reflector.
 #[test]
 fn reflectors_have_graded_levels_around_their_middle() {
     let strips = text("strips");

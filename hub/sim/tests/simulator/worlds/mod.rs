@@ -1,5 +1,5 @@
-//! Tests of worlds: every file is a valid world, the simulator rejects an invalid one with its name and position, and
-//! the truth agrees with geometry.
+//! Tests of worlds. Every file in the directory is a valid world. The simulator rejects an invalid file with the name
+//! of the file and the position of the error. The true targets agree with the geometry of the world.
 
 mod layers;
 
@@ -13,10 +13,10 @@ use scanhub_sim::mount::Mount;
 use scanhub_sim::room::{BeamTarget, LabeledScan, Room};
 use scanhub_sim::world::World;
 
-/// The directory of the files.
+/// The directory of the built-in worlds.
 const WORLDS_FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/worlds");
 
-/// Time of one scan of 361 beams.
+/// Period of the scans of 361 beams.
 const SCAN_PERIOD_NS: Nanos = 26_640_000;
 
 /// Returns the room of a world in TOML.
@@ -33,7 +33,7 @@ fn scan_at(room: &Room, end_ns: Nanos) -> LabeledScan {
     room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), end_ns)
 }
 
-/// Returns the text of a file in the directory.
+/// Returns the text of the built-in world with this name.
 fn text(name: &str) -> String {
     std::fs::read_to_string(format!("{WORLDS_FOLDER}/{name}.toml")).expect("a file of this name")
 }
@@ -103,8 +103,8 @@ fn each_seed_gives_a_different_run() {
     }
 }
 
-/// Two sensors at the same position see the same people, each with its own noise. A port beyond the last sensor belongs
-/// to another world.
+/// Two sensors at the same position see the same people, each sensor with its own noise. If there are more ports than
+/// sensors, the next port belongs to a copy of the world with other people.
 #[test]
 fn ports_beyond_the_last_sensor_have_another_world() {
     let text = format!("{}[[sensor]]\npose = [0, 100, 90]\n", text("fig8"));
@@ -238,7 +238,7 @@ fn page_shows_a_world_with_every_key() {
     let example =
         page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
     world(example);
-    // Shapes and paths that exclude the shapes and paths of the example are in comments.
+    // The example has keys that exclude each other. Some of them are in comments, which count as shown.
     let shown = |key: &str| example.lines().any(|line| line.trim_start_matches("# ").starts_with(key));
     let failure = World::of_toml("w.toml", "[[thing]]\nx = 1").unwrap_err();
     let persons = World::of_toml("w.toml", "[[person]]\nx = 1").unwrap_err();
@@ -253,7 +253,7 @@ fn page_shows_a_world_with_every_key() {
 }
 
 proptest! {
-    /// Any damaged file is rejected with a position, or is a valid world.
+    /// The simulator rejects a damaged file with a position, or the file is still a valid world.
     #[test]
     fn damaged_file_is_refused_or_runs(
         file in 0..13usize,
@@ -279,18 +279,19 @@ proptest! {
 }
 
 const ONE_SECOND: Nanos = 1_000_000_000;
-/// No noise, but beams as wide as real ones.
+/// No noise, but beams as wide as those of a real scanner.
 const WIDE_BEAMS: NoiseModel = NoiseModel { spot: true, ..NoiseModel::NONE };
 
-/// Returns the scans of `text` with and without everything from `cut` on, which must be its end.
+/// Returns the scans of two worlds: the world of `text`, and the world of `text` without the part that starts with
+/// `cut`.
 fn with_and_without(text: &str, cut: &str, end_ns: Nanos) -> (LabeledScan, LabeledScan) {
     let (without, _) = text.split_once(cut).expect("the part to remove");
     let look_at = |text: &str| scan_at(&Room::new(&world(text).with_noise(WIDE_BEAMS), 4), end_ns);
     (look_at(text), look_at(without))
 }
 
-/// Returns a world that does not depend on the seed. Otherwise, the removed part would change the random numbers of the
-/// rest.
+/// Returns the built-in world with this name, without displacements that depend on the seed. Otherwise, the objects
+/// that [`with_and_without`] removes would change the random numbers of the other objects.
 fn without_randomness(name: &str) -> String {
     text(name).lines().filter(|line| !line.starts_with("jitter_mm")).collect::<Vec<_>>().join("\n")
 }
@@ -350,7 +351,7 @@ fn surface_uncovered_by_a_box_is_static_and_new() {
     for beam in beams {
         let is_valid_twice =
             before.truth[beam] != BeamTarget::Invalid && after.truth[beam] != BeamTarget::Invalid;
-        // A beam at an edge of the box may have reported the surface behind the box before.
+        // A beam at an edge of the box may have reported the surface behind the box already before the removal.
         let edge = before.truth[beam - 2..beam + 3] != [BeamTarget::Static { since_ns: 0 }; 5];
         let [then, now] = [&before, &after].map(|look| i32::from(look.words[beam] & 8191));
         assert!(
@@ -379,7 +380,7 @@ fn truth_of_a_door_has_its_last_motion_time() {
         since
     };
     assert!(since(10 * ONE_SECOND).is_empty());
-    // While the box moves, its time is the time of the mirror's revolution.
+    // While the box moves, its target has the time of the mirror's revolution that measures it.
     assert_eq!(since(14 * ONE_SECOND + ONE_SECOND / 2), [14 * ONE_SECOND + ONE_SECOND / 2 - 13_320_000]);
     assert_eq!(since(20 * ONE_SECOND), [15 * ONE_SECOND + ONE_SECOND / 2]);
     assert_eq!(since(50 * ONE_SECOND), [35 * ONE_SECOND + ONE_SECOND / 2]);
@@ -411,10 +412,10 @@ fn truth_of_a_code_is_invalid() {
     assert!(codes > 500, "{codes}");
 }
 
-/// Beams without width, each at its own time.
+/// No noise, and beams without width, each measured at its own time.
 const THIN_BEAMS: NoiseModel = NoiseModel { comb: true, ..NoiseModel::NONE };
 
-/// Returns a world with `things` and one sensor, 1 m high, that swings from 0 to 40 degrees.
+/// Returns a world with `things` and one sensor at a height of 1 m, whose mount swings from 0 to 40 degrees.
 fn tilted_world(things: &str) -> World {
     let mount = "[sensor.mount]\nheight_mm = 1000\nfrom_deg = 0\nto_deg = 40\ndeg_s = 20\n";
     world(&format!("[[sensor]]\npose = [0, 0, 90]\n{mount}\n{things}")).with_noise(THIN_BEAMS)
@@ -424,8 +425,9 @@ fn mount(world: &World) -> &Mount {
     world.mount(0).expect("its sensor has a mount")
 }
 
-/// Returns the end points of the beams with a range in the scan that ended at `end_ns`: right, ahead and up in the
-/// frame of the mount's axis on the floor. Each beam has the angle of its own time.
+/// Returns index, end point and true target of each beam with a range, in the scan that ended at `end_ns`. A point has
+/// the coordinates right, ahead and up, with the origin on the floor below the mount's axis. It is computed with the
+/// angle of the mount at the time of its beam.
 fn points(world: &World, end_ns: Nanos) -> Vec<(usize, [f64; 3], BeamTarget)> {
     let scan = scan_at(&Room::new(world, 1), end_ns);
     let head = ScanHead::lms(361, -90_000, 500, 1, 13);
