@@ -1,4 +1,5 @@
-//! Build script that links the functions that run for each telegram next to each other, so that they fill fewer pages.
+//! Build script that links the functions that run for each telegram next to each other, so that they occupy fewer pages
+//! of memory.
 
 use std::env;
 

@@ -68,7 +68,8 @@ fn refuse_hub(command: &mut Command, matches: &ArgMatches) -> Result<(), clap::E
     Err(command.error(ErrorKind::ArgumentConflict, message))
 }
 
-/// Returns an error if `--json` stands before a verb whose flags conflict with it. clap checks only those after the verb.
+/// Returns an error if `--json` stands before a verb whose flags conflict with it. clap detects such a conflict only if
+/// `--json` stands after the verb.
 fn refuse_json(command: &mut Command, matches: &ArgMatches) -> Result<(), clap::Error> {
     let Some((name, own)) = matches.subcommand().filter(|_| matches.get_flag("json")) else { return Ok(()) };
     let command = command.find_subcommand_mut(name).expect("a verb");

@@ -400,7 +400,7 @@ const TRACKER: usize = 104;
 const REFRESH_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum wait for a line before the time is checked.
 const MAX_LINE_WAIT: Duration = Duration::from_millis(50);
-/// Timeout until all sensors stream. They need far less time unless the machine is busy.
+/// Timeout until all sensors stream. The sensors need far less time unless the machine is busy.
 const START_TIMEOUT: Duration = Duration::from_secs(30);
 /// Maximum wait for the last lines of a simulator that has ended.
 const SUMMARY_TIMEOUT: Duration = Duration::from_secs(2);

@@ -37,7 +37,7 @@ fn main() -> ExitCode {
         Err(error) => return refuse(&error),
     };
     start_log();
-    // Programs read the output of these verbs on stdout, or it is a recording. Print failures to stderr.
+    // Programs read the output of these verbs on stdout, or stdout is a recording. Print failures to stderr.
     let quiet = match &cli.verb {
         Verb::Run(_) | Verb::Replay(_) | Verb::Simulate(_) => true,
         Verb::Record(record) => record.is_to_stdout(),
@@ -137,8 +137,8 @@ fn print_status(line: &str) {
     let _ = print(line);
 }
 
-/// Prints the error of a verb: with `json` as a JSON line on stdout, which goes to stderr if `quiet`, otherwise as text on
-/// stderr.
+/// Prints the error of a verb. Without `json`, prints text to stderr. With `json`, prints a JSON line to stdout, or to
+/// stderr if `quiet`.
 fn report(failure: &Failure, json: bool, quiet: bool) {
     if !json {
         return print_error(&format!("scanhub: {failure}"));

@@ -14,7 +14,7 @@ use scanhub_shm::Domain;
 use scanhub_sim::mount::Report;
 use scanhub_sim::options::SimulateOptions;
 
-/// Publishers of all simulated mounts. Dropping it removes the topics.
+/// Publishers of all simulated mounts. Dropping this value removes the topics.
 pub(crate) struct SimulatedMounts {
     /// Reports of the encoders, with the number of the port; `None` once no more follow.
     reports: Option<Sender<(usize, Report)>>,
@@ -53,7 +53,7 @@ impl SimulatedMounts {
         Ok(SimulatedMounts { reports: Some(reports), thread: Some(thread) })
     }
 
-    /// Publishes `report` of the encoder at port `number`, if it has a name.
+    /// Publishes `report` of the encoder at port `number`, if the mount at this port has a name.
     pub(crate) fn report(&self, number: usize, report: Report) {
         if let Some(reports) = &self.reports {
             let _ = reports.send((number, report));
@@ -68,7 +68,8 @@ impl Drop for SimulatedMounts {
     }
 }
 
-/// Threads that publish the angles of recorded mounts while the hub plays the recording. Dropping it ends them.
+/// Threads that publish the angles of recorded mounts while the hub plays the recording. Dropping this value ends the
+/// threads.
 pub(crate) struct RecordedMounts {
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
@@ -123,8 +124,8 @@ impl MountTopic {
     /// Publishes `tilt` as of `stamp_ns`, with the header that `change` returns.
     fn publish(&mut self, stamp_ns: u64, tilt: Tilt, change: impl FnOnce(Header) -> Header) {
         let header = change(self.topic.header_at(stamp_ns));
-        // If memory runs out, the sample is not sent and its number is skipped. A subscriber that is not woken polls
-        // ten times a second.
+        // If memory runs out, the sample is not sent and its sequence number is skipped. A subscriber that is not woken
+        // polls ten times a second.
         let _ = self.topic.send_with(&header, |sample| *sample = tilt);
         let _ = self.sensor.wake(WakeEvent::Telegram);
     }

@@ -6,10 +6,10 @@ use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Directory, Domain, Environment};
 use tempfile::TempDir;
 
-/// Private domain. Its directory and its shared memory are removed when this is dropped.
+/// Private domain. Its directory and its shared memory are removed when this value is dropped.
 pub(crate) struct PrivateDomain {
     domain: Domain,
-    /// Temporary directory that contains the domain, if another user has occupied the usual one.
+    /// Temporary directory that contains the domain, if another user has occupied the usual directory.
     base: Option<TempDir>,
 }
 
@@ -18,12 +18,12 @@ impl PrivateDomain {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] if neither the usual directory nor one for temporary files can be used.
+    /// Returns [`Kind::Failed`] if neither the usual directory nor a temporary directory can be used.
     pub(crate) fn new(prefix: &str) -> Result<PrivateDomain, Failure> {
         let name = format!("{prefix}-{}", std::process::id());
         let environment = Environment::of_process();
-        // The path of the user's directory may be too long for a domain. The directory for users without one is short
-        // enough.
+        // The path of the user's directory may be too long for a domain. The path for users without such a directory is
+        // short enough.
         let fallback = Environment { uid: environment.uid, ..Environment::default() };
         for environment in [environment, fallback] {
             if let Ok(domain) = Domain::of_hub(&name, None, &environment)

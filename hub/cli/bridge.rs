@@ -1,5 +1,5 @@
 //! `scanhub bridge`, which starts the program scanhub-bridge. That program parses its own arguments. It is a separate
-//! program because few users need it, and its dependencies are five times those of everything else.
+//! program because few users need it, and it has five times as many dependencies as everything else.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;

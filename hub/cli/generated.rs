@@ -111,7 +111,7 @@ enum NameKind {
 struct CommandLine {
     /// Kind of the name that is expected next, if it is a name of the hub.
     name_kind: Option<NameKind>,
-    /// Whether `robot`, all sensors together, is accepted too.
+    /// Whether the name `robot` is accepted, too, which means all sensors together.
     takes_robot: bool,
     values: Vec<(String, String)>,
 }

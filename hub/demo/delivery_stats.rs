@@ -12,7 +12,8 @@ use sha2::{Digest, Sha256};
 /// Counts of all sensors.
 pub(crate) struct DeliveryStats {
     pub(crate) sensors: Vec<Sensor>,
-    /// Time of the cut, in nanoseconds of the monotonic clock. Telegrams whose last byte was sent later do not count.
+    /// Time of the cut, the end of the count, in nanoseconds of the monotonic clock. Telegrams whose last byte was sent
+    /// later do not count.
     cut_ns: u64,
     cut_at: Option<Instant>,
     /// Results of three-dimensional perception, if a sensor is on a mount.
@@ -32,7 +33,7 @@ pub(crate) struct Sensor {
     pub(crate) baud: u64,
     /// Whether the scanner is a rotating one, which sends packets. Packets before the first subscriber do not count.
     is_rotating: bool,
-    /// Hashes of packets that were sent before the first one arrived.
+    /// Hashes of packets that were sent before the first packet arrived.
     sent_before_first: Vec<String>,
     /// Number of telegrams of measured data that were sent completely before the cut.
     pub(crate) sent: u64,
@@ -153,8 +154,9 @@ impl DeliveryStats {
         self.sensors.iter().all(|sensor| !sensor.ranges.is_empty())
     }
 
-    /// Returns whether no more telegrams from before the cut will arrive: a later one of each sensor has arrived, or
-    /// none of any kind for `limit`, or six times as long has passed since the cut.
+    /// Returns whether no more telegrams from before the cut will arrive. This is so if each sensor has either
+    /// delivered a telegram from after the cut, or delivered no telegram for `limit`. After six times `limit` since the
+    /// cut, always returns true.
     pub(crate) fn is_complete(&self, limit: Duration) -> bool {
         let Some(cut_at) = self.cut_at else { return false };
         // A sensor that has sent nothing by the cut has lost nothing.
@@ -196,7 +198,8 @@ impl DeliveryStats {
     /// Updates the CPU time of the hub, process `pid`.
     pub(crate) fn update_cpu_time(&mut self, pid: u32) {
         let now = CpuTime { since: Instant::now(), used_ns: cpu_time_ns(pid) };
-        // The search for the scanners does not count.
+        // The CPU time of the search for the scanners does not count, so the measurement starts when all sensors
+        // stream.
         if self.sensors.iter().any(|sensor| sensor.ranges.is_empty()) {
             self.hub = Some(now);
             return;
@@ -290,7 +293,7 @@ impl Sensor {
         Some(lost.saturating_sub(self.line_before.lost.unwrap_or_default()))
     }
 
-    /// Returns the share of damaged bytes since the first telegram; `None` if none has been read.
+    /// Returns the share of damaged bytes since the first telegram; `None` if no byte has been read.
     fn damaged(&self) -> Option<f64> {
         let (counts, before) = (self.line?, self.line_before);
         let read = counts.read.saturating_sub(before.read);

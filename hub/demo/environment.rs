@@ -43,7 +43,7 @@ impl DemoEnvironment {
         Ok(DemoEnvironment { domain, world, sensors, directory, quiet })
     }
 
-    /// Prints the kept errors.
+    /// Prints the errors that were kept because of `quiet`.
     pub(super) fn print_errors(&self) {
         let errors = std::fs::read(self.log()).unwrap_or_default();
         let _ = io::stderr().lock().write_all(&errors);
@@ -53,8 +53,8 @@ impl DemoEnvironment {
         self.directory.path().join("log")
     }
 
-    /// Starts this program with `arguments` in the domain. With a `listener`, sends the lines of the child there, with
-    /// the child's number.
+    /// Starts this program with `arguments` in the domain. If there is a `listener`, sends each line of the child to
+    /// it, with the child's number.
     fn start(
         &self,
         arguments: &[String],
@@ -173,7 +173,7 @@ impl DemoEnvironment {
         self.start(&TILT_ARGUMENTS.map(str::to_owned), Some((TILTED, lines.clone()))).map(Some)
     }
 
-    /// Starts the page for browsers, and returns its address too.
+    /// Starts the server of the page for browsers. Also returns the address of the page.
     pub(super) fn start_web(&self) -> Result<(Child, String), Failure> {
         let web = self.start(&["web".into(), "--json".into()], None)?;
         let (web, ready) = web.await_ready(WEB, mpsc::channel().0)?;

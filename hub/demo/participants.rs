@@ -51,8 +51,8 @@ impl World {
         }
     }
 
-    /// Returns settings of the hub. The house has no robot, so its circle is small and outside the walls. The
-    /// background is learned fast, so that users need not wait long for people.
+    /// Returns settings of the hub. The house has no robot, so the circle of its zone is small and outside the walls.
+    /// The background is learned fast, so that users need not wait long for people.
     pub(crate) fn settings(self) -> &'static [&'static str] {
         match self {
             World::Robot | World::Tilt => &[],
@@ -65,7 +65,8 @@ impl World {
     /// # Errors
     ///
     /// Returns [`Kind::Usage`] for mixed families in the house, because each family's simulator would begin with the
-    /// same sensor. Returns it on the mount for a family whose simulator does not support a mount.
+    /// same sensor. Also returns [`Kind::Usage`] in the world with a mount, for a family whose simulator does not
+    /// support a mount.
     pub(crate) fn sensors(self, families: Families) -> Result<Vec<Sensor>, Failure> {
         match (self, families) {
             (World::Robot, families) => Ok(families.robot_sensors()),

@@ -16,7 +16,7 @@ use scanhub_viewer::server::player::{Playback, PlayerCommand, Progress};
 
 use crate::private_domain::PrivateDomain;
 
-/// Serves the picture of a hub, or with `--replay` that of a recording.
+/// Serves the picture of a hub, or with `--replay` the picture of a recording.
 pub(crate) fn run(web: &WebArgs, context: &mut Context) -> Result<(), Failure> {
     let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
     match &web.replay {

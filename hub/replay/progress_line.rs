@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rustix::termios::tcgetwinsize;
 use scanhub_daemon::{PlaybackRate, Progress};
 
-/// Progress line, which is removed when this is dropped.
+/// Progress line, which is removed from the terminal when this value is dropped.
 #[derive(Default)]
 pub(super) struct ProgressLine {
     drawn: String,
@@ -131,7 +131,7 @@ fn clock(ns: u64) -> String {
 
 /// Number of characters of the bar.
 const BAR_WIDTH: usize = 20;
-/// Maximum brevity, with only the time left.
+/// Maximum brevity, at which the line shows only the time.
 const MAX_BREVITY: u32 = 8;
 /// Control sequence that moves the cursor to the start of the line and clears the line (ECMA-48).
 const CLEAR_LINE: &str = "\r\x1b[K";
