@@ -27,7 +27,7 @@ use crate::text;
 pub struct BackgroundArgs {
     /// The sensor
     pub sensor: String,
-    /// Request about its model.
+    /// Request about the background model of the sensor.
     #[command(subcommand)]
     pub order: ModelRequest,
 }
@@ -155,8 +155,8 @@ fn shown(sensor: &str, shown: Option<ResponseModel>) -> Result<ResponseModel, Fa
     })
 }
 
-/// Writes `model` to `file`, and writes a line about that to `printed`. Replaces an existing file if `force` is set. If
-/// `file` is standard output, the model goes to `printed`.
+/// Writes `model` to `file`, and writes a line about the saved file to `printed`. Replaces an existing file if `force`
+/// is set. If `file` is standard output, the model goes to `printed`.
 fn save(
     file: &Path,
     force: bool,
@@ -213,8 +213,8 @@ struct SavedJson<'a> {
     count: u16,
 }
 
-/// Reads the model for `sensor` from `file`; `-` stands for `input`. Unless `any_sensor` is set, the model must be one
-/// of this sensor.
+/// Reads the model for `sensor` from `file`; `-` stands for `input`. Unless `any_sensor` is set, the model must belong
+/// to `sensor`.
 ///
 /// # Errors
 ///

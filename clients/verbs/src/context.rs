@@ -61,7 +61,7 @@ impl DomainOptions {
     ///
     /// # Errors
     ///
-    /// As for [`locations`](Self::locations).
+    /// Returns the errors of [`locations`](Self::locations).
     pub fn of_hub(&self) -> Result<Domain, Failure> {
         Domain::of_hub(&self.name, self.root.as_deref(), &Environment::of_process())
     }
@@ -71,7 +71,7 @@ impl DomainOptions {
     ///
     /// # Errors
     ///
-    /// As for [`locations`](Self::locations).
+    /// Returns the errors of [`locations`](Self::locations).
     pub fn of_publisher(&self) -> Result<Domain, Failure> {
         scanhub_shm::publisher_domain(&self.name, self.root.as_deref(), &Environment::of_process())
     }

@@ -18,7 +18,8 @@ pub struct Discovery {
     task: Option<(BackgroundTask<Answer>, Duration)>,
     /// Whether a list has succeeded or failed since the hub appeared. Later failures are ignored.
     has_reply: bool,
-    /// Time of the last change of the domain's services: before the current list, and before the last complete list.
+    /// Time of the last change of the domain's services, as read before the current list and before the last complete
+    /// list.
     task_change: Option<SystemTime>,
     reply_change: Option<SystemTime>,
 }
@@ -57,8 +58,8 @@ const SERVICES_DIRECTORY: &str = "services";
 /// Time after which all files of a new service are complete.
 const COMPLETE_AFTER: Duration = Duration::from_secs(5);
 
-/// Number of lists after which one is made even if the services are unchanged. A list misses services that could not be
-/// opened, for example because descriptors ran out.
+/// A list whose number is a multiple of this value is made even if the services are unchanged. An earlier list may have
+/// missed services that could not be opened, for example because descriptors ran out.
 const RELIST_PERIOD: usize = 6;
 
 /// Interval at which the caller polls for the result.
@@ -91,13 +92,13 @@ impl Discovery {
         self.task = None;
     }
 
-    /// Returns whether there was a hub.
+    /// Returns whether a hub has been found since this discovery was created.
     pub fn has_seen_hub(&self) -> bool {
         self.hub.is_some()
     }
 
-    /// Starts a list of the sensors of the hub in `domain` if one is due. Returns the result of a list once, when it is
-    /// complete. A list is skipped while the services of the domain are unchanged, because it executes a million
+    /// Starts a list of the sensors of the hub in `domain` if one is due. When a list is complete, returns its result
+    /// once. A list is skipped while the services of the domain are unchanged, because it executes a million
     /// instructions for each service. Before lists were skipped, they took half of a gateway's CPU time.
     ///
     /// # Errors
@@ -166,7 +167,7 @@ impl<T: Send + 'static> BackgroundTask<T> {
         thread.ok().map(|_| BackgroundTask(result))
     }
 
-    /// Returns the result if the work has ended. Returns it to only one call.
+    /// Returns the result if the work has ended. Only one call returns the result.
     pub fn result(&self) -> Option<T> {
         self.0.try_recv().ok()
     }
@@ -225,7 +226,7 @@ mod tests {
         assert_eq!([0, 1, 2].map(&mut lists_at), [true; 3]);
         let old = SystemTime::now() - Duration::from_secs(60);
         std::fs::File::open(&services).unwrap().set_modified(old).unwrap();
-        // The list at 36 s is the sixth.
+        // The list at 36 s is the sixth, which is made although the services are unchanged.
         assert_eq!([6, 16, 26, 36].map(&mut lists_at), [true, true, false, true]);
         std::fs::write(services.join("another"), "").unwrap();
         assert_eq!([46, 56].map(&mut lists_at), [true; 2], "a service may be incomplete");

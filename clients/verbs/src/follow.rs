@@ -47,17 +47,17 @@ impl RunLimits {
 pub enum Event {
     /// The run will subscribe to this topic when it is available.
     Added(Rc<TopicName>),
-    /// The run has subscribed to the topic. It receives samples that are sent from now on.
+    /// The run has subscribed to the topic. The run receives samples that are sent from now on.
     Subscribed(Rc<TopicName>),
-    /// A sample, or the substitute for a sample during a silence, which is not counted. Drop the sample before the next
-    /// call.
+    /// A sample, or, during a silence, the substitute for a sample. A substitute does not count as a received sample.
+    /// Drop the sample before the next call.
     Sample(Rc<TopicName>, Sample, Arrival),
     /// A problem of these topics, or the end of a problem. The list is empty if the run has no topics yet.
     Notice(Vec<Rc<TopicName>>, Notice),
-    /// The run cannot subscribe to this topic because memory, descriptors or slots ran out. It will try again
+    /// The run cannot subscribe to this topic because memory, descriptors or slots ran out. The run will try again
     /// ([`TopicRun::tolerating_shortage`]).
     ResourceExhausted(Rc<TopicName>, Failure),
-    /// A status of a sensor. Only a run [`with_lines`](TopicRun::with_lines) returns it.
+    /// A status of a sensor. Only a run [`with_lines`](TopicRun::with_lines) returns this event.
     Line(String, Box<Status>),
     /// End of a round over all topics. Even without samples, about ten rounds per second end.
     Tick(Instant),
@@ -79,7 +79,7 @@ pub enum Notice {
     Missed(u64),
     /// No sample has arrived for longer than the topic allows.
     Stale,
-    /// No hub runs in the domain, so the verb waits for one. The failure names the searched locations and the hubs of
+    /// No hub runs in the domain, so the verb waits for a hub. The failure names the searched locations and the hubs of
     /// other users.
     NoHub(Failure),
     /// The hub of the domain has exited.
@@ -130,7 +130,7 @@ pub struct TopicRun<'a> {
     started: Instant,
     last_sample: Instant,
     hub_started_at: Option<Instant>,
-    /// Time at which the run first found a hub. A listener does not count.
+    /// Time at which the run first found a hub. A listener does not count as a hub.
     hub_running_since: Option<Instant>,
     /// Time of the last list of sensors.
     listed_at: Option<Instant>,
@@ -176,7 +176,8 @@ struct TopicState {
     name: Rc<TopicName>,
     source: Source,
     stats: ReceiveStats,
-    /// Time on CLOCK_MONOTONIC in ns. Samples that are sent later are received without a wait.
+    /// Time, on CLOCK_MONOTONIC in ns, since which the run has been ready to receive. Earlier samples have waited, so
+    /// their arrival times are too late.
     since_ns: u64,
 }
 
@@ -189,7 +190,7 @@ struct LineState {
     losses: LineLossCounter,
 }
 
-/// Maximum number of samples that are received from one topic before the next topic.
+/// Maximum number of samples that a round receives from one topic before it goes to the next topic.
 const BATCH_SIZE: usize = 32;
 /// Maximum time until every listener has announced its remote sensors. A listener announces them once a second.
 const ANNOUNCEMENT_TIMEOUT: Duration = Duration::from_secs(3);
@@ -306,7 +307,7 @@ impl<'a> TopicRun<'a> {
     ///
     /// # Errors
     ///
-    /// The error of `summary`, or otherwise the error in `end`.
+    /// Returns the error of `summary` or, if all calls of `summary` succeed, the error in `end`.
     pub fn finish(
         mut self,
         end: Result<(), ExitReason>,
@@ -580,7 +581,7 @@ impl<'a> TopicRun<'a> {
         self.hub_running_since =
             if is_hub_running { self.hub_running_since.or(Some(Instant::now())) } else { None };
         let published = match self.session.domain().map(scanhub_shm::published_topics).transpose() {
-            // After the last shortage, the run has not yet tried to subscribe again.
+            // Listing failed because memory, descriptors or slots are short again, which the run tolerates.
             Err(failure) if failure.kind == Kind::ResourceExhausted && self.tolerates_shortage => {
                 return Ok(());
             }
@@ -589,7 +590,7 @@ impl<'a> TopicRun<'a> {
         let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
         sensors.dedup();
         let wants_all = topics.iter().all(|topic| topic.name.is_robot());
-        // Only sensors of the hub count. Without a hub, only remote sensors count.
+        // If a hub runs, only its sensors count, otherwise only remote sensors.
         let may_come =
             self.may_start(if is_hub_running { DomainHolder::Hub } else { DomainHolder::Listener });
         if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == is_hub_running) {
@@ -618,7 +619,7 @@ impl<'a> TopicRun<'a> {
     }
 
     /// Returns whether sensors of a publisher of the kind `holder` may still appear. Sensors of a listener may appear
-    /// at any time in an unbounded run, and in the first [`ANNOUNCEMENT_TIMEOUT`] of a bounded one. Sensors of the hub
+    /// at any time in an unbounded run, and in the first [`ANNOUNCEMENT_TIMEOUT`] of a bounded run. Sensors of the hub
     /// may appear in an unbounded run until [`STARTUP_GRACE`] after the hub was found.
     fn may_start(&self, holder: DomainHolder) -> bool {
         let unbounded = !self.limits.is_bounded();
@@ -671,7 +672,7 @@ impl TopicState {
     }
 }
 
-/// Adds the lines of the sensors in a combined verdict.
+/// Adds the serial lines of the sensors in a combined verdict.
 fn follow_parts(lines: &mut Vec<LineState>, sample: &Sample) {
     if let Sample::Robot(update) = sample
         && update.robot.sensors().count() != lines.len()

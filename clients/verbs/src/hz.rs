@@ -32,8 +32,8 @@ pub struct HzArgs {
     pub limits: RunLimits,
 }
 
-/// Parses the time span that a line covers. In a span below the minimum, no two samples would be far enough apart for a
-/// rate.
+/// Parses the time span that a line covers. In a span below [`MIN_WINDOW`], no two samples would be far enough apart to
+/// compute a rate.
 fn parse_window(text: &str) -> Result<Duration, String> {
     match duration::parse(text)? {
         window if window >= MIN_WINDOW => Ok(window),
@@ -81,8 +81,8 @@ struct Hz<'a> {
     notes: Output<'a>,
 }
 
-/// A topic, with a time on CLOCK_MONOTONIC in ns. Samples that are sent later are received without a wait. Earlier
-/// samples come from the history, so their arrival times show no rate.
+/// A topic with its window. `since_ns` is the time, on CLOCK_MONOTONIC in ns, since which the run has been ready to
+/// receive. Samples that were sent earlier come from the history, so their arrival times show no rate.
 struct TopicWindow {
     name: Rc<TopicName>,
     since_ns: u64,

@@ -86,7 +86,7 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
         command: Option<u8>,
         #[serde(skip_serializing_if = "Option::is_none")]
         kind: Option<&'static str>,
-        /// Whether the checksums are correct; `null` if the family has none.
+        /// Whether the checksums are correct; `null` if the family has no checksums.
         #[serde(skip_serializing_if = "Option::is_none")]
         checked: Option<Option<bool>>,
         #[serde(skip_serializing_if = "Option::is_none")]
@@ -252,7 +252,8 @@ pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
     }
 }
 
-/// Writes lines of class `notice`: one for each name in `names`, or one without a name if `names` is empty.
+/// Writes lines of class `notice`: one line for each name in `names`, or a single line without a name if `names` is
+/// empty.
 pub(crate) fn notices(
     output: &mut Output<'_>,
     names: &[Rc<TopicName>],

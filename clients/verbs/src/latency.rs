@@ -211,7 +211,7 @@ impl Latency<'_> {
     }
 }
 
-/// Returns the line of class `latency`. A span whose time is unknown is null. The keys are a contract: they may be
+/// Returns the line of class `latency`. A span whose time is unknown is null. The keys are a contract: keys may be
 /// added, but never changed.
 fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
     #[derive(Serialize)]
@@ -360,8 +360,8 @@ fn time(ns: u64) -> String {
 #[serde(tag = "class", rename = "conditions")]
 struct Conditions {
     wait: &'static str,
-    /// Whether the thread has SCHED_FIFO with the lowest priority. It then runs before all threads without real-time
-    /// priority.
+    /// Whether the thread has SCHED_FIFO with the lowest priority. The thread then runs before all threads without
+    /// real-time priority.
     realtime: bool,
     memory_locked: bool,
     /// Duration of one read of the clock in ns.
@@ -394,7 +394,8 @@ impl Conditions {
 
     fn with_realtime(self, wait: Wait, processors: usize) -> Conditions {
         let priority = may_spin(wait, processors).and_then(|()| take_priority());
-        // Do not lock later mappings. If they exceeded the limit, the topics could not be mapped.
+        // Lock only the present mappings. If later mappings were locked, too, they could exceed the limit, and then the
+        // topics could not be mapped.
         let locked = mlockall(MlockAllFlags::CURRENT).map_err(|error| {
             format!("memory is not locked: {}; `ulimit -l unlimited` permits it", io::Error::from(error))
         });
@@ -419,8 +420,8 @@ impl Conditions {
     }
 }
 
-/// Returns an error if there are too few processors for a thread with priority that never sleeps. It would stop the
-/// hub.
+/// Returns an error if there are too few processors for a thread with real-time priority that never sleeps. Such a
+/// thread would keep the hub from running.
 fn may_spin(wait: Wait, processors: usize) -> Result<(), String> {
     if wait == Wait::Spin && processors < MIN_PROCESSORS {
         return Err(format!(

@@ -56,7 +56,7 @@ green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector m
 impl LedsArgs {
     /// Shows the lights on stdout and on the LEDs until the limits are reached or a signal ends the run. Notices go to
     /// stderr without `--json`. The red light is on after the run, however it ends. If an LED fails during the run, the
-    /// verb reports that and tries the LED again later. The other LEDs continue.
+    /// verb reports the failure and tries the LED again later. The other LEDs continue.
     ///
     /// # Errors
     ///
@@ -228,8 +228,8 @@ impl LightPanel<'_> {
         }
     }
 
-    /// Returns a possible reason for the verdict: a loss on the line of the sensor that determines the verdict, or
-    /// otherwise a loss on another sensor's line.
+    /// Returns a possible reason for the verdict, as text: a loss on the line of the sensor that determines the
+    /// verdict, or otherwise a loss on another sensor's line.
     fn reason(&self) -> Option<String> {
         let sensor_name = self.states.worst.as_deref();
         let of_worst = self.losses.iter().find(|(sensor, _)| Some(sensor.as_str()) == sensor_name);
@@ -482,7 +482,7 @@ struct WorstVerdictHold {
 }
 
 impl WorstVerdictHold {
-    /// Creates a hold. A verdict counts until the time `hold` after its end. The first verdict is unknown.
+    /// Creates a hold. A verdict counts until `hold` has elapsed since its end. The first verdict is unknown.
     fn new(hold: Duration) -> WorstVerdictHold {
         WorstVerdictHold { hold, current: (Verdict::Unknown, None), previous: Vec::new() }
     }

@@ -25,8 +25,8 @@ pub struct ListArgs {
 }
 
 impl ListArgs {
-    /// Writes the topics of every sensor of the hub to stdout, with rate, subscribers, payload type and revision. As
-    /// text, the problems of sensors follow.
+    /// Writes the topics of every sensor of the hub to stdout, with rate, subscribers, payload type and revision. In
+    /// text output, the problems of the sensors follow.
     ///
     /// With `--domains`, writes every live domain instead, or only the domains below `--root` if it is given. The hubs
     /// that this user cannot reach follow, each with a command that reaches it.
@@ -176,8 +176,8 @@ fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Wri
     }))
 }
 
-/// JSON line of class `topic`. The rate is the scan rate that the hub measures. It is null if the hub reports no rate,
-/// and for topics that are not published once per scan. Marks and foreground are published only while they have a
+/// JSON line of class `topic`. The rate is the scan rate that the hub measures. The rate is null if the hub reports no
+/// rate, and for topics that are not published once per scan. Marks and foreground are published only while they have a
 /// subscriber.
 #[derive(Serialize)]
 struct TopicJson {

@@ -125,7 +125,7 @@ impl TopicPattern {
     ///
     /// # Errors
     ///
-    /// As for [`TopicName::parse`].
+    /// Returns the errors of [`TopicName::parse`].
     pub fn parse(text: &str) -> Result<TopicPattern, Failure> {
         let (sensor, topic) = text.split_once('/').unwrap_or((text, ""));
         match (sensor, topic) {
@@ -165,11 +165,11 @@ pub(crate) struct Selection {
 }
 
 impl Selection {
-    /// Parses the arguments `texts`. The selection is empty if there are none.
+    /// Parses the arguments `texts`. The selection is empty if `texts` is empty.
     ///
     /// # Errors
     ///
-    /// As for [`TopicName::parse`].
+    /// Returns the errors of [`TopicName::parse`].
     pub(crate) fn parse(texts: &[String]) -> Result<Selection, Failure> {
         let mut named: Vec<TopicName> = Vec::new();
         let mut of_all = Vec::new();

@@ -154,7 +154,7 @@ pub fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), ExitRe
     Ok(())
 }
 
-/// Returns whether colors may be used. They may if `NO_COLOR` is unset or empty (<https://no-color.org>).
+/// Returns whether colors may be used. They may be used if `NO_COLOR` is unset or empty (<https://no-color.org>).
 pub fn colors() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
@@ -197,7 +197,7 @@ pub struct LossyWriter<'a, W> {
 const MAX_READER_DELAY: Duration = Duration::from_secs(1);
 
 impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
-    /// Creates a writer to `to`. It waits for the reader only after `stop` is set.
+    /// Creates a writer to `to`. The writer waits for the reader only after `stop` is set.
     pub fn new(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
         LossyWriter { to, stop, wait_budget: MAX_READER_DELAY }
     }

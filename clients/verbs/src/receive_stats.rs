@@ -14,7 +14,7 @@ pub struct ReceiveStats {
     /// Number of samples that were published during the run, but not received. It is computed from gaps in the sequence
     /// numbers.
     pub(crate) missed: u64,
-    /// Number of samples that were received without a wait, and arrival time of the first one.
+    /// Number of samples that were sent after the run had subscribed, and the arrival time of the first of them.
     live: Option<(u64, Instant)>,
     /// Losses on the sensor's line during the run. They are known if the run receives the statuses of the sensor.
     pub(crate) loss: Loss,
@@ -40,8 +40,9 @@ impl ReceiveStats {
         }
     }
 
-    /// Counts a sample, and `missed` missed samples before it. `period_us` is the period of the scans. If
-    /// `is_of_before` is set, the sample was sent before the run subscribed, so its arrival is not used for the rate.
+    /// Counts a sample, and the `missed` samples before it, which did not arrive. `period_us` is the period of the
+    /// scans. If `is_of_before` is set, the sample was sent before the run subscribed, so its arrival is not used for
+    /// the rate.
     pub(crate) fn count(&mut self, now: Instant, missed: u64, period_us: u32, is_of_before: bool) {
         self.received += 1;
         if !is_of_before {
@@ -62,8 +63,9 @@ impl ReceiveStats {
         }
     }
 
-    /// Returns the rate in samples per second, computed from the first sample that was received without a wait and the
-    /// last sample. Returns `None` if they are less than [`scanhub_schema::MIN_RATE_SPAN`] apart.
+    /// Returns the rate in samples per second, computed from the first sample that was sent after the run had
+    /// subscribed, and the last sample. Returns `None` if these two samples are less than
+    /// [`scanhub_schema::MIN_RATE_SPAN`] apart.
     pub(crate) fn hz(&self) -> Option<f64> {
         let ((live, first), last) = (self.live?, self.last?);
         scanhub_schema::rate_hz(live - 1, last - first)
@@ -126,7 +128,8 @@ impl LineLossCounter {
             Some((life, _, last)) if *life == boot => *last = *counters,
             Some(_) => {
                 self.previous_runs = self.sums();
-                // The hub was started during the run of the verb, so all its counts belong to this run.
+                // The hub was started during the run of the verb, so all counts of the hub belong to the run of the
+                // verb.
                 self.current_run = Some((boot, Counters::default(), *counters));
             }
             None => self.current_run = Some((boot, *counters, *counters)),

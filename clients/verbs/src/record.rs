@@ -2,13 +2,13 @@
 //!
 //! The path of a sample, from top to bottom:
 //!
-//! 1. The topics: `RecordArgs::run` subscribes to the selected ones, and `Recorder::run` receives their samples.
-//! 2. The queue (`Queue`) is bounded. A sample without room is dropped, counted and reported, and becomes part of a
-//!    `Gap` in the file.
+//! 1. The topics: `RecordArgs::run` subscribes to the selected topics, and `Recorder::run` receives their samples.
+//! 2. The queue (`Queue`) is bounded. A sample for which the queue has no room is dropped, counted and reported, and
+//!    becomes part of a `Gap` in the file.
 //! 3. The disk thread (`DiskWriter::run`) takes the whole queue ten times a second. Only this thread accesses the disk,
 //!    so a slow, full or missing disk does not delay any live topic.
 //! 4. The file (`RecordingFile`) builds a chunk from the entries and writes it. `Files` names the files and removes old
-//!    ones.
+//!    files.
 //! 5. The report (`Report`) prints the progress of the disk thread and the result.
 
 mod disk;
@@ -124,7 +124,7 @@ impl RecordArgs {
     ///
     /// - [`Kind::Usage`] if the topics cannot be recorded, or not to stdout.
     /// - [`Kind::Output`] if no file can be created, and [`Kind::Failed`] if its end cannot be written. If space is
-    ///   short, both are [`Kind::ResourceExhausted`].
+    ///   short, the kind is [`Kind::ResourceExhausted`] in both cases.
     /// - The errors of [`echo`](crate::echo::EchoArgs::run).
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         // Any signal that ends the run must finish the file.
@@ -186,7 +186,7 @@ impl RecordArgs {
         })
     }
 
-    /// Returns the files of a run that starts at `wall_ns`. The first one is called `path`.
+    /// Returns the files of a run that starts at `wall_ns`. The names of the files derive from `path`.
     fn files(&self, path: &Path, wall_ns: u64) -> Result<Files, Failure> {
         let target = Target::open(path)?;
         // With --split, the names have numbers, so `path` itself is not written.
@@ -358,7 +358,8 @@ impl<'a> Recorder<'a> {
         Ok(())
     }
 
-    /// Drops a sample for which the queue has no room. This starts a gap, which lasts until half of the queue is free.
+    /// Drops a sample for which the queue has no room. The first dropped sample starts a gap, which lasts until half of
+    /// the queue is free.
     fn drop_sample(&mut self, name: &TopicName) -> Result<(), ExitReason> {
         self.dropped += 1;
         let is_first = self.gap.is_none();
@@ -432,7 +433,7 @@ impl<'a> Recorder<'a> {
 
 /// Distinguishes a second request to stop from further signals of the first request. If a terminal closes, the terminal
 /// and the shell each send a SIGHUP, and both may arrive after SIGINT. All signals of one request arrive within a
-/// second. But a busy machine may not run this process during this second. Therefore polls are counted instead of time.
+/// second. But on a busy machine, this process may not run during that second, so polls are counted instead of time.
 #[derive(Default)]
 struct SecondStop {
     polls: u32,

@@ -36,8 +36,8 @@ pub trait Show {
     fn text(&self, header: &Header, line: &mut Vec<u8>) -> io::Result<()>;
 }
 
-/// Implements [`Show`] for the payloads of all topics. It uses the functions of `json` and `text` that have the topic's
-/// name.
+/// Implements [`Show`] for the payloads of all topics. The implementation calls the functions of `json` and `text` that
+/// have the topic's name.
 macro_rules! shown {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         $(shown! { $payload, $name })*

@@ -50,7 +50,7 @@ enum ZonesCommand {
 
 impl ZonesArgs {
     /// Observes the sensor for a while, and then writes the mask of the sensor to stdout, as TOML for the hub. Warnings
-    /// go to stderr. If stderr is a terminal, it also shows the progress.
+    /// go to stderr. If stderr is a terminal, the progress is also shown there.
     ///
     /// # Errors
     ///
@@ -125,7 +125,7 @@ struct Observation<'a> {
     notes: &'a mut File,
     /// Whether the progress line is shown; `None` if `notes` is not a terminal.
     is_shown: Option<bool>,
-    /// Number of seconds whose progress was shown.
+    /// Number of seconds of the observation for which the progress was shown.
     shown_seconds: u64,
 }
 

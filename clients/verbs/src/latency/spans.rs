@@ -43,12 +43,13 @@ impl Span {
 
 /// Spans of all samples of one topic.
 pub(super) struct Spans {
-    /// Time on CLOCK_MONOTONIC in ns. Samples that are sent later are received without a wait.
+    /// Time, on CLOCK_MONOTONIC in ns, since which this process has been ready to receive. Earlier samples have waited,
+    /// so their ages are not measured.
     since_ns: u64,
     /// Number of all samples.
     pub(super) received: u64,
-    /// Number of samples that were sent before this process waited for them: those in the history, and the first ones
-    /// of a new hub.
+    /// Number of samples that were sent before this process waited for them: samples in the history, and the first
+    /// samples of a new hub.
     pub(super) before: u64,
     /// Number of samples whose stamp is ahead of this machine's clock, for example because the wall clock of another
     /// machine is ahead.
@@ -87,7 +88,7 @@ impl Spans {
         };
         self.record(Span::Age, age_ns);
         if let Some(hub_ns) = header.hub_time_ns() {
-            // The value in the header is rounded up.
+            // The value in the header is rounded up, so it may be greater than the age.
             let hub_ns = hub_ns.min(age_ns);
             self.record(Span::Hub, hub_ns);
             self.record(Span::Wake, age_ns - hub_ns);
@@ -114,8 +115,9 @@ impl Spans {
     }
 }
 
-/// Maximum difference in ns between the stamps of a sample that a listener publishes itself when it receives nothing.
-/// The listener reads the two clocks of this machine one after the other. Transmission over a network takes longer.
+/// Maximum difference between the stamps of a sample that a listener itself publishes when it receives nothing, in ns.
+/// The listener reads the two clocks of this machine one after the other. A greater difference means that the sample
+/// was sent over a network.
 const OWN_SAMPLE_NS: u64 = 10_000;
 
 /// Returns whether both stamps come from a telegram. In a sample that was published without a telegram, the stamps are
@@ -166,7 +168,7 @@ impl Ages {
         self.max_ns = self.max_ns.max(ns);
     }
 
-    /// Returns `None` if there are no times.
+    /// Returns the quantiles, or `None` if no time was recorded.
     pub(super) fn quantiles(&self) -> Option<Quantiles> {
         let (min_ns, max_ns) = (self.min_ns, self.max_ns);
         let at = |quantile| self.histogram.value_at_quantile(quantile).clamp(min_ns, max_ns);
@@ -321,7 +323,7 @@ mod tests {
         spans.take(&remote(9_001_000 * US), arrival_time);
         assert_eq!((spans.in_future, known_spans(&spans)[1]), (1, ("age", 50, 2)));
         assert_eq!((known_spans(&spans)[0].2, known_spans(&spans)[2].2), (1, 1));
-        // Samples that a listener publishes itself when it receives nothing.
+        // A listener itself publishes these samples when it receives nothing.
         for wall_ns in [9_000_000 * US - 300, 9_000_000 * US + 300] {
             spans.take(&remote(wall_ns), arrival_time);
         }

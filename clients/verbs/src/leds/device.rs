@@ -32,12 +32,12 @@ pub(super) enum DeviceEvent {
 }
 
 impl Device {
-    /// Opens the LED `name` in `root`, and switches it off. Also returns the kernel's trigger that controlled the LED
-    /// until now, if there was one.
+    /// Opens the LED `name` in `root`, and switches it off. If a trigger of the kernel controlled the LED until now,
+    /// also returns this trigger.
     ///
     /// # Errors
     ///
-    /// - [`Kind::Configuration`] if there is no such LED; the hint lists the existing ones.
+    /// - [`Kind::Configuration`] if the LED does not exist; the hint lists the existing LEDs.
     /// - [`Kind::Failed`] if this user may not switch it; the hint names its owner.
     pub(super) fn open(root: &Path, name: &str) -> Result<(Device, Option<String>), Failure> {
         if !root.is_dir() {
@@ -66,7 +66,7 @@ impl Device {
         if self.is_on == Some(on) || self.retry_at.is_some_and(|at| now < at) {
             return None;
         }
-        // An LED that was unplugged may be in the state that it has after power-on.
+        // After a failure, take the LED over again: if it was unplugged, it is in the state that it has after power-on.
         let taken = if self.retry_at.is_some() { self.take() } else { Ok(()) };
         match taken.and_then(|()| self.switch(on)) {
             Ok(()) => self.retry_at.take().map(|_| DeviceEvent::Recovered),

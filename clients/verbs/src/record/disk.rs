@@ -48,7 +48,7 @@ struct WriteFailure {
 
 /// Destination of a recording.
 pub(super) enum Destination {
-    /// Files. The next one is started when the current one is full or fails.
+    /// Files. The next file is started when the current file is full or fails.
     Files(Files),
     /// A stream, such as stdout.
     Stream(File),
@@ -229,7 +229,8 @@ impl DiskWriter {
         recording_file.add(&self.tracks, &self.batch)?;
         self.subtract_removed();
         self.bytes += self.file.written;
-        // This assignment closes the old file, which releases the lock on it. A file can be removed only after that.
+        // This assignment closes the old file, which releases the lock on it. A file can be removed only after its lock
+        // was released.
         self.file = recording_file;
         self.prune();
         self.progress.stats().events.push(WriterEvent::File(path));

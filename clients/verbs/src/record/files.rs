@@ -15,7 +15,7 @@ use scanhub_schema::file::MAGIC;
 
 use crate::duration;
 
-/// Limit of a file, at which the recording continues in the next one.
+/// Limit of a file, at which the recording continues in the next file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Split {
     /// Length in bytes.
@@ -83,10 +83,10 @@ pub(super) struct Files {
 }
 
 impl Files {
-    /// Describes the files of a run, without creating any. The run has one file `path`. With `is_split`, it has several
-    /// files, with numbers after the stem of `path`. An existing file is an error, unless `overwrites` is set. With
-    /// `overwrites`, a split run continues after the existing numbers. The last `keep` files are kept. All files of the
-    /// run must contain `run` within their first [`HEAD_LEN`] bytes.
+    /// Describes the files of a run, without creating any. Without `is_split`, the run has one file, `path`. With
+    /// `is_split`, the run has several files, with numbers after the stem of `path`. An existing file is an error,
+    /// unless `overwrites` is set. With `overwrites`, a split run continues after the existing numbers. The last `keep`
+    /// files are kept. All files of the run must contain `run` within their first [`HEAD_LEN`] bytes.
     pub(super) fn new(
         path: &Path,
         is_split: bool,
@@ -135,7 +135,7 @@ impl Files {
     }
 
     /// Removes the oldest files, first the files of earlier runs, until at most `keep` files remain. A file that cannot
-    /// be removed no longer counts.
+    /// be removed no longer counts as kept.
     pub(super) fn prune(&mut self) {
         for _ in 0..self.surplus() {
             // Another file may have this name by now.
@@ -267,8 +267,8 @@ fn is_at(file: &File, path: &Path) -> bool {
     file.metadata().map(id).is_ok_and(|own| named.is_ok_and(|named| named == own))
 }
 
-/// Maximum number of attempts to open a file that other runs remove at the same time. Some file systems never report
-/// the same inode twice.
+/// Maximum number of attempts to open a file that other runs remove at the same time. The number is limited, because
+/// some file systems never report the same inode twice, so that every attempt seems to fail.
 const MAX_ATTEMPTS: usize = 3;
 
 /// Locks `file` until it is closed, because two writers would overwrite each other. Succeeds without a lock if the file

@@ -138,7 +138,7 @@ impl RecordingFile {
     }
 
     /// Repeats the last status of each track, so that the file can be played without the earlier files. Drops a status
-    /// that is older than the newest one by more than [`STATUS_LIFETIME`].
+    /// that is older than the newest status by more than [`STATUS_LIFETIME`].
     pub(super) fn repeat(
         &mut self,
         tracks: &[TopicName],

@@ -84,8 +84,8 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Writes the first line. It has the `path` of the file, and the number `older` of files of earlier runs that are
-    /// removed once the new file has samples.
+    /// Writes the first line, which contains the `path` of the file, and the number `older` of files of earlier runs
+    /// that are removed once the new file has samples.
     pub(super) fn begin(&mut self, path: &Path, older: usize) -> Result<(), ExitReason> {
         self.files.push(path.to_owned());
         if self.form == ReportForm::Json {

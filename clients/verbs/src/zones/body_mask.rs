@@ -2,7 +2,7 @@
 //! of the objects that stay within a circle around the robot's center during the whole observation.
 //!
 //! The observation is divided into time slices. If a beam meets an object in all slices at about the same range, the
-//! object is body. If a beam meets it only in some slices, it is not body.
+//! object is body. If a beam meets an object only in some slices, the object is not body.
 
 use scanhub_schema::{Pose, Scan, in_degrees, in_sector_mdeg};
 
@@ -23,7 +23,8 @@ const HIDDEN_MARGIN_MM: u32 = 250;
 /// Minimum share of body readings in the scans of a beam for which the beam counts as meeting only the body.
 const FULL_SHARE: f64 = 0.9;
 
-/// Share of a slice's scans in which a beam must meet an object, so that a single wrong reading has no effect.
+/// Minimum share of a slice's scans in which a beam must meet an object for the object to count. A single wrong reading
+/// therefore has no effect.
 const MIN_HIT_SHARE: f64 = 0.05;
 /// Divisor of the number of slices. This part of the slices may differ from the others, because a person may walk past
 /// the body.
@@ -32,7 +33,7 @@ const PASSING_DIVISOR: usize = 5;
 /// robot cause this difference. A person moves more.
 const MAX_STEADY_DIFFERENCE_MM: u32 = 100;
 /// Maximum angle between a beam and an edge of the body at which the beam may measure any range between the body and
-/// the object behind it, in degrees. It is half of a light spot of 12 mm at 0.4 m.
+/// the object behind it, in degrees. It corresponds to half of a light spot of 12 mm at a range of 0.4 m.
 const EDGE_DEG: f64 = 1.0;
 /// Maximum difference between the ranges of neighboring beams in a sector, in mm. A sector hides at most this much more
 /// than necessary.
@@ -76,7 +77,8 @@ struct Slice {
 /// Result of an observation: the body, and other objects in the circle.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Mask {
-    /// Sectors in which readings below `range_mm` are the body, in the order of the beams. At most [`MAX_SECTORS`].
+    /// Sectors in which readings below `range_mm` are the body, in the order of the beams. There are at most
+    /// [`MAX_SECTORS`].
     pub(crate) sectors: Vec<Sector>,
     /// Sectors of objects that moved, appeared or disappeared, with the shortest range of each object.
     pub(crate) moving: Vec<Sector>,
@@ -250,7 +252,7 @@ impl FrequentHits {
     }
 }
 
-/// Returns the range in mm below which readings of `beam` are the body; 0 if none are.
+/// Returns the range in mm below which readings of `beam` are the body; 0 if no reading is the body.
 ///
 /// Within `edge` beams of an edge of the body, every reading in the circle may be body. Light spots are wider than the
 /// angle between beams, and robots vibrate, so a range near an edge may lie anywhere between the body and a farther
@@ -394,7 +396,8 @@ mod tests {
             60..=67 => Some(400 + noise(beam, slice, scan)),
             _ => Some(WALL_MM),
         };
-        // For beams on the post, the mask has the large margin. Next to it, beams are hidden up to the circle.
+        // For beams on the post, the mask has the large margin. For beams next to the post, the mask extends to the
+        // circle.
         assert_eq!(mask(post), Mask { sectors: body_sectors(60, 67, 660), moving: vec![], of_beams: COUNT });
     }
 

@@ -1,4 +1,5 @@
-//! Tests of the verbs with a fake hub. They are modules of one binary, so that their dependencies are linked only once.
+//! Tests of the verbs with a fake hub. The tests are modules of one binary, so that their dependencies are linked only
+//! once.
 
 #[path = "../../../../tests/testkit/child.rs"]
 mod child;
