@@ -1,5 +1,5 @@
-//! Forwarder of a hub's samples to a network. It subscribes to the selected topics of sensors as they appear, and
-//! handles the absence of the hub.
+//! Forwards a hub's samples to a network. The forwarder subscribes to the selected topics of each sensor when the
+//! sensor appears. It continues after the hub has exited and started again.
 
 mod selection;
 
@@ -22,18 +22,18 @@ pub use selection::Selection;
 
 /// A network that takes samples.
 pub trait SampleSink {
-    /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent.
-    /// Returns the sensor's position.
+    /// Adds the sensor called `name`. `every` returns the thinning factor of a topic, or `None` if the topic is not
+    /// sent. Returns the sensor's position in the sink, which identifies the sensor from now on.
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize;
 
-    /// Returns whether samples of this topic are needed.
+    /// Returns whether the sink needs samples of `topic` from the sensor at position `sensor`.
     fn needs(&self, sensor: usize, topic: Topic) -> bool;
 
-    /// Sends a sample of the sensor at this position.
+    /// Sends a sample of the sensor at position `sensor`.
     fn sample(&mut self, sensor: usize, sample: &outgoing::Sample<'_>);
 }
 
-/// Subscriptions to the hub of a domain, which may exit and start again.
+/// Subscriptions to the hub of a domain. The hub may exit and start again.
 pub struct Forwarder {
     selection: Selection,
     session: Session,
@@ -41,15 +41,15 @@ pub struct Forwarder {
     started: Instant,
     discovery: Discovery,
     is_hub_running: bool,
-    /// Further sensors that must exist, even if nothing of them is sent.
+    /// Further sensors that the hub must have, even if none of their topics is sent.
     required: Vec<String>,
-    /// Whether the named sensors were found in a hub.
+    /// Whether a hub was found to have all named and required sensors.
     is_checked: bool,
     is_waiting_reported: bool,
 }
 
 impl Forwarder {
-    /// Subscribes to the selected topics of the hub in the first live one of `locations`.
+    /// Subscribes to the selected topics of the hub in the first one of `locations` at which a hub runs.
     pub fn new(selection: Selection, locations: &[Domain], sink: &mut impl SampleSink) -> Forwarder {
         let named = selection.named_sensors().into_iter().map(|name| {
             let publisher_kind = selection.publisher_kind(name);
@@ -69,7 +69,7 @@ impl Forwarder {
         }
     }
 
-    /// Requires that `sensor` exists, which the user named for another purpose.
+    /// Requires that the first hub has `sensor`, which the user named for a purpose other than sending its topics.
     pub fn require(&mut self, sensor: &str) {
         self.required.push(sensor.to_owned());
     }
@@ -87,8 +87,9 @@ impl Forwarder {
         Ok(more)
     }
 
-    /// Checks whether the hub has exited or started, passes that to `report`, and searches the sensors of a new
-    /// hub. Call it after [`forward`](Forwarder::forward), because it takes longer.
+    /// Checks whether the hub has exited or started, passes each change to `report`, and searches for the sensors of a
+    /// new hub. Call this method after [`forward`](Forwarder::forward), because it takes longer and would delay waiting
+    /// samples.
     ///
     /// # Errors
     ///
@@ -106,7 +107,7 @@ impl Forwarder {
             self.discovery.on_hub_ended();
             report(Notice::HubGone)?;
         }
-        // Another process may publish sensors of other machines, which are not sent again.
+        // Without a hub, a listener has started. The remote sensors that it publishes are not sent to a network again.
         if change.started.is_some() && self.session.hub_is_running() {
             if self.discovery.has_seen_hub() || self.is_waiting_reported {
                 report(Notice::HubBack)?;
@@ -138,13 +139,14 @@ impl Forwarder {
         self.is_hub_running
     }
 
-    /// Subscribes to new sensors of the hub if all are selected. The first hub must have all named sensors.
+    /// Subscribes to new sensors of the hub, if the selection includes sensors that are not named. Returns an error if
+    /// the first hub lacks a named or required sensor.
     fn discover(&mut self, now: Instant, carrier: &mut impl SampleSink) -> Result<(), Failure> {
         let Some(domain) = self.session.domain().filter(|_| self.is_hub_running) else { return Ok(()) };
         let Some(called) = self.discovery.poll(domain, now)? else { return Ok(()) };
         if self.selection.includes_unnamed() {
             for name in &called.sensors {
-                // The name of a remote sensor has another form.
+                // `check_sensor` rejects the names of remote sensors, which are not sent.
                 let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
                 if !is_known && check_sensor(name).is_ok() {
                     let may_have = |topic| called.may_have(name, topic);
@@ -166,7 +168,7 @@ impl Forwarder {
     }
 }
 
-/// Reports a `notice` of the hub: a line of JSON to `out`, or text to `notes`.
+/// Reports a `notice` about the hub: as a line of JSON to `out` if `json` is set, otherwise as text to `notes`.
 ///
 /// # Errors
 ///
@@ -188,12 +190,12 @@ struct Sensor {
     sources: Vec<Source>,
 }
 
-/// Samples that are taken from one topic before the next one has its turn.
+/// Maximum number of samples that are taken from one topic before the next topic is read.
 const BATCH_SIZE: usize = 32;
 
 impl Sensor {
-    /// Creates subscriptions to the selected topics that the sensor `may_have`, and to its status if it is announced
-    /// with its type.
+    /// Creates subscriptions to the selected topics that the sensor `may_have`. Also subscribes to the sensor's status
+    /// if the sink announces sensors, because announcements contain the type from the status.
     fn new(
         name: &str,
         may_have: impl Fn(Topic) -> bool,
@@ -207,8 +209,9 @@ impl Sensor {
         Sensor { name: name.to_owned(), position, sources }
     }
 
-    /// Passes waiting samples to `sink`, and returns whether more may wait. Attaches at most one subscriber in each
-    /// round over all sensors, see `subscribed`, because that takes a thousand times as long as sending.
+    /// Passes waiting samples to `sink`, and returns whether more may wait. Sets `subscribed` after attaching a
+    /// subscriber, and attaches none if it is already set. [`Forwarder::forward`] therefore attaches at most one
+    /// subscriber per call, because attaching takes a thousand times as long as sending.
     ///
     /// # Errors
     ///
@@ -236,7 +239,8 @@ impl Sensor {
         Ok(more)
     }
 
-    /// Returns the time after which there may be a sample to send although the hub sends nothing.
+    /// Returns the time after which the sensor may have a sample to send even if the hub publishes nothing, such as a
+    /// verdict that becomes unknown. `None` if there is no such time.
     fn time_left(&self) -> Option<Duration> {
         self.sources.iter().filter_map(Source::time_left).min()
     }
@@ -252,7 +256,7 @@ macro_rules! payloads {
             }
         }
     };
-    // Samples of zones have their age in addition.
+    // A sample of `zones` also contains its age, so the payload is one of its fields.
     (Zones $sample:ident) => {
         &$sample.zones
     };
@@ -267,7 +271,8 @@ fn borrowed(sample: &Sample) -> outgoing::Sample<'_> {
     outgoing::Sample { header: sample.header(), missed: sample.missed(), payload: payload(sample) }
 }
 
-/// Prints the counters of `outgoing` in this run: lines of JSON of this `class`, or text.
+/// Prints the counters of `outgoing` since the start of the run: as lines of JSON of class `class` if `json` is set,
+/// otherwise as text.
 ///
 /// # Errors
 ///
@@ -313,7 +318,7 @@ pub fn write_counters(
     Ok(())
 }
 
-/// Class `lan` or `bridge` of a sender.
+/// JSON line with the counters of one topic. Its class is `lan` for a gateway and `bridge` for a bridge.
 #[derive(Serialize)]
 struct SentLine<'a> {
     class: &'static str,

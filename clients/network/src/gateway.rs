@@ -1,5 +1,5 @@
-//! `scanhub gateway`: sends the hub's samples to a network as datagrams. It is an ordinary client, which continues when
-//! the hub, its links or the network fail and come back. It receives nothing from the network.
+//! `scanhub gateway`: sends the hub's samples to a network as datagrams. The gateway is an ordinary client. It
+//! continues when the hub, a link or the network fails and comes back. It receives nothing from the network.
 
 mod host;
 mod interface_monitor;
@@ -69,9 +69,10 @@ pub struct GatewayArgs {
 }
 
 impl GatewayArgs {
-    /// Sends until a signal stops it, even without hub or network. The counters go to stdout at the end and after each
-    /// SIGUSR1, and everything else to stderr without `--json`. Lines for which there is no room are dropped, so that a
-    /// slow reader delays only the end, by a second.
+    /// Sends until a signal stops the gateway, even while hub or network are unavailable. Counters are printed to
+    /// stdout at the end and after each SIGUSR1. Other lines go to stderr, or to stdout with `--json`. A line is
+    /// dropped if the reader of the output is too slow for it. Such a reader therefore delays only the end of the
+    /// gateway, by a second.
     ///
     /// # Errors
     ///
@@ -79,8 +80,8 @@ impl GatewayArgs {
     ///
     /// - [`Kind::Configuration`] if the interface does not exist, neither an interface nor a host is named, a host or
     ///   another value is not valid, or the key file contains no key that only this user can read,
-    /// - [`Kind::Usage`] if there is no such topic,
-    /// - [`Kind::NoTopic`] if the first hub has no such sensor,
+    /// - [`Kind::Usage`] if a named topic does not exist,
+    /// - [`Kind::NoTopic`] if the first hub lacks a named sensor,
     /// - [`Kind::ResourceExhausted`] if descriptors or memory are short,
     /// - [`Kind::Interrupted`] if a signal stops the run before all hosts are resolved.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
@@ -97,7 +98,8 @@ impl GatewayArgs {
         verb_result(gateway.run(&mut report, &report_requested, &stop))
     }
 
-    /// Checks everything that needs neither network nor hub: the topics, and which options exclude each other.
+    /// Checks the options as far as that is possible without network and hub: that the topics are valid, and that no
+    /// options exclude each other.
     ///
     /// # Errors
     ///
@@ -125,7 +127,7 @@ impl GatewayArgs {
 enum Display {
     /// Lines at the start, at the end and on request.
     Lines,
-    /// Objects, once a second.
+    /// JSON objects, once a second.
     Json,
     /// One line that each update overwrites.
     Terminal,
@@ -141,7 +143,8 @@ struct Gateway<'a> {
     tick_at: Instant,
 }
 
-/// Word in place of an interface in the name of the file with the gateway's number, if it sends only to hosts.
+/// Word that replaces the interface in the name of the file with the gateway's number, if the gateway sends only to
+/// hosts.
 const HOSTS: &str = "hosts";
 
 /// Interval between announcements, and between reports of the counters.
@@ -195,7 +198,7 @@ impl<'a> Gateway<'a> {
             if self.network.destinations.update() {
                 report.interface(&self.network)?;
             }
-            // Send waiting samples before checking the hub, which takes longer.
+            // Send waiting samples before checking the hub, because the check takes longer.
             let more = self.forwarder.forward(&mut self.network)?;
             let now = Instant::now();
             self.forwarder.check_hub(now, &mut self.network, &mut |notice| report.hub(notice))?;
@@ -246,12 +249,12 @@ struct Report<'a> {
     display: Display,
     out: Output<'a>,
     notes: Output<'a>,
-    /// Datagrams to the first destination, as of the last status line.
+    /// Number of datagrams that had been sent to the first destination when the last status line was drawn.
     sent: u64,
 }
 
 impl<'a> Report<'a> {
-    /// Creates the output: counters to `out`, and everything else to `notes` if `out` is not JSON.
+    /// Creates a report that prints counters to `out`, and everything else to `notes`, or to `out` with JSON.
     fn new(display: Display, out: &'a mut dyn Write, notes: &'a mut dyn Write) -> Report<'a> {
         Report { display, out: Output::new(out), notes: Output::new(notes), sent: 0 }
     }
@@ -438,12 +441,13 @@ fn write_status(
     }
 }
 
-/// Returns the number of datagrams to the first destination, which always exists, and its name.
+/// Returns the number of datagrams that were sent to the first destination, and its name. Each gateway has a
+/// destination.
 fn first(network: &Network) -> (u64, &str) {
     network.destinations.all().next().map_or((0, ""), |destination| (destination.sent, &destination.name))
 }
 
-/// Returns the gateway's number as in all output.
+/// Returns the gateway's number in the form that all output has: 16 hex digits.
 fn id(network: &Network) -> String {
     format!("{:016x}", network.identity.hub)
 }
@@ -483,9 +487,9 @@ struct LinkJson<'a> {
     message: Option<&'a str>,
 }
 
-/// Reason for which a gateway has another number than the stored one.
+/// Reason why a gateway does not use the stored number.
 const RENUMBERED_REASON: &str = "a new number, because the saved one belongs to another machine";
-/// Note of a gateway without a key.
+/// Note that a gateway without a key prints.
 const NO_KEY_NOTE: &str = "receivers cannot know who sends; see `scanhub key new` and --key-file";
 /// Moves the cursor to the start of the line, and clears it (ECMA-48).
 const CLEAR_LINE: &[u8] = b"\r\x1b[K";

@@ -1,5 +1,5 @@
-//! Identity of a gateway: a random number that it keeps from one start to the next, and an epoch that is greater than
-//! those of earlier runs. Two gateways of one hub have different numbers.
+//! Identity of a gateway: a random number that the gateway keeps from one run to the next, and an epoch that is greater
+//! than those of earlier runs. Two gateways of one hub have different numbers.
 
 use std::fs::{File, Permissions};
 use std::hash::{BuildHasher, RandomState};
@@ -12,29 +12,29 @@ use scanhub_files::regular_file;
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Directory, StateDirectory};
 
-/// Identity of a gateway in one run. No other process has its number while this value exists.
+/// Identity of a gateway in one run. While this value exists, no other process on this machine can get the same number.
 #[derive(Debug)]
 pub struct GatewayIdentity {
     /// Number of the gateway.
     pub hub: u64,
     /// Seconds since 1970 at the start of the run, or the epoch of the previous run plus one, if that is greater.
     pub epoch: u32,
-    /// Whether the gateway has a new number, because the kept one belongs to another machine whose disk was copied.
+    /// Whether the gateway has a new number, because the saved one belongs to another machine, whose disk was copied.
     pub is_renumbered: bool,
     /// File with the number, which stays locked.
     _file: File,
 }
 
 impl GatewayIdentity {
-    /// Begins a run of the gateway of `domain` on `interface` (or another word for its destination), or of another one
-    /// if that one is running. The number is kept in a file in `directory`, which is created if it does not exist.
-    /// `now_s` is seconds since 1970. A number that was kept on another `machine`, if that is known, belongs to another
-    /// gateway.
+    /// Begins a run of a gateway of `domain` on `interface`, which may also be another word for the gateway's
+    /// destination. Each number is saved in a file in `directory`, which is created if it does not exist. If the
+    /// gateway of one file is already running, the next file is tried. `now_s` is the time in seconds since 1970.
+    /// `machine` identifies this machine, if known. A number that was saved on another machine is not used.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Output`] if the file cannot be written, because listeners could not distinguish this run from
-    /// the last one, and [`Kind::Configuration`] if too many are running.
+    /// Returns [`Kind::Output`] if the file cannot be written, because listeners could then not distinguish this run
+    /// from the previous one. Returns [`Kind::Configuration`] if too many gateways are running.
     fn begin(
         directory: &Path,
         domain: &str,
@@ -64,7 +64,7 @@ impl GatewayIdentity {
         Err(Failure::new(Kind::Configuration, what, "stop some of them"))
     }
 
-    /// Begins a run with the number in `file`, or with a new one.
+    /// Begins a run with the number in `file`, or with a new number if the file contains none for this machine.
     fn of(file: File, now_s: u64, machine: Option<u64>) -> io::Result<GatewayIdentity> {
         let now = u32::try_from(now_s).unwrap_or(u32::MAX);
         let stored = StoredIdentity::read(&file);
@@ -72,7 +72,7 @@ impl GatewayIdentity {
             stored.machine.is_some_and(|there| machine.is_some_and(|here| here != there))
         };
         let is_renumbered = stored.as_ref().is_some_and(is_copy);
-        // An invalid line, or one without a next epoch, makes it another gateway.
+        // If the line is not valid, or its epoch is already the highest one, the gateway gets a new number.
         let last = stored.filter(|stored| !is_copy(stored)).and_then(|kept| {
             let epoch = kept.epoch.checked_add(1)?.max(now);
             Some(StoredIdentity { epoch, machine: machine.or(kept.machine), ..kept })
@@ -83,7 +83,7 @@ impl GatewayIdentity {
             machine,
         });
         let line = stored.line();
-        // Earlier versions let other users read the file.
+        // Earlier versions created the file so that other users could read it.
         file.set_permissions(Permissions::from_mode(0o600))?;
         file.write_all_at(line.as_bytes(), 0)?;
         file.set_len(line.len() as u64)?;
@@ -92,7 +92,8 @@ impl GatewayIdentity {
     }
 }
 
-/// Content of the file: 16 hex digits, 10 digits, and 16 hex digits for the machine if that is known.
+/// Content of the file: the number in 16 hex digits, the epoch in 10 decimal digits, and the machine in 16 hex digits
+/// if it is known.
 struct StoredIdentity {
     hub: u64,
     epoch: u32,
@@ -118,11 +119,11 @@ impl StoredIdentity {
     }
 }
 
-/// Returns the directory of these files, next to those of domains.
+/// Returns the directory for the files with numbers. It also contains the state directories of domains.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Configuration`] if the environment names none.
+/// Returns [`Kind::Configuration`] if none of STATE_DIRECTORY, XDG_STATE_HOME and HOME is set.
 fn directory() -> Result<PathBuf, Failure> {
     StateDirectory::base().ok_or_else(|| {
         let what = "no directory for the gateway's number: neither XDG_STATE_HOME nor HOME is set";
@@ -130,11 +131,11 @@ fn directory() -> Result<PathBuf, Failure> {
     })
 }
 
-/// Maximum number of gateways of one domain on one interface. More are started by mistake.
+/// Maximum number of gateways of one domain on one interface. A greater number is treated as a mistake of the user.
 const MAX_GATEWAYS: u32 = 16;
 
-/// Begins a run of the gateway of `domain` on this machine, now. `destination` is its interface, or another word for
-/// its destination.
+/// Begins a run of a gateway of `domain` on this machine, now. `destination` is the gateway's interface, or another
+/// word for where it sends.
 ///
 /// # Errors
 ///
@@ -145,8 +146,8 @@ pub fn begin_run(domain: &str, destination: &str) -> Result<GatewayIdentity, Fai
     GatewayIdentity::begin(&directory()?, domain, destination, now_s, machine(Path::new(MACHINE_ID)))
 }
 
-/// Returns a number that identifies this machine, a hash of its ID because the ID itself is confidential
-/// (machine-id(5)). `None` if the file at `path` is missing or contains no such ID.
+/// Returns a number that identifies this machine. It is a hash of the machine's ID, because the ID itself is
+/// confidential (machine-id(5)). `None` if the file at `path` is missing or contains no valid ID.
 fn machine(path: &Path) -> Option<u64> {
     let text = regular_file::read_text(path, regular_file::MAX_FILE_BYTES).ok()?;
     let id = text.trim_end();
@@ -157,7 +158,8 @@ fn machine(path: &Path) -> Option<u64> {
 /// File with the ID of this machine.
 const MACHINE_ID: &str = "/etc/machine-id";
 
-/// FNV-1a, because the hash is compared with those of other builds.
+/// Returns the FNV-1a hash of a machine's ID. The algorithm is fixed, because hashes that other builds have saved are
+/// compared with this one.
 fn hash(id: &str) -> u64 {
     let bytes = "scanhub gateway ".bytes().chain(id.bytes());
     bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))

@@ -1,5 +1,5 @@
 //! Network interfaces of this machine, and the kernel's notifications that they or their addresses have changed
-//! (rtnetlink(7)). The notifications include interfaces that were down only briefly, which polling would miss.
+//! (rtnetlink(7)). The notifications also report interfaces that were down only briefly, which polling would miss.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -21,11 +21,11 @@ pub(crate) struct Interface {
     pub(crate) index: u32,
     /// Whether the interface is enabled.
     pub(crate) up: bool,
-    /// Whether it has a carrier, such as a plugged cable.
+    /// Whether the interface has a carrier, such as a plugged cable.
     pub(crate) running: bool,
-    /// Whether it supports multicast. The loopback does, although its flags do not say so.
+    /// Whether the interface supports multicast. The loopback does, although it lacks the flag.
     pub(crate) multicast: bool,
-    /// Whether it leads back to this machine.
+    /// Whether the interface is the loopback, which leads back to this machine.
     pub(crate) loopback: bool,
     /// First IPv4 address.
     pub(crate) address: Option<Ipv4Addr>,
@@ -55,7 +55,7 @@ pub(crate) fn interfaces() -> Result<Vec<Interface>, Failure> {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Configuration`], with a list of all interfaces, if it does not exist.
+/// Returns [`Kind::Configuration`], with a list of all interfaces, if there is no such interface.
 pub(crate) fn by_name(name: &str) -> Result<Interface, Failure> {
     let mut all = interfaces()?;
     if let Some(at) = all.iter().position(|interface| interface.name == name) {
@@ -69,7 +69,8 @@ pub(crate) fn by_name(name: &str) -> Result<Interface, Failure> {
     ))
 }
 
-/// Returns whether a sender with `address` is on this machine. `false` if the system cannot list its addresses.
+/// Returns whether a sender with `address` is on this machine. If the system cannot list its addresses, only loopback
+/// and unspecified addresses count.
 pub(crate) fn is_of_this_machine(address: IpAddr) -> bool {
     let has_address = |entry: &InterfaceAddress| ipv4(entry).is_some_and(|own| own == address);
     // A datagram to a group has the source address 0.0.0.0 if it is sent by loopback on a machine without another
@@ -106,12 +107,12 @@ pub(crate) struct InterfaceChanges {
     losses: CarrierLosses,
 }
 
-/// Interface that lost its carrier, was disabled or removed. It may be up again.
+/// Interface that lost its carrier, was disabled or was removed. It may already be up again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LostInterface {
     /// The interface with this index.
     One(u32),
-    /// Any interface, because the queue of notifications overflowed.
+    /// Possibly any interface, because the queue of notifications overflowed.
     Any,
 }
 
@@ -123,7 +124,7 @@ impl InterfaceChanges {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] if the kernel refuses.
+    /// Returns [`Kind::Failed`] if the kernel refuses the subscription.
     pub(crate) fn subscribe() -> Result<InterfaceChanges, Failure> {
         let socket = open_netlink().map_err(|error| {
             Failure::new(Kind::Failed, format!("cannot watch network interfaces: {error}"), "")
@@ -132,7 +133,7 @@ impl InterfaceChanges {
     }
 
     /// Reads all waiting notifications, and calls `on_lost` with each interface that was lost since the last call.
-    /// Returns whether anything has changed. Costs one system call if nothing has.
+    /// Returns whether there were notifications. If there were none, the call costs one system call.
     pub(crate) fn read(&mut self, mut on_lost: impl FnMut(LostInterface)) -> bool {
         let mut any = false;
         loop {
@@ -154,7 +155,7 @@ impl AsFd for InterfaceChanges {
 }
 
 impl LostInterface {
-    /// Returns whether it may be the interface with this index.
+    /// Returns whether the interface with this index may be lost.
     pub(crate) fn includes(self, index: u32) -> bool {
         self == LostInterface::Any || self == LostInterface::One(index)
     }
@@ -165,7 +166,7 @@ fn open_netlink() -> rustix::io::Result<OwnedFd> {
     const LINK: u32 = 1;
     const IPV4_ADDRESS: u32 = 0x10;
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    // No protocol: NETLINK_ROUTE is 0.
+    // `None` stands for protocol 0, which is NETLINK_ROUTE.
     let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
     bind(&socket, &SocketAddrNetlink::new(0, LINK | IPV4_ADDRESS))?;
     send(&socket, &request_links(), SendFlags::empty())?;
@@ -182,26 +183,27 @@ fn request_links() -> [u8; HEADER + LINK_HEADER] {
     request
 }
 
-/// Number of times that each interface has lost its carrier. If that happens twice in a second, the kernel reports both
-/// losses at once when the carrier is back, and only this number shows them.
+/// Number of times that each interface has lost its carrier. If that happens twice in a second, the kernel may report
+/// both losses in one notification after the carrier is back, and then only this number shows that there were losses.
 #[derive(Default)]
 struct CarrierLosses {
-    /// By the interface's index.
+    /// Index of each interface, and its number of losses.
     counts: Vec<(u32, u32)>,
 }
 
-// struct nlmsghdr and struct ifinfomsg.
+// Lengths of struct nlmsghdr and struct ifinfomsg, types of messages, and the flag IFF_RUNNING.
 const HEADER: usize = 16;
 const LINK_HEADER: usize = 16;
 const NEWLINK: u16 = 16;
 const DELLINK: u16 = 17;
 const GETLINK: u16 = 18;
 const RUNNING: u32 = 0x40;
-/// IFLA_CARRIER_DOWN_COUNT, since Linux 4.16.
+/// Attribute IFLA_CARRIER_DOWN_COUNT, the number of losses. The kernel reports it since Linux 4.16.
 const CARRIER_DOWN_COUNT: u16 = 48;
 
 impl CarrierLosses {
-    /// Reads a datagram of the kernel, and calls `on_lost` with each lost interface.
+    /// Reads a datagram of the kernel, which contains one or more messages, and calls `on_lost` with each lost
+    /// interface.
     fn read(&mut self, mut bytes: &[u8], on_lost: &mut impl FnMut(LostInterface)) {
         while let Some((message, rest)) = u32_at(bytes, 0).and_then(|len| cut(bytes, len as usize)) {
             bytes = rest;
@@ -219,7 +221,7 @@ impl CarrierLosses {
         }
     }
 
-    /// Records the number of losses of an interface. Returns whether it has changed.
+    /// Records the number of losses of an interface. Returns whether the number differs from the last one.
     fn update(&mut self, index: u32, count: u32) -> bool {
         match self.counts.iter_mut().find(|(known, _)| *known == index) {
             Some((_, before)) => std::mem::replace(before, count) != count,
@@ -231,7 +233,7 @@ impl CarrierLosses {
     }
 }
 
-/// Returns the number of losses in `message`.
+/// Returns the number of losses in `message`, if the message has that attribute.
 fn loss_count(message: &[u8]) -> Option<u32> {
     let mut attributes = message.get(HEADER + LINK_HEADER..)?;
     loop {
@@ -243,8 +245,9 @@ fn loss_count(message: &[u8]) -> Option<u32> {
     }
 }
 
-/// Returns the first `len` bytes, and the rest, which starts at a multiple of 4. `None` if `bytes` is shorter, or if
-/// `len` has no room for the length itself.
+/// Returns the first `len` bytes, and the rest. The rest starts at the next multiple of 4, because the kernel aligns
+/// messages and attributes. `None` if `bytes` is shorter than `len`, or if `len` is below 4, the length of the shortest
+/// header.
 fn cut(bytes: &[u8], len: usize) -> Option<(&[u8], &[u8])> {
     let first = bytes.get(..len).filter(|first| first.len() >= 4)?;
     Some((first, bytes.get(len.next_multiple_of(4)..).unwrap_or_default()))
@@ -271,14 +274,14 @@ mod tests {
             own.chain([Ipv4Addr::new(127, 0, 0, 9), Ipv4Addr::UNSPECIFIED])
                 .all(|own| is_of_this_machine(own.into()))
         );
-        // Reserved for documentation (RFC 5737).
+        // This address is reserved for documentation (RFC 5737), so it belongs to no machine.
         assert!(!is_of_this_machine(Ipv4Addr::new(192, 0, 2, 1).into()));
         let failure = by_name("no-such").unwrap_err();
         assert_eq!(failure.kind, Kind::Configuration);
         assert!(failure.message.contains("no-such") && failure.hint.contains("lo"), "{failure}");
     }
 
-    /// Builds a message of the kernel, with a name before the number of losses.
+    /// Builds a message of the kernel, in which the attribute with the interface's name precedes the number of losses.
     fn message(kind: u16, index: u32, flags: u32, losses: Option<u32>) -> Vec<u8> {
         let mut body = vec![0; 4];
         body.extend([index.to_ne_bytes(), flags.to_ne_bytes(), [0xFF; 4]].concat());
@@ -336,7 +339,7 @@ mod tests {
     #[test]
     fn kernel_lists_existing_links() {
         let mut changes = InterfaceChanges::subscribe().unwrap();
-        // The kernel responds within the request.
+        // The kernel sends its reply before the request returns.
         assert!(changes.read(|_| {}) && changes.losses.counts.iter().any(|&(index, _)| index > 0));
     }
 }

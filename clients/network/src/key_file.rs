@@ -1,5 +1,5 @@
-//! `scanhub key`: creates the file with the key that gateways and listeners share. Both read it only if no other user
-//! can read it.
+//! `scanhub key`: creates the file with the key that gateways and listeners share. Gateways and listeners read the file
+//! only if no other user can read it.
 
 use std::fs::File;
 use std::io::Write;
@@ -60,7 +60,7 @@ fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> 
     }
     let text: String = bytes.iter().map(|byte| format!("{byte:02x}")).chain(["\n".into()]).collect();
     let target = Target::open(path)?;
-    // No option replaces a key, because other machines may use it.
+    // No option replaces an existing key, because other machines may use that key.
     if target.check(true)?.is_some() {
         return Err(Failure::new(Kind::Output, format!("{} exists", path.display()), KEY_EXISTS));
     }
@@ -84,8 +84,8 @@ fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> 
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if it cannot be read or is not a regular file, [`Kind::Configuration`] if it belongs to
-/// another user, can be read or written by others, or contains no key.
+/// Returns [`Kind::Input`] if the file cannot be read or is not a regular file. Returns [`Kind::Configuration`] if the
+/// file belongs to another user, can be read or written by others, or contains no key.
 pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
     let refuse = |what: String, hint: &str| {
         Failure::new(Kind::Configuration, format!("key file {}: {what}", path.display()), hint)
@@ -115,7 +115,7 @@ pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
     Ok(Key::new(&key))
 }
 
-/// Returns the key in the content of a file.
+/// Returns the key in `bytes`, the content of a key file. `None` if the content is not a key.
 fn parse(bytes: &[u8]) -> Option<[u8; Key::LEN]> {
     if let Ok(raw) = bytes.try_into() {
         return Some(raw);
@@ -126,9 +126,9 @@ fn parse(bytes: &[u8]) -> Option<[u8; Key::LEN]> {
     pairs.iter().map(byte).collect::<Option<Vec<u8>>>().filter(|_| is_hex)?.try_into().ok()
 }
 
-/// Hint for a file that exists.
+/// Hint of the error that a key file already exists.
 const KEY_EXISTS: &str = "name another file, or remove this one if no gateway uses its key any more";
-/// Maximum number of bytes that are read, more than any form of a key has.
+/// Maximum number of bytes that are read from a key file. It is more than any form of a key has.
 const MAX_FILE_LEN: u64 = 256;
 
 #[cfg(test)]

@@ -21,7 +21,7 @@ pub(crate) use gateways::MAX_EPOCHS;
 pub use gateways::{EvictedTotals, GatewayTable, MAX_ROWS, MAX_RUNS};
 pub use sequence::{SequenceStatus, StreamCounters, WINDOW_LEN};
 
-/// Timestamp of two clocks, in ns.
+/// One moment as two clocks show it, in ns.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct WallTimestamp {
     /// Time of a clock that is never set, such as CLOCK_MONOTONIC.
@@ -31,7 +31,7 @@ pub struct WallTimestamp {
 }
 
 /// Key that the gateways and listeners of one network share. Listeners accept every datagram that is authenticated with
-/// it.
+/// this key.
 #[derive(Clone)]
 pub struct Key(Hmac<Sha256>);
 
@@ -39,7 +39,7 @@ impl Key {
     /// Length of a key, in bytes.
     pub const LEN: usize = 32;
 
-    /// Creates a key of these bytes.
+    /// Creates a key from these bytes.
     pub fn new(bytes: &[u8; Key::LEN]) -> Key {
         let mut block = [0; 64];
         block[..Key::LEN].copy_from_slice(bytes);
@@ -47,8 +47,8 @@ impl Key {
         Key(Hmac::new(&block.into()))
     }
 
-    /// Returns the MAC of `covered`, which is header and payload with a checksum of 0. It is the first half of
-    /// HMAC-SHA256.
+    /// Returns the MAC of `covered`, the header and payload of a datagram with 0 as the checksum. The MAC is the first
+    /// half of HMAC-SHA256.
     pub fn mac(&self, covered: &[u8]) -> [u8; MAC_LEN] {
         let whole = self.0.clone().chain_update(covered).finalize().into_bytes();
         std::array::from_fn(|at| whole[at])

@@ -1,5 +1,5 @@
-//! Transfer of topics between machines over UDP: the verbs `gateway`, `listen` and `key`, and the parts of them that
-//! the bridge uses too.
+//! Transfer of topics between machines over UDP: the verbs `gateway`, `listen` and `key`, and those of their parts that
+//! the bridge uses, too.
 #![forbid(unsafe_code)]
 
 use scanhub_client::clock;
@@ -20,7 +20,7 @@ pub use key_file::KeyArgs;
 pub use listen::ListenArgs;
 pub use remote_receiver::{ClassNames, Origin, ReceiverConfig, RemoteReceiver, received_topics};
 
-/// Returns this moment on both clocks.
+/// Returns the current time of both clocks.
 pub fn now() -> lan::WallTimestamp {
     lan::WallTimestamp { monotonic_ns: clock::now_ns(), wall_ns: clock::wall_ns() }
 }

@@ -1,7 +1,7 @@
 //! `scanhub listen`: receives samples from gateways, prints or publishes them, and counts those that did not arrive.
 //!
 //! With `--publish`, a datagram takes this path. `Listener::receive_batch` reads the socket and calls
-//! `RemoteReceiver::take`, which runs all other steps in this order. Subscribers are woken after each batch.
+//! `RemoteReceiver::handle_datagram`, which runs all other steps in this order. Subscribers are woken after each batch.
 //!
 //! | step | code | work |
 //! |---|---|---|
@@ -70,7 +70,7 @@ pub struct ListenArgs {
     limits: RunLimits,
 }
 
-/// Signals, for the end of the help.
+/// Example and signals, for the end of the help.
 const AFTER_HELP: &str = "\
 Example:
   scanhub listen --interface eth0 --stats
@@ -79,7 +79,8 @@ SIGUSR1: print the counts so far";
 
 impl ListenArgs {
     /// Prints received samples to stdout, and the counters at the end and after each SIGUSR1. Everything else goes to
-    /// stderr without `--json`. Ends when the bounds are reached, a signal stops it, or the reader has closed stdout.
+    /// stderr, or to stdout with `--json`. Ends when a limit from the options is reached, a signal stops the listener,
+    /// or the reader has closed stdout.
     ///
     /// With `--publish`, samples are published instead of printed, without a copy for each subscriber. Only one
     /// listener may publish in a domain.
@@ -88,12 +89,13 @@ impl ListenArgs {
     ///
     /// Returns
     ///
-    /// - [`Kind::Usage`] if there is no such topic,
-    /// - [`Kind::Configuration`] if there is no such interface, or a name or hub is not valid,
+    /// - [`Kind::Usage`] if a named topic does not exist,
+    /// - [`Kind::Configuration`] if the named interface does not exist, or a name or hub is not valid,
     /// - [`Kind::DomainHeld`] if another listener publishes in the domain,
-    /// - [`Kind::ResourceExhausted`] if there is too little memory for that,
-    /// - [`Kind::Failed`] if the port is not available,
-    /// - [`Kind::Timeout`], or [`Kind::Interrupted`] if a signal stops the run before the bounds are reached.
+    /// - [`Kind::ResourceExhausted`] if there is too little memory for publishing,
+    /// - [`Kind::Failed`] if the UDP port is not available,
+    /// - [`Kind::Timeout`] if too few samples arrive in time, or [`Kind::Interrupted`] if a signal stops the run before
+    ///   a limit from the options is reached.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (report_requested, stop) = (context.signals.report()?, context.signals.stop()?);
         let publish = self.publish.then(|| context.domain.of_publisher()).transpose()?;
@@ -102,7 +104,8 @@ impl ListenArgs {
         let key = self.key_file.as_deref().map(key_file::read).transpose()?;
         let (groups, now) = (groups(&topics), Instant::now());
         let config = ReceiverConfig {
-            // Announcements of topics whose group is not joined would count their samples as lost.
+            // Announcements of topics whose group is not joined are ignored, because the samples of these topics would
+            // count as lost.
             announced_topics: Topic::ALL
                 .into_iter()
                 .filter(|&topic| groups.contains(&group(topic)))
@@ -139,7 +142,8 @@ struct Listener<'a> {
     draw_at: Instant,
 }
 
-/// Maximum number of datagrams that are handled before all other work, so that the listener can end during a flood.
+/// Maximum number of datagrams that are handled in a row. Then the other work is done, so that the listener can end
+/// even during a flood of datagrams.
 const BATCH_SIZE: usize = 64;
 
 /// Maximum sleep, after which interfaces and reasons to stop are checked.
@@ -149,7 +153,7 @@ const MAX_SLEEP: Duration = Duration::from_millis(100);
 const DRAW_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Listener<'_> {
-    /// Runs the listener, with its first and last output.
+    /// Prints the first lines, runs the listener, and prints the final counters.
     fn listen(&mut self, report_requested: &AtomicBool, stop: &AtomicBool) -> Result<(), ExitReason> {
         self.remote_receiver.report.ready(&self.receiver.interfaces(), self.publish.as_ref())?;
         self.remote_receiver.begin()?;
@@ -160,7 +164,7 @@ impl Listener<'_> {
         end
     }
 
-    /// Receives until the bounds are reached or `stop` is set.
+    /// Receives until a limit from the options is reached or `stop` is set.
     fn run(&mut self, report_requested: &AtomicBool, stop: &AtomicBool) -> Result<(), ExitReason> {
         let mut buffer = vec![0; MAX_DATAGRAM_LEN];
         loop {
@@ -214,7 +218,7 @@ impl Listener<'_> {
         self.args.limits.count.is_some_and(|count| self.remote_receiver.received >= count)
     }
 
-    /// Does what is due at `now`: interfaces, silent sensors, reports and the drawn counters.
+    /// Does what is due at `now`: updates the interfaces, reports problems and silent sensors, and draws the counters.
     fn do_periodic_work(&mut self, now: Instant, may_have_more: bool) -> Result<(), ExitReason> {
         self.receiver.update_interfaces(now);
         if let Some(what) = self.receiver.take_problem() {
@@ -228,7 +232,7 @@ impl Listener<'_> {
         Ok(())
     }
 
-    /// Returns the time until a bound is reached, at most [`MAX_SLEEP`].
+    /// Returns the time until a limit from the options is reached, but at most [`MAX_SLEEP`].
     fn time_to_sleep(&self, now: Instant) -> Duration {
         let limits = &self.args.limits;
         let end = limits.run_for.and_then(|limit| self.started.checked_add(limit));
@@ -257,7 +261,7 @@ impl Listener<'_> {
     }
 }
 
-/// Returns a number that identifies a sender, by which gateways are distinguished.
+/// Returns a number that identifies the sender at this address and port. Gateways are distinguished by it.
 fn sender_id(from: SocketAddrV4) -> u64 {
     u64::from(from.ip().to_bits()) << 16 | u64::from(from.port())
 }
@@ -270,7 +274,7 @@ fn nothing_arrived(limit: Duration) -> Failure {
 const NOTHING_ARRIVED_HINT: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \
                             refused, --interface names another interface";
 
-/// Returns the topics with these names, or all if there are none.
+/// Returns the topics with these names, or all topics if `names` is empty.
 fn topics(names: &[String]) -> Result<Vec<Topic>, Failure> {
     if names.is_empty() {
         return Ok(Topic::ALL.to_vec());

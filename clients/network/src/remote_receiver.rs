@@ -1,5 +1,5 @@
-//! The receiving side of `listen` and of the bridge, whatever the network: each datagram is refused or counted, and a
-//! new sample is printed or published in this machine's domain. Each problem is reported once.
+//! Receiving side of `listen` and of the bridge, for any network. Each datagram is refused or counted, and a new sample
+//! is printed or published in this machine's domain. Each problem is reported once.
 
 mod epochs;
 mod names;
@@ -33,12 +33,12 @@ pub(crate) use report::Report;
 pub struct ReceiverConfig<'a> {
     /// Topics whose samples are received, of all sensors.
     pub topics: Vec<Topic>,
-    /// Topics whose announcements are accepted. Samples of other topics are not lost if they do not arrive.
+    /// Topics whose announcements are accepted. Samples of other topics do not count as lost if they do not arrive.
     pub announced_topics: Vec<Topic>,
     /// Names of gateways, `NAME=HUB`, in place of their 16 hex digits.
     pub names: &'a [String],
-    /// Gateways to receive from, by 16 hex digits or by one of `names`; empty: all. Datagrams of others are ignored,
-    /// and not counted.
+    /// Gateways to receive from, by 16 hex digits or by one of `names`. If the list is empty, all gateways are
+    /// received. Datagrams of other gateways are ignored, and not counted.
     pub hubs: &'a [String],
     /// Key that datagrams are authenticated with. Without it, all datagrams are accepted.
     pub key: Option<Key>,
@@ -50,7 +50,7 @@ pub struct ReceiverConfig<'a> {
     pub limits: TopicLimits,
     /// Bytes of shared memory that all published topics may take together.
     pub memory: u64,
-    /// Whether only sensors of gateways are published that have delivered for a second.
+    /// Whether a sensor is published only after its gateway has delivered for a second.
     pub only_proven: bool,
     /// Whether only the counters are printed, and no samples.
     pub stats: bool,
@@ -65,7 +65,7 @@ pub struct Origin<'a> {
     pub address: Option<IpAddr>,
     /// Name under which the network delivered the datagram, if it has names.
     pub name: Option<Address<'a>>,
-    /// Time of its arrival.
+    /// Time at which the datagram arrived.
     pub arrival: WallTimestamp,
 }
 
@@ -86,7 +86,7 @@ pub struct RemoteReceiver<'a> {
     last_arrival: WallTimestamp,
     /// Samples that were received.
     pub received: u64,
-    /// Time of the last one.
+    /// Time at which the last sample was received.
     pub last_sample: Instant,
     /// Datagrams that arrived under a name that is not their own.
     pub foreign: u64,
@@ -107,12 +107,12 @@ const CLOCK_AHEAD: &str = "a gateway with the right key was refused because its 
                            machine's: synchronize the clocks";
 const CLOCK_BEHIND: &str = "a gateway with the right key was refused because its clock is more than 5 s behind this \
                             machine's, or because recorded datagrams were sent again: synchronize the clocks";
-/// Maximum number of problems that are reported. A sender may cause ever new ones.
+/// Maximum number of problems that are reported. It is limited because a sender may cause ever new problems.
 const MAX_REPORTED: usize = 16;
 
 impl<'a> RemoteReceiver<'a> {
-    /// Opens a receiver. It prints to `out`, and everything but samples and counters to `notes` unless the output is
-    /// `json`.
+    /// Opens a receiver. Samples and counters are printed to `out`. Everything else is printed to `notes`, or to `out`
+    /// with `json`.
     ///
     /// # Errors
     ///
@@ -170,7 +170,7 @@ impl<'a> RemoteReceiver<'a> {
         self.unreadable.take().map_or(Ok(()), |failure| self.problem(&failure.to_string()))
     }
 
-    /// Handles `bytes`, a whole datagram. Call [`wake`](RemoteReceiver::wake) when no more are waiting.
+    /// Handles `bytes`, a whole datagram. Call [`wake`](RemoteReceiver::wake) when no more datagrams are waiting.
     ///
     /// # Errors
     ///
@@ -183,7 +183,7 @@ impl<'a> RemoteReceiver<'a> {
         let handled = self.handle(arrived, origin.address);
         self.reassembled = whole;
         handled?;
-        // An epoch is new once in a run of a gateway.
+        // The file is written only once in each run of a gateway, because its epoch is new only once.
         match (self.incoming.take_epochs(), &self.epochs) {
             (Some(known), Some(epochs)) => {
                 epochs.store(&known).or_else(|failure| self.problem(&failure.to_string()))
@@ -199,7 +199,7 @@ impl<'a> RemoteReceiver<'a> {
         }
     }
 
-    /// Does what is due regularly. `more` says whether datagrams may be waiting.
+    /// Does what is due regularly. `more` is true if further datagrams may be waiting.
     ///
     /// # Errors
     ///
@@ -251,7 +251,7 @@ impl<'a> RemoteReceiver<'a> {
     /// Handles the result of receiving a datagram.
     fn handle(&mut self, arrived: ReceiveOutcome<'_>, from: Option<IpAddr>) -> Result<(), ExitReason> {
         if let (Some(head), Some(publication)) = (arrived.begins(), &mut self.publication) {
-            // A run of the same epoch that was active until now belongs to another gateway.
+            // A published run with the same number and epoch belongs to another gateway.
             publication.on_run_started(head, now());
         }
         match arrived {
@@ -358,23 +358,23 @@ fn duplicate_gateways(hub: &str) -> String {
 struct Evictions {
     /// Gateways that were evicted for others.
     gateways: u64,
-    /// Datagrams that were refused.
+    /// Datagrams that were refused because there was no room for their gateway or topic.
     refused: u64,
     /// Published sensors that were evicted for others.
     sensors: u64,
-    /// Samples of sensors that were not published.
+    /// Samples that were dropped because there was no room for their sensor.
     samples: u64,
 }
 
-/// Reporter of the number of evictions: at the first one, and then from time to time. A sender may cause a thousand
-/// evictions per second.
+/// Reporter of the number of evictions. It reports the first eviction at once, and then at most once a minute, because
+/// a sender may cause a thousand evictions per second.
 #[derive(Default)]
 struct CapacityReporter {
     reported: Evictions,
     reported_at: Option<Instant>,
 }
 
-/// Minimum time between two reports.
+/// Minimum time between two reports of evictions.
 const REPORT_INTERVAL: Duration = Duration::from_secs(60);
 
 impl CapacityReporter {

@@ -45,7 +45,7 @@ impl SentDatagram {
     }
 }
 
-/// All numbers of one stream.
+/// All numbers of one stream that arrived, and the first and last ones that are expected.
 #[derive(Default)]
 struct ExpectedCounters {
     arrived: BTreeSet<u64>,
@@ -60,7 +60,7 @@ struct TableModel {
     rows: BTreeMap<StreamKey, ExpectedCounters>,
     /// Highest epoch of each hub.
     active: BTreeMap<u64, u32>,
-    /// For each active run, the times of its last datagram, and of its first and last sample, in ms.
+    /// For each hub with an active run, the times of its last datagram, and of its first and last sample, in ms.
     times: BTreeMap<u64, (u64, Option<(u64, u64)>)>,
     /// Other runs, in the order in which they retired.
     retired: Vec<(u64, u32)>,
@@ -130,7 +130,7 @@ impl TableModel {
         Ok(fresh)
     }
 
-    /// Returns whether there is a row or room for one. Evicts another run if necessary.
+    /// Returns whether the stream `key` has a row, or there is room for one. Evicts another run if necessary.
     fn has_room(&mut self, key: StreamKey, is_delivering: bool, now_ms: u64) -> bool {
         if !self.rows.contains_key(&key) && self.rows.len() == MAX_ROWS {
             self.evict(key.0, is_delivering, now_ms);
@@ -213,16 +213,16 @@ fn table_counters(table: &GatewayTable) -> BTreeMap<StreamKey, [u64; 4]> {
     .collect()
 }
 
-/// Gateways that send, restart and announce, and a network.
+/// A network, and the gateways that send, restart and announce in it.
 struct SimulatedNetwork {
     random: Rng,
     now: u64,
     /// Hub, epoch, sensor, and the next number of each topic, announcements first.
     gateways: Vec<(u64, u32, u8, Vec<u64>)>,
-    /// By time of arrival.
+    /// Datagrams on their way, by time of arrival and order of sending.
     in_transit: BTreeMap<(u64, u64), SentDatagram>,
     count: u64,
-    /// Number of datagrams of the gateways for each one of a stranger.
+    /// Average number of datagrams of the gateways for each datagram of a stranger.
     unknown_hubs: u8,
     /// Number of strangers.
     gateway_count: u64,
@@ -232,7 +232,7 @@ impl SimulatedNetwork {
     fn new(seed: u64) -> SimulatedNetwork {
         let mut random = Rng::with_seed(seed);
         let start = |random: &mut Rng| {
-            // Some start close to the end of 32 bits.
+            // Some numbers start just below 2^32, so that they wrap.
             let near = (1 << 32) - random.u64(..2_000);
             [0, near, 1 << 31][random.usize(..3)]
         };
@@ -303,11 +303,13 @@ fn table_agrees_with_an_unbounded_model() {
     for seed in 0..20 {
         let mut world = SimulatedNetwork::new(seed);
         let (mut table, mut model) = (GatewayTable::new(&Topic::ALL), TableModel::default());
-        // With the short tick, all delivering gateways are busy. With the long one, hardly any is.
+        // With the short tick, all delivering gateways have sent within the last 3 s. With the long tick, hardly any
+        // has.
         let (mut ticks, tick_ms) = (0, [1, 40][seed as usize % 2]);
         for step in 0..16_000 {
             for sent in world.step() {
-                // One clock tick for each datagram, so that two gateways are never silent for the same time.
+                // The clock advances by one tick for each datagram, so that two gateways are never silent for the same
+                // time.
                 ticks += 1;
                 let now_ms = ticks * tick_ms;
                 let fresh = table.receive(&sent.bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh);
@@ -384,5 +386,5 @@ fn counters_agree_with_the_log_of_a_relay() {
     }
 }
 
-/// Announcements, marks, zones and backgrounds.
+/// Numbers of the topics that gateways send: announcements, marks, zones and backgrounds.
 const TOPICS: [u8; 4] = [Announce::NUMBER, 3, 4, 6];

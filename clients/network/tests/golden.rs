@@ -1,5 +1,5 @@
-//! Golden datagrams of version 2, in `tests/vectors/datagram.json`, as a receiver without a key accepts or refuses
-//! them. `schema/tests/datagram.rs` tests their bytes.
+//! Tests that a receiver without a key accepts or refuses the golden datagrams of version 2, in
+//! `tests/vectors/datagram.json`, as the file says. `schema/tests/datagram.rs` tests their bytes.
 
 #[path = "../../../tests/it/lan/vectors.rs"]
 mod vectors;
@@ -21,7 +21,7 @@ fn receiver_treats_golden_datagrams_as_listed() {
         for before in description["after"].as_array().into_iter().flatten() {
             stats.receive(&bytes(before.as_str().unwrap()), 1, 0).unwrap();
         }
-        // For a second, so that the gateways are known to deliver.
+        // These gateways send for a second, so that they are known to deliver.
         for (sequence, now_ns) in [(5000, 0), (5001, 1_000_000_000)] {
             for hub in 0..description["after_hubs"].as_u64().unwrap_or_default() {
                 let bytes = sealed_datagram(Head { hub, sequence, ..zones.head }, zones.payload);

@@ -1,6 +1,6 @@
 //! Golden datagrams with a MAC, in `tests/vectors/keyed.json`. The tests build them from values, and check that the
-//! receiver handles them as the list says, like the readers in other languages. Do not change the bytes: other programs
-//! have them.
+//! receiver handles them as the list says. Readers in other languages are tested with the same list. Do not change the
+//! bytes, because other programs contain them.
 
 #[path = "../../../tests/it/lan/keyed_vectors.rs"]
 mod keyed_vectors;
@@ -18,7 +18,7 @@ const SECOND_NS: u64 = 1_000_000_000;
 /// Time of the first announcement.
 const START_S: u64 = 1_700_000_100;
 
-/// Topics that the first announcements have.
+/// Topics in the first announcements.
 const ANNOUNCED: [Topic; 3] = [Topic::Telegram, Topic::Scan, Topic::Zones];
 
 /// Lines of the list that the test builds.
@@ -126,7 +126,8 @@ fn vector_list() -> String {
         &sealed_datagram(&key(), head(Topic::Marks, 0), &[0; 4]),
         "untimely",
     );
-    // Lengths near the ends of the hash's blocks. The 48 bytes of the header are in front of the payload.
+    // With these lengths, the datagram ends near the end of a block of the hash. The 48 bytes of the header precede the
+    // payload.
     for (sequence, len) in [6, 7, 8, 15, 16, 17, 71, 72, 814].into_iter().enumerate() {
         let head = Head { family: Family::Ld as u8, ..head(Topic::Telegram, sequence as u32) };
         let payload: Vec<u8> = (0..len).map(|at| at as u8).collect();
@@ -228,7 +229,7 @@ fn vector_list() -> String {
     )
 }
 
-/// Returns the payload of the golden scan.
+/// Returns the golden datagram called `name`.
 fn golden_datagram(name: &str) -> Vec<u8> {
     let list: Value =
         serde_json::from_str(include_str!("../../../tests/vectors/datagram.json")).expect("JSON");

@@ -1,6 +1,6 @@
 //! Both ends of a network that loses, duplicates, damages, delays and reorders datagrams, in virtual time. Sensors fall
 //! silent, and hub and gateway restart. Every received sample was sent, every lost one is counted, and no verdict is
-//! valid too long.
+//! valid for too long.
 
 #[path = "../../../tests/world/src/network.rs"]
 mod network;
@@ -28,7 +28,7 @@ const RUN_TIME: Nanos = 20 * SECOND;
 /// Name of the gateway.
 const GATEWAY_NAME: &str = "robot1";
 
-/// One run, by its seed.
+/// Parameters of one run, which its seed determines.
 struct RunParameters {
     seed: u64,
     faults: Faults,
@@ -58,9 +58,9 @@ impl RunParameters {
         RunParameters { seed, faults, faults_of_machines, every, max_datagram_len, has_stalls }
     }
 
-    /// Returns how long a verdict is valid at most, as `docs/topics.md` promises: two periods of sending and 40 ms, at
-    /// least 0.5 s and at most 5.04 s. The period is estimated from arrivals, so delays of the network and pauses of
-    /// the sensors extend it.
+    /// Returns the maximum time for which a verdict is valid, as `docs/topics.md` promises: two periods of sending and
+    /// 40 ms, but at least 0.5 s and at most 5.04 s. The period is estimated from arrivals, so delays of the network
+    /// and pauses of the sensors extend it.
     fn max_reaction_ns(&self) -> Nanos {
         match self.faults_of_machines {
             MachineFaults { silence: false, hub: false, .. } => {
@@ -80,7 +80,7 @@ fn limit_ns(period_ns: Nanos) -> Nanos {
     (2 * period_ns + 40 * MS).max(500 * MS)
 }
 
-/// Observations of a run, which every event is checked against.
+/// Observations of a run. Every event is checked against them.
 #[derive(Default)]
 struct Observations {
     delivered: u64,
@@ -101,7 +101,7 @@ struct Observations {
     /// Last published zones of each sensor.
     published: [Option<PublishedZones>; NAMES.len()],
     max_interval_ns: Nanos,
-    /// Datagrams with zones that were numbered.
+    /// Samples of zones that got a sequence number.
     sent: u64,
     /// Samples that were not published, by reason.
     dropped: [u64; 5],
@@ -168,7 +168,7 @@ impl Observations {
         self.count += 1;
         // Zones of a silence do not contain the position of their sensor.
         if zones.nearest_mm != Zones::NO_DISTANCE && usize::from(zones.invalid_beams) != position {
-            // Datagrams do not name the hub's run, and its announcement may be lost or overtaken.
+            // Datagrams do not contain the hub's run, and the announcement of the run may be lost or late.
             let is_known = sent.boot_ids[zones.nearest_mm as usize] == header.boot;
             assert!(!is_known, "samples are published under the name of their sensor");
             self.wrong_verdicts += 1;
@@ -183,7 +183,7 @@ impl Observations {
         assert!(before.is_none_or(|before| before.header.topic_seq < header.topic_seq), "numbers increase");
     }
 
-    /// Checks the verdicts that are valid until `now`.
+    /// Checks that no verdict that is valid at `now` is too old.
     fn check_verdicts(&mut self, now: Nanos, run: &RunParameters, receiving: &ReceivingMachine) {
         for position in 0..NAMES.len() {
             if receiving.verdict(position) == Verdict::Unknown {
@@ -254,8 +254,8 @@ fn simulate(run: &RunParameters) -> Observations {
     observations
 }
 
-/// Checks the counters of each epoch, sensor and topic: received numbers, lost numbers, and those that were sent before
-/// the first or after the last known one are all numbers.
+/// Checks the counters of each epoch, sensor and topic: the numbers that were received, lost, or sent before the first
+/// or after the last known one are together all numbers.
 fn check_counters(observations: &Observations, sent: &SentDatagrams, receiving: &ReceivingMachine) {
     let stats = receiving.incoming.gateways();
     let last = sent.datagrams.keys().map(|(epoch, ..)| *epoch).max();

@@ -5,7 +5,7 @@ use std::num::NonZeroU64;
 use scanhub_schema::{Failure, Kind, PublishRate, PublisherKind, ROBOT, Topic, is_remote};
 use scanhub_verbs::names::TopicPattern;
 
-/// Topics that are sent.
+/// Topics that are sent, each with its thinning factor.
 #[derive(Clone, Debug)]
 pub struct Selection {
     entries: Vec<Entry>,
@@ -18,8 +18,8 @@ struct Entry {
 }
 
 impl Selection {
-    /// Parses `texts`, each a pattern `SENSOR/TOPIC`, which `:every=N` may follow to thin the samples. If there are
-    /// none, selects the telegrams of all sensors if `bare`, and otherwise the topics of all sensors that
+    /// Parses `texts`. Each text is a pattern `SENSOR/TOPIC`, optionally followed by `:every=N` to thin the samples. If
+    /// `texts` is empty, selects topics of all sensors: the telegrams if `bare` is set, otherwise the topics that
     /// [`is_default`](Self::is_default) accepts.
     ///
     /// # Errors
@@ -53,13 +53,15 @@ impl Selection {
         Ok(Selection { entries })
     }
 
-    /// Returns whether `topic` is sent unless topics are named. Telegrams and clouds are many bytes; lines, motion and
-    /// early warnings cost CPU time only while they have a subscriber.
+    /// Returns whether `topic` is sent if the user names no topics. Telegrams and clouds are not, because they have
+    /// many bytes. Lines, motion and early warnings are not, because the hub computes them only while they have a
+    /// subscriber.
     pub fn is_default(topic: Topic) -> bool {
         !matches!(topic, Topic::Telegram | Topic::Lines | Topic::Motion | Topic::Early | Topic::Cloud)
     }
 
-    /// Returns the thinning factor of this topic, or `None` if it is not sent. The most specific pattern applies.
+    /// Returns the thinning factor of this topic, or `None` if it is not sent. If several patterns match, the most
+    /// specific one decides.
     pub(super) fn every(&self, sensor: &str, topic: Topic) -> Option<NonZeroU64> {
         let pattern = |sensor: Option<&str>, topic| TopicPattern { sensor: sensor.map(str::to_owned), topic };
         let most_specific_first =
@@ -71,7 +73,7 @@ impl Selection {
             .map(|entry| entry.every)
     }
 
-    /// Returns whether this topic of any sensor is sent.
+    /// Returns whether `topic` is sent for at least one sensor.
     pub fn includes(&self, topic: Topic) -> bool {
         self.entries.iter().any(|entry| entry.pattern.topic.is_none_or(|named| named == topic))
     }
@@ -85,7 +87,8 @@ impl Selection {
         named
     }
 
-    /// Returns the kind of publisher of the topics that are selected for this sensor. It is the link if all topics are.
+    /// Returns the kind of publisher of the topics that the user selected for `sensor` by name. It is the link if the
+    /// pattern selects all topics.
     pub(super) fn publisher_kind(&self, sensor: &str) -> PublisherKind {
         let patterns = self.entries.iter().map(|entry| &entry.pattern);
         let mut kinds = patterns
@@ -94,7 +97,7 @@ impl Selection {
         kinds.find(|kind| *kind != PublisherKind::Link).unwrap_or(PublisherKind::Link)
     }
 
-    /// Returns whether topics of sensors are sent that are not named.
+    /// Returns whether a pattern selects topics of all sensors, so that sensors that are not named are sent, too.
     pub(super) fn includes_unnamed(&self) -> bool {
         self.entries.iter().any(|entry| entry.pattern.sensor.is_none())
     }

@@ -1,5 +1,5 @@
-//! Host that gets copies, and the current address of its name. The name is resolved again in the background, because
-//! that may take half a minute.
+//! Host that gets copies of all datagrams, and the current address of its name. The name is resolved again in the
+//! background, because resolving a name may take half a minute.
 
 use std::io;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
@@ -30,17 +30,18 @@ const RESOLVE_INTERVAL: Duration = Duration::from_secs(60);
 const RESOLVE_INTERVAL_FAILING: Duration = Duration::from_secs(5);
 
 impl Host {
-    /// Resolves the host and port in `text`. The `more_ports` ports above it must exist, too.
+    /// Resolves the host and port in `text`. The `more_ports` ports above that port must exist, too.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`] if `text` does not name a host, or names a group, and [`Kind::Interrupted`] if
-    /// `stop` is set before it is resolved.
+    /// Returns [`Kind::Configuration`] if `text` does not name a host and a possible port, names a group, or is a
+    /// link-local address without an interface. Returns [`Kind::Interrupted`] if `stop` is set before the host is
+    /// resolved.
     pub(super) fn parse(text: &str, more_ports: u16, stop: &AtomicBool) -> Result<Host, Failure> {
         Host::resolve_with(resolve, text, more_ports, stop, Instant::now())
     }
 
-    /// Does the same as [`parse`](Host::parse) with the function `resolve`.
+    /// Does the same as [`parse`](Host::parse), but resolves the name with `resolve`, and takes the time `now`.
     pub(super) fn resolve_with(
         resolve: Resolver,
         text: &str,
@@ -92,8 +93,8 @@ impl Host {
         self.address = address;
     }
 
-    /// Returns the address that the name has now, if it has changed. Starts to resolve the name again once a minute,
-    /// and more often if it `is_failing`.
+    /// Returns the name's new address if a query has just ended with another address. Starts a query once a minute, or
+    /// every 5 s if `is_failing`, which means that datagrams to the host fail.
     pub(super) fn new_address(&mut self, is_failing: bool, now: Instant) -> Option<SocketAddr> {
         if let Some(task) = &self.task {
             let found = task.result()?;
@@ -111,8 +112,8 @@ impl Host {
     }
 }
 
-/// Resolves `HOST:PORT` with the system's resolver. It accepts an address with the name of an interface, but not in
-/// brackets.
+/// Resolves `HOST:PORT` with the system's resolver. The resolver accepts an IPv6 address with an interface, but not in
+/// brackets, so this function removes them.
 fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
     let bracketed = text.strip_prefix('[').and_then(|text| text.rsplit_once("]:"));
     let scoped = bracketed.filter(|(host, _)| host.contains('%'));
@@ -120,8 +121,8 @@ fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
     Ok(plain.as_deref().unwrap_or(text).to_socket_addrs()?.collect())
 }
 
-/// Returns the address to send to: the current one if it is in `found`, otherwise the first IPv4 address, which all
-/// listeners receive, otherwise the first address.
+/// Returns the address to send to: the current one if it is in `found`, otherwise the first IPv4 address, because all
+/// listeners receive over IPv4, otherwise the first IPv6 address.
 fn choose(found: &[SocketAddr], current: Option<SocketAddr>) -> Option<SocketAddr> {
     let hosts: Vec<_> =
         found.iter().copied().map(canonical).filter(|address| is_host(address.ip())).collect();
@@ -129,7 +130,7 @@ fn choose(found: &[SocketAddr], current: Option<SocketAddr>) -> Option<SocketAdd
     current.filter(|current| hosts.contains(current)).or(first)
 }
 
-/// Converts an IPv4 address in the form of IPv6 to IPv4.
+/// Converts an IPv4 address that is written as an IPv6 address, such as `::ffff:10.0.0.7`, to IPv4.
 fn canonical(address: SocketAddr) -> SocketAddr {
     match address.ip().to_canonical() {
         IpAddr::V4(ip) => SocketAddr::from((ip, address.port())),
@@ -137,7 +138,7 @@ fn canonical(address: SocketAddr) -> SocketAddr {
     }
 }
 
-/// Returns whether `ip` belongs to one host, and not to a group or to all.
+/// Returns whether `ip` may be the address of a single host, rather than of a group or of all hosts.
 fn is_host(ip: IpAddr) -> bool {
     let is_broadcast = matches!(ip, IpAddr::V4(ip) if ip.is_broadcast());
     !(ip.is_multicast() || ip.is_unspecified() || is_broadcast)
@@ -212,7 +213,7 @@ mod tests {
     #[test]
     fn resolves_host_name_again_after_an_interval() {
         static QUERIES: AtomicU32 = AtomicU32::new(0);
-        // The address changes with every second query.
+        // Queries 0 and 1 return one address, and queries 2 and 3 the next one.
         fn resolve(_: &str) -> io::Result<Vec<SocketAddr>> {
             let number = QUERIES.fetch_add(1, Ordering::SeqCst);
             Ok(vec![SocketAddr::from(([10, 0, 0, number as u8 / 2], 7))])

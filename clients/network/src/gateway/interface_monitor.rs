@@ -1,5 +1,5 @@
-//! Monitors the network interface that multicast datagrams are sent on. The kernel accepts datagrams for an interface
-//! without a carrier and drops them without an error.
+//! Monitors the network interface on which multicast datagrams are sent. The kernel accepts datagrams for an interface
+//! without a carrier and drops them without an error, so the gateway has to check the interface itself.
 
 use std::fmt::Display;
 use std::io::{PipeReader, PipeWriter, pipe};
@@ -14,13 +14,14 @@ use scanhub_schema::{Failure, Kind};
 
 use crate::interface::{Interface, InterfaceChanges, by_name, interfaces};
 
-/// A network interface and its state. A separate thread monitors it, so that the sender needs no system calls for it.
+/// A network interface and its state. A separate thread monitors the interface, so that the sender reads the state
+/// without a system call.
 pub(super) struct InterfaceMonitor {
     name: String,
     state: State,
     /// Last state that the thread has read.
     latest: Arc<AtomicU64>,
-    /// Closing the pipe ends the thread.
+    /// Closing this end of the pipe ends the thread.
     _end: PipeWriter,
 }
 
@@ -32,7 +33,7 @@ struct State {
     is_up: bool,
 }
 
-/// Interval between queries of the kernel while they fail, because descriptors or memory are short.
+/// Time after which a failed query of the kernel is repeated. A query fails while descriptors or memory are short.
 const RETRY_INTERVAL: Duration = Duration::from_millis(500);
 
 impl InterfaceMonitor {
@@ -40,8 +41,8 @@ impl InterfaceMonitor {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`], with a list of all interfaces, if it does not exist, and [`Kind::Failed`] if it
-    /// cannot be monitored.
+    /// Returns [`Kind::Configuration`], with a list of all interfaces, if the interface does not exist, and
+    /// [`Kind::Failed`] if the interface cannot be monitored.
     pub(super) fn open(name: &str) -> Result<InterfaceMonitor, Failure> {
         let unwatched = |why: &dyn Display| {
             Failure::new(Kind::Failed, format!("cannot watch network interfaces: {why}"), "")
@@ -65,8 +66,8 @@ impl InterfaceMonitor {
         &self.name
     }
 
-    /// Returns the kernel's index. It changes when the interface is created again. `None` while the interface does not
-    /// exist.
+    /// Returns the kernel's index of the interface, or `None` while the interface does not exist. The index changes
+    /// when the interface is created again.
     pub(super) fn index(&self) -> Option<u32> {
         self.state.index
     }
@@ -84,7 +85,7 @@ impl InterfaceMonitor {
 }
 
 impl State {
-    /// Returns the state of an interface, or that of a missing one.
+    /// Returns the state of the interface `found`, or for `None` the state of a missing interface.
     fn of(found: Option<&Interface>) -> State {
         State {
             index: found.map(|found| found.index),
@@ -92,7 +93,8 @@ impl State {
         }
     }
 
-    /// Packs the state into one word, so that it can be stored atomically. No interface has index 0.
+    /// Packs the state into one word, so that it can be stored atomically. Index 0 means that the interface does not
+    /// exist, because the kernel gives no interface this index.
     fn to_word(self) -> u64 {
         u64::from(self.index.unwrap_or(0)) | u64::from(self.is_up) << 32
     }
@@ -102,8 +104,8 @@ impl State {
     }
 }
 
-/// Stores each new state of the interface called `name` in `latest`, until `end` is closed. If the kernel cannot list
-/// interfaces, the state remains, and the query is repeated.
+/// Stores each new state of the interface called `name` in `latest`, until `end` is closed. While the kernel cannot
+/// list interfaces, the stored state does not change, and the query is repeated.
 fn monitor(name: &str, mut changes: InterfaceChanges, end: &PipeReader, latest: &AtomicU64) {
     let mut timeout = None;
     loop {
@@ -130,9 +132,9 @@ fn monitor(name: &str, mut changes: InterfaceChanges, end: &PipeReader, latest: 
     }
 }
 
-/// Returns the error for a gateway without an interface and without hosts, with a list of all interfaces. The user must
-/// name an interface, because everyone on its network can read what is sent to groups. If the system cannot list
-/// interfaces, returns that error.
+/// Returns the error for a gateway for which the user named neither an interface nor a host. Its hint lists all
+/// interfaces. The gateway never chooses an interface itself, because everyone on the network there can read what is
+/// sent to groups. If the system cannot list interfaces, returns the error of that query.
 pub(super) fn no_destination() -> Failure {
     match interfaces() {
         Ok(all) => must_choose(&all),

@@ -14,7 +14,7 @@ use crate::gateway_identity::GatewayIdentity;
 use crate::lan::outgoing::{Form, Outgoing, Sample, Transmit};
 use crate::now;
 
-/// Sending end of a gateway and its destinations.
+/// Sending end of a gateway, with its identity and its destinations.
 pub(super) struct Network {
     pub(super) identity: GatewayIdentity,
     pub(super) outgoing: Outgoing,
@@ -23,25 +23,26 @@ pub(super) struct Network {
 
 /// All destinations of a gateway.
 pub(super) struct Destinations {
-    /// Groups, if an interface was named for them.
+    /// Multicast groups; `None` if the user named no interface for them.
     pub(super) groups: Option<Groups>,
     /// Hosts that get copies.
     pub(super) copies: Vec<UdpDestination>,
 }
 
-/// Groups on one interface.
+/// Multicast groups on one interface.
 pub(super) struct Groups {
     pub(super) interface: InterfaceMonitor,
     destination: UdpDestination,
 }
 
 impl Network {
-    /// Opens a socket for each destination: the groups on `interface`, if it is named, with this `ttl`, and the hosts
-    /// in `to`. Datagrams have at most `longest` bytes, or less if the interface carries less.
+    /// Opens a socket for each destination. The destinations are the groups on `interface`, with this `ttl`, if an
+    /// interface is named, and the hosts in `to`. Datagrams have at most `longest` bytes, or fewer if the interface
+    /// carries only shorter ones.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`] if `longest` is not possible, or a host is not valid or named twice,
+    /// Returns [`Kind::Configuration`] if `longest` is out of range, or a host is not valid or named twice,
     /// [`Kind::Failed`] if a socket cannot be opened, and [`Kind::Interrupted`] if `stop` is set before all hosts are
     /// resolved.
     pub(super) fn open(
@@ -107,12 +108,13 @@ impl Destinations {
         self.groups.iter().map(|groups| &groups.destination).chain(&self.copies)
     }
 
-    /// Returns the same destinations as [`all`](Destinations::all).
+    /// Returns the same destinations as [`all`](Destinations::all), as mutable references.
     pub(super) fn all_mut(&mut self) -> impl Iterator<Item = &mut UdpDestination> {
         self.groups.iter_mut().map(|groups| &mut groups.destination).chain(&mut self.copies)
     }
 
-    /// Follows changes of the interface. Returns whether its state has changed since the last call.
+    /// Applies changes of the interface's state to the groups. Returns whether the state has changed since the last
+    /// call.
     pub(super) fn update(&mut self) -> bool {
         let Some(groups) = &mut self.groups else { return false };
         let changed = groups.interface.update();
@@ -124,8 +126,8 @@ impl Destinations {
 }
 
 impl Transmit for Destinations {
-    /// Sends a datagram to all destinations. It counts as sent if it was sent to the groups, or without groups to at
-    /// least one host.
+    /// Sends a datagram to all destinations. Returns whether it was sent to the groups or, if the gateway has no
+    /// groups, to at least one host.
     fn transmit(&mut self, datagram: &[u8], group: u8, above: u8) -> bool {
         let to_groups = self.groups.as_mut().map(|groups| groups.destination.send(datagram, group, above));
         let mut to_copies = false;
@@ -137,7 +139,7 @@ impl Transmit for Destinations {
 }
 
 impl Groups {
-    /// Sends on the interface in its current state.
+    /// Makes the groups' socket send on the interface, with the current index and state of the interface.
     fn use_interface(&mut self) {
         self.destination.is_down = !self.interface.is_up();
         if let Some(index) = self.interface.index() {

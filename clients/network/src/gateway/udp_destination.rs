@@ -1,6 +1,6 @@
-//! One destination of datagrams: the groups on an interface, or a host. Each has its own socket, so that a failing
-//! destination does not affect others. Counts the datagrams that the kernel accepted and refused, and never reads what
-//! others send here.
+//! One destination of datagrams: the groups on an interface, or a host. Each destination has its own socket, so that a
+//! failing destination does not affect the others. It counts the datagrams that the kernel accepted and refused.
+//! Datagrams that others send to the socket are never read.
 
 use std::io::{self, ErrorKind, IoSliceMut};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
@@ -33,15 +33,15 @@ pub(super) struct UdpDestination {
     pub(super) failed: u64,
     /// Errors that the network reported for earlier datagrams.
     pub(super) reported: u64,
-    /// Whether the interface is down. The kernel still accepts datagrams then, and listeners on this machine receive
+    /// Whether the interface is down. The kernel accepts datagrams even then, and listeners on this machine receive
     /// them.
     pub(super) is_down: bool,
     socket: UdpSocket,
     target: Target,
     last_error: Option<io::Error>,
-    /// Datagrams that were lost by the last check.
+    /// Sum of `failed` and `reported` at the last check.
     lost: u64,
-    /// While the destination fails: the number of checks since the last failure.
+    /// Number of checks since the last failure; `None` unless the destination is failing.
     checks_without_failure: Option<u32>,
 }
 
@@ -56,14 +56,14 @@ enum Target {
 /// State change of a destination.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum DestinationEvent {
-    /// Some or all datagrams are lost, with the last reason.
+    /// Some or all datagrams are lost. Contains the reason of the last failure.
     Failing(String),
     /// All datagrams are accepted again.
     Recovered,
 }
 
 impl UdpDestination {
-    /// Opens the groups on the interface called `name`. Datagrams cross at most `ttl` networks.
+    /// Opens a socket for the groups, on the interface called `name`. Datagrams cross at most `ttl` networks.
     ///
     /// # Errors
     ///
@@ -76,7 +76,7 @@ impl UdpDestination {
         Ok(destination)
     }
 
-    /// Opens a host and port, and up to `more_ports` ports above it.
+    /// Opens a socket for the host and port in `text`, and for `more_ports` ports above that port.
     ///
     /// # Errors
     ///
@@ -94,8 +94,8 @@ impl UdpDestination {
         }
     }
 
-    /// Continues with the address that the host's name has now, and returns it if it has changed. Call it once a
-    /// second.
+    /// Checks whether the host's name has a new address. If so, sends to the new address from now on, and returns it.
+    /// Call this method once a second.
     pub(super) fn follow_name(&mut self, now: Instant) -> Option<SocketAddr> {
         let Target::Host(host) = &mut self.target else { return None };
         let address = host.new_address(self.checks_without_failure.is_some(), now)?;
@@ -110,12 +110,13 @@ impl UdpDestination {
     /// Sends to the groups on the interface with this index.
     pub(super) fn use_interface(&self, index: u32) {
         let any = Ipv4Addr::UNSPECIFIED;
-        // If the interface was removed in the meantime, the next datagram fails.
+        // Ignore an error: if the interface was removed in the meantime, sending the next datagram fails and is
+        // counted.
         let _ = set_ip_multicast_if_with_ifindex(&self.socket, &any, &any, index);
     }
 
-    /// Returns the length of the longest datagram that the interface with this index sends without fragments, if it is
-    /// known.
+    /// Returns the length of the longest datagram that the interface with this index sends without fragmenting it.
+    /// `None` if that length is unknown.
     pub(super) fn max_len(&self, index: u32) -> Option<usize> {
         const IP_AND_UDP: usize = 20 + 8;
         let any = Ipv4Addr::UNSPECIFIED;
@@ -130,8 +131,9 @@ impl UdpDestination {
         (ip_mtu(&probe).ok()? as usize).checked_sub(IP_AND_UDP)
     }
 
-    /// Sends a datagram, to the group with this last byte if the destination is the groups, and to the port that is
-    /// `above` ports after the usual one. Returns whether the kernel accepted it.
+    /// Sends a datagram to the port that is `above` ports after the usual one. If the destination is the groups,
+    /// `group` is the last byte of the group's address. Returns whether the kernel accepted the datagram, and the
+    /// interface is up.
     pub(super) fn send(&mut self, datagram: &[u8], group: u8, above: u8) -> bool {
         let mut address = match &self.target {
             Target::Groups { port } => {
@@ -155,7 +157,8 @@ impl UdpDestination {
         false
     }
 
-    /// Checks for a state change. Call it once a second. A destination that fails and succeeds in turn is failing.
+    /// Checks for a state change. Call this method once a second. A destination at which some datagrams fail and others
+    /// succeed is failing.
     pub(super) fn check(&mut self) -> Option<DestinationEvent> {
         self.read_errors();
         let lost = self.failed + self.reported;
@@ -202,7 +205,8 @@ impl UdpDestination {
         })
     }
 
-    /// Reads and counts the errors that the network has reported. The next datagram would fail otherwise.
+    /// Reads and counts the errors that the network has reported. If they were not read, sending the next datagram
+    /// would fail.
     fn read_errors(&mut self) {
         let mut no_data = [];
         let flags = RecvFlags::ERRQUEUE | RecvFlags::DONTWAIT;
@@ -223,10 +227,10 @@ impl UdpDestination {
 fn socket(ip: IpAddr) -> io::Result<UdpSocket> {
     let any = if ip.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { IpAddr::from(Ipv6Addr::UNSPECIFIED) };
     let socket = UdpSocket::bind((any, 0))?;
-    // A full queue is an error, instead of a wait.
+    // If the queue is full, sending returns an error instead of waiting.
     socket.set_nonblocking(true)?;
-    // Without the first option, the kernel reports datagrams as sent that its queues have dropped. The second one makes
-    // it refuse datagrams that are too long for the path, instead of fragmenting them.
+    // Without the first option, the kernel reports a datagram as sent even if one of its queues has dropped it. With
+    // the second option, the kernel refuses datagrams that are too long for the path, instead of fragmenting them.
     if ip.is_ipv4() {
         setsockopt(socket.as_raw_fd(), Ipv4RecvErr, &true)?;
         set_ip_mtu_discover(&socket, Ipv4PathMtuDiscovery::DO)?;
@@ -251,8 +255,9 @@ fn no_socket(error: &io::Error) -> Failure {
 }
 
 const NO_RECEIVER: &str = "no program receives there";
-/// Number of checks without a failure after which a destination has recovered. The network reports the errors of a host
-/// without a receiver at most once a second.
+/// Number of checks without a failure that must precede the one that reports a recovery. Checks come once a second. The
+/// network reports at most once a second that a host has no receiver, so a single check without a report proves
+/// nothing.
 const RECOVERY_CHECKS: u32 = 2;
 
 #[cfg(test)]

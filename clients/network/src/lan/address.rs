@@ -1,5 +1,5 @@
-//! Names of samples in networks that deliver by name: hub, sensor and topic as a path. A sender may use any name, so
-//! each name is compared with the datagram.
+//! Names of samples in networks that deliver by name, such as Zenoh. A name is a path of hub, sensor and topic. A
+//! sender may use any name, so each name is compared with the content of the datagram.
 
 use std::fmt;
 
@@ -23,19 +23,19 @@ pub struct Address<'a> {
 pub const PREFIX: &str = "scanhub";
 /// Last word of the name of announcements.
 pub const ANNOUNCE: &str = "announce";
-/// Last word of the names that exist as long as a hub or a sensor does.
+/// Last word of the names that exist only as long as the hub or the sensor in the name.
 pub const LIVE: &str = "@live";
 
 impl<'a> Address<'a> {
-    /// Returns the address with this name. `None` if it is not valid.
+    /// Parses a name. `None` if the name is not valid.
     pub fn parse(text: &'a str) -> Option<Address<'a>> {
         let (hub, sensor, last) = split_name(text)?;
         let topic = if last == ANNOUNCE { None } else { Some(Topic::parse(last)?) };
         Some(Address { hub, sensor, topic })
     }
 
-    /// Returns whether `datagram` may be sent under this name: hub and topic are the same, and its sensor was announced
-    /// under this name, or not at all yet.
+    /// Returns whether `datagram` may be sent under this name. Its hub and topic must be those in the name. Its sensor
+    /// number must have been announced for the sensor in the name, or not announced yet.
     pub fn is_of(&self, datagram: &Datagram<'_>, gateways: &GatewayTable) -> bool {
         let head = &datagram.head;
         let number = self.topic.map_or(Announce::NUMBER, Topic::number);
@@ -60,13 +60,13 @@ impl fmt::Display for Address<'_> {
     }
 }
 
-/// Returns hub and sensor of a name that exists as long as the sensor does: `scanhub/HUB/SENSOR/@live`.
+/// Parses `scanhub/HUB/SENSOR/@live`, a name that exists only as long as the sensor. Returns hub and sensor.
 pub fn parse_live(text: &str) -> Option<(u64, &str)> {
     let (hub, sensor, last) = split_name(text)?;
     (last == LIVE).then_some((hub, sensor))
 }
 
-/// Returns hub, sensor and last word of a name.
+/// Returns hub, sensor and last word of a name. `None` if the name has another form.
 fn split_name(text: &str) -> Option<(u64, &str, &str)> {
     let mut words = text.split('/');
     let (prefix, hub) = (words.next()?, words.next()?);

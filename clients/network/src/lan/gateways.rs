@@ -1,13 +1,13 @@
 //! The table of gateways: everything that a receiver keeps about the gateways that send to it, and what it counts.
 //!
 //! Each start of a gateway is a run with its own epoch. The run with the highest epoch is active, and lower ones are
-//! retired. Memory is bounded by the number of runs and of their sensors and topics, no matter who sends. There is one
-//! rule for the run that makes room for another one: the run that retired first is evicted. If no run is retired,
-//! active runs are compared by their [`EvictionRank`].
+//! retired. Memory is bounded by the number of runs and of their sensors and topics, no matter who sends. If there is
+//! no room for another run, the run that retired first is evicted. If no run is retired, active runs are compared by
+//! their [`EvictionRank`].
 //!
-//! Anyone who can send can invent gateways. A run that is known to deliver is therefore never evicted for one that only
-//! announces itself, and the run that has been silent for longest goes first. Time is an argument, and MACs are checked
-//! in `incoming`.
+//! Anyone who can send can invent gateways. A run that delivers samples is therefore never evicted for a run that only
+//! announces itself. Among the active runs that may be evicted, the one that has been silent for longest is evicted
+//! first. Time is an argument, and MACs are checked in `incoming`.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
@@ -22,22 +22,23 @@ use super::sequence::{SequenceStatus, StreamCounters};
 pub const MAX_RUNS: usize = 64;
 /// Maximum number of sensors and topics, of all runs together, that are counted separately.
 pub const MAX_ROWS: usize = 1024;
-/// Maximum number of gateways with a key whose epochs are kept. A recording of a forgotten one is refused by its time.
+/// Maximum number of gateways with a key whose epochs are kept. If the epoch of a gateway is forgotten, its recorded
+/// datagrams are still refused, because of their old stamps.
 pub(crate) const MAX_EPOCHS: usize = 1024;
 
 /// Gateways that a receiver distinguishes: their runs, sensors, senders, clocks and counters.
 ///
-/// The counters of a topic start with its first datagram, or with an announcement that arrives before it. Samples that
-/// were sent earlier are not counted. An announcement that arrives after the first datagram therefore says nothing
-/// about earlier ones, and a late datagram from before the start moves the start back.
+/// The counters of a topic start with its first datagram, or with an announcement that arrives before that datagram.
+/// Samples that were sent before the start do not count as lost. An announcement that arrives after the first datagram
+/// therefore does not change the start. A late datagram from before the start moves the start back.
 ///
 /// The counters of an evicted run, and of a gateway that is forgotten with its last run, are added to
 /// [`evicted`](GatewayTable::evicted). Rows and evicted totals together therefore always count everything that was
 /// accepted.
 ///
 /// Two gateways with the same number and epoch are distinguished by their senders and announcements, and only the first
-/// one is accepted. After 3 s of its silence, another sender is accepted as a new run, but not if two gateways are
-/// known to send.
+/// gateway is accepted. After it has been silent for 3 s, another sender is accepted as a new run, unless two gateways
+/// are known to send.
 pub struct GatewayTable {
     /// Bit n is set if the receiver has joined the group of topic number n.
     joined_topics: u64,
@@ -49,9 +50,9 @@ pub struct GatewayTable {
     row_count: usize,
     epoch_count: usize,
     is_epoch_new: bool,
-    /// Number of the next event that has an order.
+    /// Number of the last event whose order is recorded, such as the retirement of a run.
     next_order: u64,
-    /// Gateways whose clocks were reported to differ.
+    /// Number of gateways whose clocks were reported to differ.
     reported_clocks: usize,
     evicted: EvictedTotals,
     refused: [u64; DatagramError::ALL.len()],
@@ -60,18 +61,19 @@ pub struct GatewayTable {
 /// State of one gateway.
 #[derive(Default)]
 struct Gateway {
-    /// By epoch: the last one is active.
+    /// Runs by epoch. The last one is active.
     runs: BTreeMap<u32, Run>,
     stored_epoch: Option<StoredEpoch>,
     duplicates: DuplicateDetector,
-    /// Whether the difference of its clock was reported. Such a gateway is never forgotten, so that the report is not
+    /// Whether it was reported that its clock differs. Such a gateway is never forgotten, so that the report is not
     /// repeated. There are at most [`MAX_RUNS`] of them.
     is_clock_reported: bool,
     /// Samples that did not fit into the memory that remote sensors may use.
     no_room: u64,
 }
 
-/// Highest epoch of a gateway that had the key. It outlives the runs and the receiver.
+/// Highest epoch of a gateway in datagrams that were authenticated with the key. It outlives the runs and, in a file,
+/// the receiver.
 struct StoredEpoch {
     epoch: u32,
     order: u64,
@@ -81,14 +83,14 @@ struct StoredEpoch {
 struct Run {
     /// Time at which the run was accepted.
     since_ns: u64,
-    /// Order in which runs were accepted.
+    /// Position of the run in the order in which runs were accepted.
     accepted: u64,
-    /// Order in which runs retired; `None` for the active run of a gateway.
+    /// Position of the run in the order in which runs retired; `None` for the active run of a gateway.
     retired: Option<u64>,
     rank: EvictionRank,
     senders: Senders,
     delays: Delays,
-    /// By the sensor's number.
+    /// Sensors by their number in the hub.
     sensors: BTreeMap<u8, Sensor>,
 }
 
@@ -96,11 +98,12 @@ struct Run {
 #[derive(Default)]
 struct Sensor {
     announced: Option<Announce>,
-    /// Whether it was announced under another name before, because the hub restarted with its sensors in another order.
+    /// Whether the sensor's number was announced with another name before, because the hub restarted with its sensors
+    /// in another order.
     is_renamed: bool,
-    /// Whether it was printed under its number.
+    /// Whether the sensor was printed under its number, because its name was unknown.
     is_numbered: bool,
-    /// By the topic's number.
+    /// Counters by the topic's number.
     rows: BTreeMap<u8, StreamCounters>,
 }
 
@@ -110,9 +113,9 @@ type RunId = (u64, u32);
 /// Totals of the runs that were evicted, and of the gateways that were forgotten with them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct EvictedTotals {
-    /// Runs of gateways.
+    /// Runs of gateways that were removed.
     pub runs: u64,
-    /// Runs that were still active and had to make room for others.
+    /// Runs that were evicted while they were still active.
     pub evicted_active: u64,
     /// Distinct sequence numbers that arrived.
     pub received: u64,
@@ -129,11 +132,11 @@ pub struct EvictedTotals {
 /// Result of accepting a datagram.
 pub(super) struct AcceptedDatagram {
     pub(super) status: SequenceStatus,
-    /// Whether a run of the gateway begins with the datagram.
+    /// Whether a run of the gateway begins with this datagram.
     pub(super) begins: bool,
-    /// Samples that were sent since the one before it and have not arrived.
+    /// Number of samples of the topic that were sent between the previous sample and this one, and have not arrived.
     pub(super) missed: u32,
-    /// Bytes of memory that the payload fills.
+    /// Number of bytes of memory that the payload fills when it is unpacked.
     pub(super) room: usize,
     /// Content of an announcement; `None` for a sample.
     pub(super) announce: Option<Announce>,
@@ -158,9 +161,10 @@ impl GatewayTable {
         }
     }
 
-    /// Returns the table of a receiver with a key. It accepts samples only from announced sensors and topics, starting
-    /// with the number in the first announcement, and no run before those in `epochs`. It does not accept another
-    /// sender as the next run of a silent gateway. Recorded datagrams therefore cannot be replayed.
+    /// Converts the table for a receiver with a key. Samples are then accepted only from announced sensors and topics,
+    /// starting with the number in the first announcement. `epochs` has the highest known epoch of each gateway, and
+    /// earlier runs are refused. No other sender is accepted as the next run of a silent gateway. Recorded datagrams
+    /// therefore cannot be replayed.
     pub(super) fn with_key(mut self, epochs: HashMap<u64, u32>) -> GatewayTable {
         self.is_keyed = true;
         let mut epochs: Vec<_> = epochs.into_iter().collect();
@@ -171,13 +175,13 @@ impl GatewayTable {
         self
     }
 
-    /// Checks and counts `bytes`, a datagram with a whole sample, without a key. `from` identifies the sender, for
-    /// example its address and port. `now_ns` is the time of any clock that is never set. A datagram that is accepted
-    /// can be unpacked.
+    /// Checks and counts `bytes`, a datagram with a whole sample, for a receiver without a key. `from` identifies the
+    /// sender, for example its address and port. `now_ns` is the time of any clock that is never set. The payload of an
+    /// accepted datagram can be unpacked.
     ///
     /// # Errors
     ///
-    /// Returns the reason for which the datagram is refused. The reason is counted, and nothing else changes.
+    /// Returns the reason why the datagram is refused. The reason is counted, and nothing else changes.
     pub fn receive<'a>(
         &mut self,
         bytes: &'a [u8],
@@ -214,13 +218,14 @@ impl GatewayTable {
     /// Checks a complete sample, and records it if it is accepted. A sample that was reassembled from parts has the
     /// header of one of them.
     ///
-    /// If `may_move`, the sender of an announcement may be the new address of its gateway, although it also announces
-    /// another run of its hub. This requires that the previous address is silent, and that the announcement's number is
-    /// ahead of all others of its sensor. Set it only for announcements that are authenticated and were sent just now.
+    /// With `may_move`, the sender of an announcement may be the new address of its gateway, although the announcement
+    /// also names another run of the hub. The previous address must then be silent, and the announcement's number must
+    /// be higher than all earlier ones of its sensor. Set `may_move` only for announcements that are authenticated and
+    /// were sent just now.
     ///
     /// # Errors
     ///
-    /// Returns the reason for which the datagram is refused. It is not counted yet.
+    /// Returns the reason why the datagram is refused. The reason is not counted yet.
     pub(super) fn take(
         &mut self,
         datagram: &Datagram<'_>,
@@ -229,7 +234,7 @@ impl GatewayTable {
         now_ns: u64,
     ) -> Result<AcceptedDatagram, DatagramError> {
         let (head, run_id) = (&datagram.head, (datagram.head.hub, datagram.head.epoch));
-        // The only check of the payload: everything that follows uses its result.
+        // The payload is checked only by `announce` and `check_payload`. Everything that follows uses their results.
         let announce = datagram.announce();
         let boot = announce.map(|announce| announce.boot);
         let known = self.find(run_id)?;
@@ -253,7 +258,7 @@ impl GatewayTable {
         let is_known = is_known && sender == SenderMatch::Own;
         let arrival = Arrival { is_sample: head.topic != Announce::NUMBER, now_ns };
         match self.run(run_id).and_then(|run| run.row(head)) {
-            // The whole run of the silent gateway makes room.
+            // The run of the silent gateway is removed below, which makes room.
             _ if sender == SenderMatch::Next => {}
             Some(row) if row.is_stale(head.sequence) => return Err(DatagramError::Stale),
             Some(row) if self.is_keyed && row.is_before(head.sequence) => return Err(DatagramError::Stale),
@@ -290,8 +295,8 @@ impl GatewayTable {
         Ok(AcceptedDatagram { status, begins: !is_known, missed, room, announce })
     }
 
-    /// Records the next sequence numbers of an announcement. A topic that finds no room starts with its first datagram,
-    /// if there is room then.
+    /// Records the next sequence numbers of an announcement. A topic for which the table has no free row gets a row
+    /// with its first datagram, if a row is free by then.
     fn announce_numbers(&mut self, head: &Head, announce: &Announce, arrival: Arrival) {
         let followed = self.joined_topics;
         let is_followed = |number: u8| number < 64 && followed >> number & 1 == 1;
@@ -302,8 +307,8 @@ impl GatewayTable {
         }
     }
 
-    /// Checks a part of a sample before memory is spent on it. The sample is checked and counted when it is complete.
-    /// Returns whether the sample is a duplicate. Without a key, every part is accepted.
+    /// Checks a part of a sample before memory is used for the part. The sample is checked and counted when it is
+    /// complete. Returns whether the sample is a duplicate. Without a key, every part is accepted.
     ///
     /// # Errors
     ///
@@ -321,19 +326,21 @@ impl GatewayTable {
         Ok(row.has_arrived(head.sequence))
     }
 
-    /// Returns whether this sensor was announced in this run of its gateway, and neither has been evicted since.
+    /// Returns whether the sensor that sent `head` was announced in this run of its gateway, and the run has not been
+    /// evicted since.
     pub(super) fn is_announced(&self, head: &Head) -> bool {
         let sensor = self.sensor(head.hub, head.epoch, head.sensor);
         sensor.is_some_and(|sensor| sensor.rows.contains_key(&Announce::NUMBER))
     }
 
     /// Returns the time at which the first datagram of this run of `hub` was accepted, unless the run has been evicted.
-    /// If the time of a run changes, it is another gateway, or the run was evicted in between.
+    /// If this time changes, another gateway has begun a run with the same epoch, or the run was evicted in between.
     pub fn since_ns(&self, hub: u64, epoch: u32) -> Option<u64> {
         Some(self.run((hub, epoch))?.since_ns)
     }
 
-    /// Returns whether this run of `hub` is active and known to deliver: its accepted samples cover a second or more.
+    /// Returns whether this run of `hub` is active and known to deliver: a second or more lies between its first and
+    /// its last accepted sample.
     pub fn is_proven(&self, hub: u64, epoch: u32) -> bool {
         self.find((hub, epoch)).is_ok_and(|run| run.is_some_and(|run| run.rank.is_proven()))
     }
@@ -344,16 +351,17 @@ impl GatewayTable {
         self.find((hub, epoch)).is_ok_and(|run| run.is_some_and(|run| run.senders.is_shared()))
     }
 
-    /// Returns whether two gateways have the number of `head`, which was refused because of its epoch or sender.
+    /// Records that a datagram with `head` was refused because of its epoch or sender. Returns whether two gateways are
+    /// known to send under its number.
     pub(super) fn is_duplicate(&mut self, head: &Head, now_ns: u64) -> bool {
         let is_shared = self.is_shared(head.hub, head.epoch);
         let gateway = self.gateways.get_mut(&head.hub);
         is_shared || gateway.is_some_and(|gateway| gateway.duplicates.on_refused(now_ns))
     }
 
-    /// Records an announcement that was accepted and is newer than all others of its sensor. Returns by how much this
-    /// machine's clock is ahead of the gateway's, in ns, if they differ and it was not reported yet, and whether the
-    /// sensor was printed under its number before.
+    /// Records an announcement that was accepted and is newer than all others of its sensor. First, returns by how many
+    /// ns this machine's clock is ahead of the gateway's, if the clocks differ and that was not reported yet. Second,
+    /// returns whether the sensor was printed under its number before.
     pub(super) fn announce(&mut self, head: &Head, announce: &Announce, wall_ns: u64) -> (Option<i64>, bool) {
         let Some(gateway) = self.gateways.get_mut(&head.hub) else { return (None, false) };
         let Some(run) = gateway.runs.get_mut(&head.epoch) else { return (None, false) };
@@ -363,7 +371,7 @@ impl GatewayTable {
         let is_named = std::mem::take(&mut sensor.is_numbered);
         run.delays.add(wall_ns.wrapping_sub(head.stamp_ns) as i64);
         let ahead_ns = run.delays.difference_ns().filter(|_| !run.delays.clocks_agree());
-        // Anyone who can send can invent more gateways.
+        // The number of reports is limited, because anyone who can send can invent gateways.
         let is_new = !gateway.is_clock_reported && self.reported_clocks < MAX_RUNS;
         if ahead_ns.is_some() && is_new {
             gateway.is_clock_reported = true;
@@ -372,8 +380,8 @@ impl GatewayTable {
         (ahead_ns.filter(|_| is_new), is_named)
     }
 
-    /// Returns the age of a sample that arrived at `wall_ns`, in ns. `None` while the difference of the clocks is
-    /// unknown, and if they differ too much.
+    /// Returns the age of a sample that arrived at `wall_ns`, in ns. `None` if the difference of the clocks is unknown
+    /// or too large.
     pub(super) fn age_ns(&self, head: &Head, wall_ns: u64) -> Option<u64> {
         self.run((head.hub, head.epoch)).filter(|run| run.delays.clocks_agree())?;
         wall_ns.checked_sub(head.stamp_ns)
@@ -390,7 +398,8 @@ impl GatewayTable {
         announced.map_or_else(|| format!("#{sensor}"), |announced| announced.sensor().to_owned())
     }
 
-    /// Returns the name of the sensor that sent `head`, which is printed now, as [`name`](Self::name) does.
+    /// Returns the name of the sensor that sent `head`, as [`name`](Self::name) does, for printing. If that is only a
+    /// number, records it, so that the name is reported later.
     pub(super) fn printed_name(&mut self, head: &Head) -> String {
         if let Some(run) = self.run_mut((head.hub, head.epoch)) {
             let sensor = run.sensors.entry(head.sensor).or_default();
@@ -399,8 +408,8 @@ impl GatewayTable {
         self.name(head.hub, head.epoch, head.sensor)
     }
 
-    /// Returns the name of the sensor of a row, as [`name`](Self::name) does, but `#` and its number if it had several
-    /// names, because the row counts the samples of each of them.
+    /// Returns the name of a row's sensor, as [`name`](Self::name) does. If the sensor's number had several names,
+    /// returns `#` and the number, because the row counts the samples under all of these names.
     pub(crate) fn row_name(&self, row: &StreamCounters) -> String {
         match self.sensor(row.hub, row.epoch, row.sensor) {
             Some(sensor) if sensor.is_renamed => format!("#{}", row.sensor),
@@ -408,8 +417,8 @@ impl GatewayTable {
         }
     }
 
-    /// Returns how many samples of the row's topic were replaced by newer ones before they were sent, as last
-    /// announced. `None` if that was not announced.
+    /// Returns how many samples of the row's topic were replaced by newer ones before they were sent, as the gateway
+    /// announced last. `None` if the gateway does not announce that.
     pub fn replaced(&self, row: &StreamCounters) -> Option<u32> {
         self.announced(row.hub, row.epoch, row.sensor)?.replaced(row.topic)
     }
@@ -422,7 +431,7 @@ impl GatewayTable {
     }
 
     /// Returns the gateways with samples that did not fit into the memory that remote sensors may use, and the number
-    /// of these samples. Those of forgotten gateways are in [`EvictedTotals::no_room`].
+    /// of these samples. Samples of forgotten gateways are counted in [`EvictedTotals::no_room`].
     pub fn no_room(&self) -> impl Iterator<Item = (u64, u64)> {
         let all = self.gateways.iter().map(|(hub, gateway)| (*hub, gateway.no_room));
         all.filter(|(_, no_room)| *no_room > 0)
@@ -439,8 +448,8 @@ impl GatewayTable {
         std::mem::take(&mut self.is_epoch_new).then(|| self.gateways.iter().filter_map(kept).collect())
     }
 
-    /// Keeps an authenticated epoch of `hub`. Anyone with the key can invent gateways, so the one that has been
-    /// known for longest is forgotten if there are too many.
+    /// Keeps an authenticated epoch of `hub`. Anyone with the key can invent gateways, so the number of epochs is
+    /// limited: the one that was stored first is forgotten.
     fn store_epoch(&mut self, hub: u64, epoch: u32) {
         let order = self.order();
         let gateway = self.gateways.entry(hub).or_default();
@@ -463,7 +472,8 @@ impl GatewayTable {
         }
     }
 
-    /// Returns the active run with this number and epoch; `None` if it is not known yet.
+    /// Returns the active run with this number and epoch; `None` if it is not known yet. Returns
+    /// [`DatagramError::Epoch`] if a run with a higher epoch is active.
     fn find(&self, (hub, epoch): RunId) -> Result<Option<&Run>, DatagramError> {
         match self.gateways.get(&hub).and_then(|gateway| gateway.runs.last_key_value()) {
             Some((active, _)) if *active > epoch => Err(DatagramError::Epoch),
@@ -485,12 +495,12 @@ impl GatewayTable {
     }
 
     /// Returns the row of the sensor that sent `head` for `topic`, or a new row that starts with `first`. `None` if
-    /// there is no room.
+    /// there is no room for a new row.
     fn row(&mut self, head: &Head, topic: u8, first: u32, arrival: Arrival) -> Option<&mut StreamCounters> {
         let Head { hub, epoch, sensor, .. } = *head;
         let known = self.sensor(hub, epoch, sensor);
         if known.is_none_or(|sensor| !sensor.rows.contains_key(&topic)) {
-            // Each run has at least one row.
+            // Evicting a run frees a row, because each run has at least one.
             if self.row_count == MAX_ROWS {
                 self.evict((hub, epoch), arrival)?;
             }
@@ -501,7 +511,8 @@ impl GatewayTable {
         Some(rows.entry(topic).or_insert_with(|| StreamCounters::new((hub, epoch, sensor, topic), first)))
     }
 
-    /// Returns whether there is room for another row of `run_id`, or a run that can be evicted for `arrival`.
+    /// Returns whether there is room for another row of `run_id`, or another run can be evicted for `arrival`.
+    /// `is_known` is false if the run itself is new.
     fn has_room(&self, run_id: RunId, is_known: bool, arrival: Arrival) -> bool {
         let (hub, epoch) = run_id;
         let is_full = self.row_count == MAX_ROWS || !is_known && self.run_count == MAX_RUNS;
@@ -510,13 +521,13 @@ impl GatewayTable {
     }
 
     /// Begins a run, and retires the active run of its gateway. If there are too many runs, evicts one of them, and
-    /// returns it. The caller has checked that there is room.
+    /// returns its ID. The caller has checked that there is room or a run to evict.
     fn begin(&mut self, run_id: RunId, arrival: Arrival) -> Option<RunId> {
         let (hub, epoch) = run_id;
         let order = self.order();
         let runs = &mut self.gateways.entry(hub).or_default().runs;
         if let Some(mut last) = runs.last_entry() {
-            // After the end of an active run, the last one retired before and keeps its order.
+            // If the active run was removed, the last entry is a run that retired before. It keeps its order.
             last.get_mut().retired.get_or_insert(order);
         }
         runs.insert(epoch, Run::new(arrival.now_ns, order));
@@ -524,8 +535,9 @@ impl GatewayTable {
         if self.run_count > MAX_RUNS { self.evict(run_id, arrival) } else { None }
     }
 
-    /// Evicts a run to make room for `run_id`, to which `arrival` belongs, and returns it. Returns `None` if all other
-    /// runs are active and known to deliver, or if they have just delivered and `arrival` is not a sample.
+    /// Evicts a run to make room for `run_id`, to which `arrival` belongs, and returns the ID of the evicted run.
+    /// Returns `None` if all other runs are active and none of them may be evicted, see
+    /// [`EvictionRank::may_be_evicted`].
     fn evict(&mut self, run_id: RunId, arrival: Arrival) -> Option<RunId> {
         let (evicted, is_active) = self.next_evicted(run_id, arrival)?;
         self.end(evicted, is_active);
@@ -566,7 +578,7 @@ impl GatewayTable {
         self.row_count -= run.rows().count();
     }
 
-    /// Forgets a gateway without runs, unless its epoch is kept or the difference of its clock was reported. Adds its
+    /// Forgets a gateway without runs, unless its epoch is kept or it was reported that its clock differs. Adds its
     /// counter to the totals.
     fn remove_if_unused(&mut self, hub: u64) {
         let is_unused = |gateway: &Gateway| {
@@ -585,7 +597,7 @@ impl GatewayTable {
 }
 
 impl Gateway {
-    /// Returns whether its active run has a lower epoch.
+    /// Returns whether the gateway's active run has a lower epoch than `epoch`.
     fn has_before(&self, epoch: u32) -> bool {
         self.runs.last_key_value().is_some_and(|(active, _)| *active < epoch)
     }
@@ -610,13 +622,13 @@ impl Run {
 /// Kind and time of a received datagram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Arrival {
-    /// Whether it is a sample rather than an announcement.
+    /// Whether the datagram is a sample rather than an announcement.
     pub(super) is_sample: bool,
     /// Time of arrival, in ns of a clock that is never set.
     pub(super) now_ns: u64,
 }
 
-/// Rank of a run when there is no room for another one.
+/// Rank by which runs are compared if one of them must be evicted to make room for another run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct EvictionRank {
     last_datagram_ns: u64,
@@ -624,9 +636,9 @@ pub(super) struct EvictionRank {
     delivered_ns: Option<(u64, u64)>,
 }
 
-/// Minimum time between the first and the last sample of a run that is known to deliver.
+/// Minimum time between the first and the last sample of a run that is known to deliver, in ns.
 const MIN_PROVEN_NS: u64 = 1_000_000_000;
-/// Time after its last sample for which a run that is known to deliver keeps its rank.
+/// Time for which a run that is known to deliver keeps its rank after its last sample, in ns.
 const RANK_LIFETIME_NS: u64 = 60_000_000_000;
 
 impl EvictionRank {
@@ -642,8 +654,9 @@ impl EvictionRank {
         }
     }
 
-    /// Returns whether the run may be evicted for a run that `arrival` belongs to. It may if it has not delivered for 3
-    /// s. For a sample, it also may if it has delivered for less than a second.
+    /// Returns whether this run may be evicted for the run to which `arrival` belongs. A run may be evicted if it has
+    /// not delivered for 3 s. If `arrival` is a sample, a run that has delivered for less than a second may be evicted,
+    /// too.
     pub(super) fn may_be_evicted(&self, arrival: Arrival) -> bool {
         let silent_ns = |(_, last_ns): (u64, u64)| arrival.now_ns.saturating_sub(last_ns);
         let is_busy = self.delivered_ns.is_some_and(|delivered_ns| silent_ns(delivered_ns) < SILENCE_NS);
@@ -666,17 +679,18 @@ impl EvictionRank {
 }
 
 /// Delays of the last announcements of a run. An announcement is stamped when it is sent, so its delay is the transit
-/// time plus the difference of the clocks. The shortest one is the least disturbed.
+/// time plus the difference of the clocks. The shortest delay is used, because the network has disturbed it least.
 #[derive(Default)]
 struct Delays {
     last_ns: [i64; MAX_DELAYS],
     count: usize,
 }
 
-/// Number of announcements that count: those of two sensors in the last five seconds.
+/// Number of announcements whose delays are kept. For a gateway with two sensors, these are the announcements of five
+/// seconds.
 const MAX_DELAYS: usize = 10;
-/// Maximum difference of clocks that are treated as one. An age is at least the time of a telegram on its line, which
-/// is 15 ms or more.
+/// Maximum difference, in ns, of clocks that are treated as one. The difference is an error of the age of a sample.
+/// That age is at least the time that a telegram takes on its line, which is 15 ms or more.
 const MAX_CLOCK_DIFFERENCE_NS: u64 = 20_000_000;
 
 impl Delays {
@@ -911,7 +925,7 @@ mod tests {
         for n in 0..30 {
             assert_eq!(hear(1, &zones(head(5, 1, 200 + n)), 100 * u64::from(n)), Ok(SequenceStatus::New));
         }
-        // Its numbers start again, and none of the first gateway's numbers count as lost.
+        // The numbers of the second gateway start a new run, and no numbers in between count as lost.
         assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(DatagramError::Twin));
         assert_eq!(hear(2, &zones(head(5, 1, 101)), 5900), Ok(SequenceStatus::New));
         assert!(!table.is_shared(5, 1), "a new run");
@@ -942,7 +956,8 @@ mod tests {
         let damaged = head(5, 3, 0).seal(&mut buffer, 3).unwrap();
         assert_eq!(fresh(&mut table, damaged), Err(DatagramError::Payload));
         assert!(knows(&table, 5, 2) && !knows(&table, 5, 3));
-        // Fills the table with sensors of a run that then retires. One more row evicts it.
+        // Fill the table with sensors of four runs. One of these runs then retires, and the row of its next run evicts
+        // it.
         for sensor in 1..=240 {
             for hub in 0..4 {
                 let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
@@ -1013,8 +1028,8 @@ mod tests {
         assert_eq!(receive(&mut table, (1, 1), delivers(0)), None);
         assert_eq!(receive(&mut table, (2, 1), delivers(0)), None);
         for n in 1..30_000 {
-            // One gateway delivers ten times a second, the other one delivered once. Every millisecond, an attacker
-            // invents another.
+            // Gateway 1 delivers ten times a second. Gateway 2 has delivered once. Every millisecond, an attacker
+            // invents a further gateway.
             if n % 100 == 0 {
                 assert_eq!(receive(&mut table, (1, 1), delivers(n)), None, "{n}");
             }
@@ -1133,7 +1148,7 @@ mod tests {
         let counted = table.evicted().no_room + table.no_room().map(|(_, count)| count).sum::<u64>();
         assert_eq!(counted, 3);
         assert_eq!(announce(&mut table, 5, 2, 1_000), None, "reported before");
-        // Any number of gateways with other clocks are reported up to a limit, and take no more memory.
+        // However many gateways have other clocks, the number that is reported and kept is limited.
         let reported = (1_000..2_000).filter(|&hub| announce(&mut table, hub, 1, hub).is_some()).count();
         assert_eq!(reported, MAX_RUNS - 1);
         assert!(table.gateways.len() <= 2 * MAX_RUNS, "{}", table.gateways.len());

@@ -1,9 +1,9 @@
-//! Receiving end of a network: it refuses each datagram, records it in the table of gateways, or returns a new sample
-//! with everything that is known about its sender.
+//! Receiving end of a network. It refuses a datagram, or records it in the table of gateways. A new sample is returned
+//! together with everything that is known about its sender.
 //!
-//! With a key, only datagrams that are authenticated with it are accepted. A recording of such datagrams is refused
-//! when it is sent again: a sensor is accepted once an announcement arrives that was sent just now, by this machine's
-//! clock. From then on, sequence numbers only increase.
+//! With a key, only datagrams that are authenticated with that key are accepted. Recorded datagrams that are sent again
+//! are refused: a sensor is accepted only after an announcement that was sent just now, by this machine's clock. From
+//! then on, each sequence number is accepted once, and none that was used before that announcement.
 
 use std::collections::HashMap;
 
@@ -21,11 +21,12 @@ pub struct Incoming {
     gateways: GatewayTable,
     reassembler: Reassembler,
     key: Option<Key>,
-    /// Gateways whose datagrams are received; empty: all.
+    /// Gateways whose datagrams are received. If the list is empty, datagrams of all gateways are received.
     hubs: Vec<u64>,
 }
 
-/// Maximum difference of the clocks for the first announcement of a sensor, if there is a key.
+/// Maximum difference, in ns, between this machine's clock and the stamp of a sensor's first announcement, if there is
+/// a key.
 const MAX_FIRST_CLOCK_DIFFERENCE_NS: u64 = 5_000_000_000;
 
 /// Result of receiving a datagram.
@@ -34,18 +35,19 @@ pub enum ReceiveOutcome<'a> {
     Refused {
         /// Reason under which it is counted.
         reason: DatagramError,
-        /// Number of the gateway, if two are known to send under it.
+        /// Number of the gateway, if two gateways are known to send under this number.
         shared: Option<u64>,
     },
-    /// The datagram was refused: it is the first announcement of a sensor and is authenticated, but its stamp is off.
-    /// The clocks differ, or it was recorded.
+    /// The datagram was refused: it is the first announcement of a sensor and is authenticated, but its stamp differs
+    /// too much from this machine's clock. Either the clocks differ, or the announcement was recorded earlier and sent
+    /// again.
     Untimely {
         /// This machine's clock minus the stamp, in ns.
         behind_ns: i64,
     },
-    /// The datagram comes from a gateway that is not received. It is not counted.
+    /// The datagram comes from a gateway that is not among those to receive from. It is not counted.
     Ignored,
-    /// The datagram is not one that may be sent under the name that it arrived under. It is not counted.
+    /// The datagram arrived under a name that does not match its content. It is not counted.
     Foreign,
     /// A part of a sample that is not complete yet.
     Part,
@@ -65,11 +67,12 @@ pub struct Announcement {
     pub announce: Announce,
     /// CLOCK_MONOTONIC of this machine at its arrival, in ns.
     pub arrival_ns: u64,
-    /// Whether a run of its gateway begins with it.
+    /// Whether a run of the gateway begins with this datagram.
     pub begins: bool,
-    /// Whether the sensor was printed under its number before, and has this name now.
+    /// Whether the sensor was printed under its number before, and its name is known now.
     pub is_named: bool,
-    /// This machine's clock minus the gateway's, in ns, if they differ. Reported once for each gateway.
+    /// This machine's clock minus the gateway's, in ns, if the clocks differ. It is present in only one announcement of
+    /// each gateway.
     pub behind_ns: Option<i64>,
     /// Whether its gateway has the key, or has delivered samples for a second or more.
     pub is_proven: bool,
@@ -81,20 +84,21 @@ pub struct RemoteSample<'a> {
     pub remote: ReceivedSample<'a>,
     /// Last announcement of its sensor.
     pub announced: Option<Announce>,
-    /// Whether a run of its gateway begins with it.
+    /// Whether a run of the gateway begins with this datagram.
     pub begins: bool,
-    /// Samples of its topic that were sent before it and have not arrived; 0 if it is late.
+    /// Number of samples of the topic that were sent between the previous sample and this one, and have not arrived; 0
+    /// for a late sample.
     pub missed: u32,
     /// Whether its gateway has the key, or has delivered samples for a second or more.
     pub is_proven: bool,
 }
 
-/// Payload of a sample as in a datagram. It is valid for its topic.
+/// Payload of a sample in the form that it has in a datagram. It was checked, and is valid for its topic.
 #[derive(Clone, Copy, Debug)]
 pub struct CheckedPayload<'a> {
     /// The payload as it was received.
     pub bytes: &'a [u8],
-    /// Bytes of memory that it fills, as [`DatagramPayload::room`] returned when it was checked.
+    /// Bytes of memory that the payload fills when it is unpacked, as [`DatagramPayload::room`] returned.
     pub room: usize,
 }
 
@@ -113,15 +117,16 @@ pub struct ReceivedSample<'a> {
     pub arrival_ns: u64,
     /// Age at its arrival, in ns, if the clocks agree.
     pub age_ns: Option<u64>,
-    /// Whether it arrived after a newer one.
+    /// Whether the sample arrived after a newer one of its topic.
     pub late: bool,
-    /// Whether it has a MAC of the receiver's key.
+    /// Whether it was authenticated with the receiver's key.
     pub authenticated: bool,
 }
 
 impl ReceivedSample<'_> {
-    /// Returns the header of the sample when process `pid` publishes it here. Its stamps are those of the arrival, and
-    /// the sensor's is in `wall_ns`. It has no period, because a gateway may leave out samples.
+    /// Returns the header with which process `pid` publishes the sample on this machine. Its stamps are the time of
+    /// arrival, and `wall_ns` is the stamp from the datagram. The header has no period, because a gateway may thin out
+    /// samples.
     pub fn header(&self, pid: u32) -> Header {
         let head = &self.head;
         let quality = if head.flags & LanFlags::SUSPECT != 0 { Quality::Suspect } else { Quality::Clean };
@@ -144,7 +149,7 @@ impl ReceivedSample<'_> {
 }
 
 impl CheckedPayload<'_> {
-    /// Returns the payload as a value, whose type is that of the topic. `None` if there is too little memory.
+    /// Returns the payload as a value. `P` must be the payload type of the topic. `None` if there is too little memory.
     pub fn unpack<P: DatagramPayload + ?Sized>(&self) -> Option<Box<P>>
     where
         Box<P>: Default,
@@ -156,7 +161,7 @@ impl CheckedPayload<'_> {
 }
 
 impl ReceiveOutcome<'_> {
-    /// Returns the header of a datagram with which a run of its gateway begins.
+    /// Returns the header of the datagram if a run of its gateway begins with it.
     pub fn begins(&self) -> Option<&Head> {
         match self {
             ReceiveOutcome::Announced(announced) if announced.begins => Some(&announced.head),
@@ -174,25 +179,25 @@ impl Incoming {
         Incoming { gateways, reassembler: parts, key: None, hubs: Vec::new() }
     }
 
-    /// Creates a receiving end that accepts only what is authenticated with `key`. `epochs` has the highest epoch of
-    /// each gateway that was received before, see [`take_epochs`](Incoming::take_epochs).
+    /// Creates a receiving end that accepts only datagrams that are authenticated with `key`. `epochs` has the highest
+    /// epoch of each gateway that was received before, see [`take_epochs`](Incoming::take_epochs).
     pub fn with_key(topics: &[Topic], key: Key, epochs: HashMap<u64, u32>) -> Incoming {
         let end = Incoming::new(topics);
         Incoming { gateways: end.gateways.with_key(epochs), key: Some(key), ..end }
     }
 
-    /// Receives only from these gateways; if there are none, from all.
+    /// Receives only from the gateways in `hubs`, or from all gateways if `hubs` is empty.
     pub fn with_hubs(self, hubs: Vec<u64>) -> Incoming {
         Incoming { hubs, ..self }
     }
 
-    /// Returns the highest authenticated epochs of all gateways, which must outlive this process, if one is new since
-    /// the last call.
+    /// Returns the highest authenticated epoch of each gateway, if one of them is new since the last call. The caller
+    /// must save them for the next process.
     pub fn take_epochs(&mut self) -> Option<HashMap<u64, u32>> {
         self.gateways.take_epochs()
     }
 
-    /// Returns the gateways, and everything that was counted.
+    /// Returns the table of gateways, with all counters.
     pub fn gateways(&self) -> &GatewayTable {
         &self.gateways
     }
@@ -202,7 +207,7 @@ impl Incoming {
         self.gateways.count_no_room(hub);
     }
 
-    /// Returns the name of the sensor that sent `head`, which is printed now: its name, or `#` and its number.
+    /// Returns the name of the sensor that sent `head`, for printing: its name, or `#` and its number.
     pub(crate) fn printed_name(&mut self, head: &Head) -> String {
         self.gateways.printed_name(head)
     }
@@ -219,7 +224,8 @@ impl Incoming {
         self.receive_named(bytes, None, from, arrival, whole)
     }
 
-    /// Does the same as [`receive`](Incoming::receive) for a network that delivers datagrams under a `name`.
+    /// Does the same as [`receive`](Incoming::receive), for a network that delivers each datagram under a name. A
+    /// datagram whose content does not match `name` is not handled.
     pub fn receive_named<'a>(
         &mut self,
         bytes: &'a [u8],
@@ -228,7 +234,7 @@ impl Incoming {
         arrival: WallTimestamp,
         whole: &'a mut Vec<u8>,
     ) -> ReceiveOutcome<'a> {
-        // The only place where a checksum is computed.
+        // Checksums are checked only here.
         let read = Datagram::read(bytes);
         if let Ok(datagram) = &read {
             if name.is_some_and(|name| !name.is_of(datagram, &self.gateways)) {
@@ -272,8 +278,8 @@ impl Incoming {
         }
     }
 
-    /// Checks that `datagram`, which was read from `bytes`, is authenticated and cannot be a recorded one, if there is
-    /// a key.
+    /// If there is a key, checks that `datagram`, which was read from `bytes`, is authenticated. Also refuses the
+    /// datagram if its epoch, or the stamp of a sensor's first announcement, shows that it may be a recorded one.
     fn check_key(
         &self,
         bytes: &[u8],
@@ -293,8 +299,8 @@ impl Incoming {
         Ok(())
     }
 
-    /// Returns the complete sample of `datagram`: itself, or the sample that it is the last part of, which is written
-    /// to `whole`.
+    /// Returns the sample that `datagram` completes. That is `datagram` itself, unless it is a part: then the whole
+    /// sample is written to `whole`. `None` if further parts of the sample are missing.
     fn complete<'a>(
         &mut self,
         datagram: Datagram<'a>,
@@ -309,7 +315,7 @@ impl Incoming {
         Ok(complete.map(|head| Datagram { head, payload: whole, mac: None }))
     }
 
-    /// Handles a datagram that was not received before.
+    /// Handles a datagram that was accepted and is not a duplicate.
     fn on_accepted<'a>(
         &mut self,
         datagram: &Datagram<'a>,
@@ -320,7 +326,7 @@ impl Incoming {
         let (begins, arrival_ns) = (accepted.begins, arrival.monotonic_ns);
         let is_proven = self.key.is_some() || self.gateways.is_proven(head.hub, head.epoch);
         let Some(topic) = Topic::of_number(head.topic) else {
-            // A newer announcement supersedes a late one.
+            // A late announcement is ignored, because a newer one arrived before it.
             let Some(announce) = accepted.announce.filter(|_| !late) else {
                 return ReceiveOutcome::Duplicate;
             };
@@ -336,7 +342,7 @@ impl Incoming {
             });
         };
         let announced = self.gateways.announced(head.hub, head.epoch, head.sensor).copied();
-        // Bytes after a telegram belong to a later revision.
+        // Bytes after the telegram belong to fields of a later revision.
         let (room, is_telegram) = (accepted.room, topic == Topic::Telegram);
         let bytes = if is_telegram { &datagram.payload[..room] } else { datagram.payload };
         let remote = ReceivedSample {
@@ -379,12 +385,13 @@ mod tests {
         head.seal_with(&mut buffer, len, |covered| key().mac(covered)).unwrap().to_vec()
     }
 
-    /// Announces sensor 0 at `at_s` of the gateway's clock, which has `next` zones.
+    /// Returns an announcement of sensor 0 that was sent at `at_s` of the gateway's clock. `next` is the next number of
+    /// the zones.
     fn announcement(epoch: u32, sequence: u32, at_s: u64, next: u32) -> Vec<u8> {
         announced_of(1, epoch, sequence, at_s, next)
     }
 
-    /// Announces sensor 0 in this run of its hub.
+    /// Returns an announcement of sensor 0 with `boot` as the run of its hub.
     fn announced_of(boot: u64, epoch: u32, sequence: u32, at_s: u64, next: u32) -> Vec<u8> {
         let mut announce = Announce::new(boot, "front", "");
         let topic = Topic::Zones;
@@ -440,7 +447,7 @@ mod tests {
         let mut incoming = listener(&[]);
         let again = recorded.each_ref().map(|bytes| receive(&mut incoming, bytes, 200));
         assert_eq!(again, [Some(DatagramError::Untimely); 3], "the gateway has exited");
-        // The gateway continues. Its announcement is accepted, but nothing that was sent before it.
+        // The gateway continues. Its announcement is accepted, but nothing that was sent before that announcement.
         assert_eq!(receive(&mut incoming, &zones(1, 90), 200), Some(DatagramError::Untimely));
         assert_eq!(receive(&mut incoming, &announcement(1, 50, 200, 91), 203), None);
         assert_eq!(receive(&mut incoming, &zones(1, 91), 203), None);
@@ -509,7 +516,7 @@ mod tests {
         assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 40), 100), None);
         assert_eq!(receive(&mut incoming, &part(39, 0), 100), Some(DatagramError::Stale));
         assert_eq!([0, 1].map(|at| receive(&mut incoming, &part(40, at), 100)), [None; 2]);
-        // A new partial sample is kept, no matter how many complete ones are sent again in the meantime.
+        // A new partial sample is kept, no matter how many complete samples are sent again in the meantime.
         assert_eq!(receive(&mut incoming, &part(60, 0), 101), None);
         for sequence in (41..50).chain(52..60) {
             [0, 1].iter().for_each(|&at| assert_eq!(receive(&mut incoming, &part(sequence, at), 101), None));
@@ -523,7 +530,7 @@ mod tests {
         assert_eq!((received, incoming.gateways().refused(DatagramError::Stale)), (19, 1));
     }
 
-    /// A datagram with zones of gateway 5, without a MAC.
+    /// Returns a datagram with zones of gateway 5, without a MAC.
     fn plain_zones(epoch: u32, sequence: u32) -> Vec<u8> {
         let mut buffer = [0; 100];
         let len = Zones::unknown().pack(&mut buffer[HEADER_LEN..]).unwrap();

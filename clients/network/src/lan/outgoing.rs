@@ -1,8 +1,8 @@
 //! Sending end of a network: it converts samples of a hub's sensors to complete datagrams, thinned and numbered, and
 //! announces the sensors.
 //!
-//! A sample is an argument, and so is the time. Datagrams go to a [`Transmit`] at once, or wait until
-//! [`Outgoing::take_next`] takes them.
+//! Samples and time are arguments. Datagrams go to a [`Transmit`] at once, or wait until [`Outgoing::take_next`] takes
+//! them.
 
 mod datagram_writer;
 mod sensor;
@@ -30,9 +30,10 @@ pub const ANNOUNCEMENT_INTERVAL: Duration = Duration::from_secs(1);
 /// A sample of a topic, or a silence.
 #[derive(Clone, Copy, Debug)]
 pub struct Sample<'a> {
-    /// Header of the sample. `None` for a silence: the payload then says that nothing is known, and no hub has sent it.
+    /// Header of the sample. `None` for a silence: the payload does not come from a hub, and states that the verdict is
+    /// unknown.
     pub header: Option<&'a Header>,
-    /// Samples of the topic that were sent before it and were not received here.
+    /// Number of samples of the topic that the hub sent before this one, and that were missed here.
     pub missed: u64,
     /// Payload, which determines the topic.
     pub payload: PayloadRef<'a>,
@@ -65,21 +66,21 @@ macro_rules! payloads {
 scanhub_schema::for_each_topic!(payloads);
 
 impl Outgoing {
-    /// Creates the end of gateway `hub` in its run `epoch`. Its datagrams have at most `longest` bytes, and never more
-    /// than [`MTU_ETHERNET`](scanhub_schema::datagram::MTU_ETHERNET).
+    /// Creates the sending end of gateway `hub` in its run `epoch`. Datagrams have at most `longest` bytes, and never
+    /// more than [`MTU_ETHERNET`](scanhub_schema::datagram::MTU_ETHERNET).
     pub fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> Outgoing {
         Outgoing { writer: DatagramWriter::new(hub, epoch, form, longest), sensors: Vec::new() }
     }
 
-    /// Creates the end of gateway `hub` in its run `epoch` for a connection that is slow at times: the newest sample of
-    /// each sensor and topic waits until [`take_next`](Outgoing::take_next) takes it. A sample is one datagram, however
-    /// long it is.
+    /// Creates the sending end of gateway `hub` in its run `epoch` for a connection that is slow at times. The newest
+    /// sample of each sensor and topic waits until [`take_next`](Outgoing::take_next) takes it. Each sample is one
+    /// datagram, however long the sample is.
     pub fn with_queue(hub: u64, epoch: u32) -> Outgoing {
         Outgoing { writer: DatagramWriter::with_queue(hub, epoch), sensors: Vec::new() }
     }
 
-    /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent.
-    /// Returns the sensor's position, which identifies it from now on.
+    /// Adds the sensor called `name`. `every` returns the thinning factor of a topic, or `None` if the topic is not
+    /// sent. Returns the sensor's position, which identifies it from now on.
     pub fn follow(&mut self, name: &str, every: impl Fn(Topic) -> Option<NonZeroU64>) -> usize {
         self.sensors.push(Sensor::new(name, every));
         self.sensors.len() - 1
@@ -90,21 +91,22 @@ impl Outgoing {
         self.sensors.iter().position(|sensor| sensor.name == name)
     }
 
-    /// Returns whether samples of this topic are needed, because they are sent or an announcement contains something of
-    /// them.
+    /// Returns whether samples of `topic` are needed, because they are sent, or because announcements contain a value
+    /// from them.
     pub fn needs(&self, sensor: usize, topic: Topic) -> bool {
         let is_announced = self.writer.announces();
         self.sensors[sensor].sends(topic) || is_announced && topic == Topic::Status
     }
 
-    /// Sends a sample of the sensor at this position, or a silence of its zones, to `to`. Before the first sample of a
-    /// run of the hub, it sends an announcement. It sends nothing if the sample is thinned out, is a background that
+    /// Sends a sample of the sensor at this position, or a silence of its zones, to `to`. Before the first sample of
+    /// each run of the hub, an announcement is sent. Nothing is sent if the sample is thinned out, is a background that
     /// was sent before, or comes from another machine.
     pub fn sample(&mut self, sensor: usize, sample: &Sample<'_>, now: WallTimestamp, to: &mut impl Transmit) {
         self.sensors[sensor].send(sample, now, &mut self.writer, to);
     }
 
-    /// Announces all sensors that have sent a sample. Call it every [`ANNOUNCEMENT_INTERVAL`], and at the end.
+    /// Announces all sensors that have sent a sample. Call this method every [`ANNOUNCEMENT_INTERVAL`], and at the end
+    /// of the run.
     pub fn announce(&mut self, now: WallTimestamp, to: &mut impl Transmit) {
         self.sensors.iter().for_each(|sensor| sensor.announce(now, &mut self.writer, to));
     }
@@ -114,8 +116,8 @@ impl Outgoing {
         self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.writer, to));
     }
 
-    /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none
-    /// waits.
+    /// Takes the sample that has waited for longest, numbers it, and returns its datagram for sending at `now`. `None`
+    /// if no sample waits.
     pub fn take_next(&mut self, now: WallTimestamp) -> Option<QueuedSample<'_>> {
         self.writer.take_next(now)
     }
@@ -126,14 +128,14 @@ impl Outgoing {
     }
 
     /// Counts the last sample that [`take_next`](Outgoing::take_next) returned for this sensor and topic, of `bytes`
-    /// bytes, as failed. Its number stays in use.
+    /// bytes, as failed. Its sequence number is not used again.
     pub fn mark_failed(&mut self, sensor: u8, topic: Option<Topic>, bytes: usize) {
         self.writer.mark_failed(sensor, topic, bytes);
     }
 
-    /// Returns the announcement (no topic), the status or the background of the sensor called `name` that
-    /// [`take_next`](Outgoing::take_next) returned last, for a receiver that queries it at `now`. It has the number
-    /// that it had before, so that receivers count it once.
+    /// Returns the datagram that [`take_next`](Outgoing::take_next) returned last for the sensor called `name` and
+    /// `topic`: its status, its background or, without a topic, its announcement. Call this method when a receiver
+    /// queries the datagram, at `now`. The datagram keeps its sequence number, so that receivers count it once.
     pub fn resend_last(&mut self, name: &str, topic: Option<Topic>, now: WallTimestamp) -> Option<&[u8]> {
         self.writer.resend_last(name, topic, now)
     }
@@ -144,13 +146,13 @@ impl Outgoing {
         self.writer.stored_samples()
     }
 
-    /// Drops the samples that [`resend_last`](Outgoing::resend_last) returns.
+    /// Drops the samples that are kept for [`resend_last`](Outgoing::resend_last).
     pub fn drop_kept(&mut self) {
         self.writer.drop_kept();
     }
 
-    /// Returns whether samples wait, so that newer ones may replace them. Announcements then contain the number of
-    /// replaced samples.
+    /// Returns whether there is a queue, in which newer samples replace older ones. Announcements then contain the
+    /// number of replaced samples.
     pub(crate) fn announces_replaced(&self) -> bool {
         self.writer.counts_replaced()
     }
@@ -160,7 +162,7 @@ impl Outgoing {
         self.writer.max_datagram_len()
     }
 
-    /// Returns the counters of each sensor, by its number in the hub.
+    /// Returns the counters of each sensor, in the order of the sensors' numbers in the hub.
     pub fn counters(&self) -> impl Iterator<Item = &SensorStats> {
         self.writer.sensors()
     }
@@ -170,7 +172,7 @@ impl Outgoing {
         self.writer.oversized_samples()
     }
 
-    /// Returns a `SENSOR/TOPIC` whose samples do not all fit into datagrams, each of them once.
+    /// Returns the `SENSOR/TOPIC` of a sample that did not fit into datagrams. Returns each name only once.
     pub(crate) fn take_oversized(&mut self) -> Option<String> {
         self.writer.take_oversized()
     }

@@ -3,29 +3,29 @@
 
 use scanhub_schema::datagram::{Datagram, Head, MAX_PART_LEN};
 
-/// Samples that are not complete yet. A sample that is evicted for another one is not reported: its number did not
-/// arrive.
+/// Samples that are not complete yet. A sample that is evicted is not reported here: it counts as lost, because its
+/// sequence number never arrives.
 #[derive(Default)]
 pub(super) struct Reassembler {
     partial: Vec<PartialSample>,
-    /// Samples whose memory is used again.
+    /// Finished or evicted samples, whose memory is used for the next ones.
     free: Vec<PartialSample>,
-    /// Parts that arrived.
+    /// Number of parts that have arrived.
     count: u64,
 }
 
 /// A sample with missing parts.
 struct PartialSample {
-    /// Header of its parts, with the index of the first one.
+    /// Header of the sample's parts, with 0 as the index of the part.
     head: Head,
     from: u64,
     /// Whether the sample is a duplicate.
     is_known: bool,
-    /// Value of [`Reassembler::count`] at its last part.
+    /// Value of [`Reassembler::count`] when the last part of this sample arrived.
     last: u64,
-    /// Length of each part that arrived.
+    /// Length of each part; `None` for a missing part.
     lengths: Vec<Option<usize>>,
-    /// The parts, each with room for the longest one.
+    /// Bytes of all parts. Each part has room for the maximum length.
     bytes: Vec<u8>,
 }
 
@@ -35,7 +35,7 @@ const MAX_PER_TOPIC: usize = 4;
 const MAX_TOTAL: usize = 64;
 
 impl Reassembler {
-    /// Takes a part from the sender `from`. `is_known` is true if its sample is a duplicate. Once the sample is
+    /// Takes a part from the sender `from`. `is_known` is true if the sample is a duplicate. Once the sample is
     /// complete, writes it to `whole`, and returns its header.
     pub(super) fn take(
         &mut self,
@@ -69,9 +69,9 @@ impl Reassembler {
         Some(Head { parts: 1, ..head })
     }
 
-    /// Adds a sample, and returns its index. If there is no room, it replaces a sample with the same number and another
-    /// header, the one of its topic that has waited for longest, or the one of all. A duplicate never replaces a new
-    /// sample.
+    /// Adds a sample, and returns its index. It replaces a sample of its topic that has the same number but another
+    /// header. If there is no room, it evicts the sample of its topic, or of all topics, that has waited for longest.
+    /// Duplicates are evicted first. Returns `None` if a duplicate would evict a sample that is not a duplicate.
     fn begin(&mut self, head: Head, from: u64, is_known: bool) -> Option<usize> {
         let topic = |it: &PartialSample| (it.from, it.head.hub, it.head.epoch, it.head.sensor, it.head.topic);
         let of_topic = (from, head.hub, head.epoch, head.sensor, head.topic);

@@ -1,6 +1,5 @@
-//! Publishes the sensors of other machines in the domain of this one, so that programs can subscribe to them like to
-//! those of a hub. Samples come from [`Incoming`](super::incoming::Incoming), and where topics are created is up to a
-//! [`TopicStore`].
+//! Publishes remote sensors in a domain of this machine, so that programs can subscribe to them as to the sensors of a
+//! hub. Samples come from [`Incoming`](super::incoming::Incoming). Topics are created in a [`TopicStore`].
 
 mod remote_sensor;
 
@@ -24,7 +23,7 @@ pub struct Republisher<S: TopicStore> {
     /// Whether topics are created only for sensors of a gateway that is known to deliver.
     only_proven: bool,
     candidates: Candidates,
-    /// Number of sensors that may still be evicted, and the time at which it increases by 1.
+    /// Number of sensors that may be evicted now. It increases by 1 at `next_credit_ns`.
     eviction_credit: usize,
     next_credit_ns: u64,
     next_history_ns: u64,
@@ -52,11 +51,12 @@ pub struct DroppedSamples {
     pub no_room: u64,
 }
 
-/// Maximum number of sensors. Anyone who can send to the network can announce some.
+/// Maximum number of published sensors. It is limited because anyone who can send to the network can announce sensors.
 pub(crate) const MAX_SENSORS: usize = 16;
 
-/// Interval at which one more sensor may be evicted, after as many as there is room for. An eviction takes
-/// milliseconds, and anyone who can send can cause it.
+/// Interval at which one more sensor may be evicted, in ns. Evictions that are not used are saved, up to
+/// [`MAX_SENSORS`] of them. The rate is limited because an eviction takes milliseconds, and anyone who can send can
+/// cause one.
 const EVICTION_CREDIT_INTERVAL_NS: u64 = 250_000_000;
 
 /// Interval at which late joiners receive the last status, zones and background.
@@ -66,7 +66,7 @@ const HISTORY_INTERVAL_NS: u64 = 100_000_000;
 const CLEANUP_INTERVAL_NS: u64 = 5_000_000_000;
 
 impl<S: TopicStore> Republisher<S> {
-    /// Creates the publisher of process `pid` at `now_ns`. It creates topics in `store`.
+    /// Creates the publisher of process `pid` at `now_ns`. The publisher creates topics in `store`.
     pub fn new(store: S, pid: u32, now_ns: u64) -> Republisher<S> {
         Republisher {
             sensors: Vec::new(),
@@ -83,13 +83,13 @@ impl<S: TopicStore> Republisher<S> {
         }
     }
 
-    /// Creates topics only for sensors whose gateway has the key, or has delivered for a second.
+    /// Makes the publisher create topics only for sensors whose gateway has the key, or has delivered for a second.
     pub fn only_proven(self) -> Republisher<S> {
         Republisher { only_proven: true, ..self }
     }
 
-    /// Handles the start of a gateway's run with `head`. Published sensors with the same epoch belong to another
-    /// gateway.
+    /// Handles the start of a gateway's run with the datagram of `head`. Published sensors with the same number and
+    /// epoch belong to another gateway, so they are retired.
     pub fn on_run_started(&mut self, head: &Head, now: WallTimestamp) {
         self.sensors
             .iter_mut()
@@ -97,8 +97,8 @@ impl<S: TopicStore> Republisher<S> {
             .for_each(|sensor| sensor.retire(now));
     }
 
-    /// Handles an announcement of the gateway that is called `hub`: creates the missing topics of its sensor. Returns
-    /// the sensor's name here once all of them exist.
+    /// Handles an announcement of the gateway that is called `hub`: creates the missing topics of the announced sensor.
+    /// When all of them exist, returns the sensor's name on this machine, but only once.
     ///
     /// # Errors
     ///
@@ -118,9 +118,9 @@ impl<S: TopicStore> Republisher<S> {
         made
     }
 
-    /// Publishes `sample`, or counts it in [`dropped`](Self::dropped). Creates its topics as
-    /// [`on_announcement`](Self::on_announcement) does if its gateway is known to deliver since this sample. If there
-    /// is no room for its sensor, another one may be evicted.
+    /// Publishes `sample`, or counts it in [`dropped`](Self::dropped). If the gateway is known to deliver since this
+    /// sample, first creates the sensor's topics, as [`on_announcement`](Self::on_announcement) does. If there is no
+    /// room for the sensor, another sensor may be evicted. `hub` returns the gateway's name.
     ///
     /// # Errors
     ///
@@ -173,16 +173,18 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.iter().map(RemoteSensor::failed).sum()
     }
 
-    /// Returns the names of the sensors here.
+    /// Returns the names of the published sensors.
     pub fn names(&self) -> Vec<&str> {
         self.sensors.iter().map(|sensor| sensor.name.as_str()).collect()
     }
 
-    /// Creates the missing topics of the sensor in `announce`, from the gateway that is called `hub`. Returns the
-    /// sensor's name here once all of them exist. A sensor that had its number before loses it, even if there is no
-    /// room for this one, so that no sample is published under another sensor's name.
+    /// Creates the missing topics of the sensor in `announce`, from the gateway that is called `hub`. When all of them
+    /// exist, returns the sensor's name on this machine, but only once. Another sensor that had the same number before
+    /// is retired, even if there is no room for the new one, so that no sample is published under another sensor's
+    /// name.
     ///
-    /// If there is no room, a sample evicts another sensor that is not known to deliver. An announcement does not.
+    /// If there is no room and `arrival` is a sample, evicts another sensor whose rank permits that. An announcement
+    /// evicts none.
     fn create_sensor(
         &mut self,
         head: &Head,
@@ -198,7 +200,7 @@ impl<S: TopicStore> Republisher<S> {
         }
         let at = self.sensors.iter().position(|sensor| sensor.name == name);
         if let Some(at) = at {
-            // Its topics stay, even if there is no room for others.
+            // The sensor keeps its topics, even if there is no room for further ones.
             self.sensors[at].on_announcement(head, announce, arrival);
         }
         if self.only_proven && !is_proven {
@@ -230,7 +232,7 @@ impl<S: TopicStore> Republisher<S> {
         };
         if !missing.is_empty() {
             let sensor = &mut self.sensors[at];
-            // All topics are created, or none.
+            // If one topic cannot be created, none of them stays.
             let made = missing.iter().try_for_each(|&topic| sensor.add(topic));
             made.inspect_err(|_| missing.iter().for_each(|&topic| sensor.remove(topic)))?;
         }
@@ -249,8 +251,9 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.len() == MAX_SENSORS || !self.store.fits(&topics(announce))
     }
 
-    /// Publishes the samples of `candidate`, which sent `head`, if the sensor was made. Otherwise, it stays a
-    /// candidate. Samples from another run of the hub than `boot` may belong to another sensor, so they are dropped.
+    /// Publishes the stored samples of `candidate` if its sensor, which sent `head`, has been created. Otherwise, the
+    /// sensor stays a candidate. Samples from another run of the hub than `boot` may belong to another sensor, so they
+    /// are dropped.
     fn publish_stored(&mut self, head: &Head, boot: u64, candidate: Option<Candidate>) {
         let Some(candidate) = candidate else { return };
         let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.has_sent(head)) else {
@@ -262,7 +265,7 @@ impl<S: TopicStore> Republisher<S> {
         self.dropped.unproven -= published as u64;
     }
 
-    /// Publishes `sample`, if it can be.
+    /// Publishes `sample`, or counts the reason why that is not possible.
     fn publish(&mut self, sample: &RemoteSample<'_>) {
         let RemoteSample { remote, announced, is_proven, .. } = sample;
         let head = &remote.head;
@@ -293,13 +296,13 @@ impl<S: TopicStore> Republisher<S> {
         *reason += 1;
     }
 
-    /// Returns the index of the sensor that is evicted next for another one.
+    /// Returns the index of the sensor that is evicted first to make room for the sensor of `arrival`.
     fn next_evicted(&self, arrival: Arrival) -> Option<usize> {
         let may_go = |at: &usize| self.sensors[*at].rank.may_be_evicted(arrival);
         (0..self.sensors.len()).filter(may_go).min_by_key(|&at| self.sensors[at].rank.active_until_ns())
     }
 
-    /// Removes the sensor, after it has published that it is silent.
+    /// Publishes that the sensor at index `at` is silent, and removes the sensor.
     fn evict(&mut self, at: usize, now: WallTimestamp) {
         self.sensors.remove(at).retire(now);
         self.evicted_active += 1;
@@ -307,7 +310,7 @@ impl<S: TopicStore> Republisher<S> {
     }
 }
 
-/// Returns the topics of `announce` that are known here.
+/// Returns the topics of `announce` that this version has.
 fn topics(announce: &Announce) -> Vec<Topic> {
     let is_announced = |topic: &Topic| announce.topics().iter().any(|one| one.topic == topic.number());
     Topic::ALL.into_iter().filter(is_announced).collect()
@@ -322,7 +325,7 @@ pub trait TopicStore {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind) if there is not.
+    /// Returns [`Kind::ResourceExhausted`](scanhub_schema::Kind) if there is too little room.
     fn check_room(&self, topics: &[Topic]) -> Result<(), Failure>;
 
     /// Returns whether the memory that remote sensors may use has room for `topics` of one more sensor.
@@ -343,7 +346,7 @@ pub trait TopicStore {
     fn clean_up(&self);
 }
 
-/// Topics of one sensor in a store. Samples of other topics are neither sent nor skipped.
+/// Topics of one sensor in a store. For a topic that does not exist, `send` and `skip` do nothing.
 pub trait SensorTopics {
     /// Creates `topic`, which does not exist.
     ///
@@ -379,16 +382,16 @@ pub trait SensorTopics {
     fn failed(&self) -> u64;
 }
 
-/// Sensors that were announced before their gateway was known to deliver, the last ones. They have no topics yet, but
-/// the last sample of each topic with a history is kept: a background, for example, is sent only once.
+/// The last sensors that were announced before their gateway was known to deliver. They have no topics yet. The last
+/// sample of each topic with a history is kept, because a background, for example, is sent only once.
 #[derive(Default)]
 pub(super) struct Candidates(VecDeque<Candidate>);
 
-/// A sensor, and its samples that late subscribers would get.
+/// A sensor that is not published yet, and those of its samples that late joiners would receive.
 pub(super) struct Candidate {
     /// Gateway, its run, and the sensor's number.
     source: (u64, u32, u8),
-    /// At most one of each topic.
+    /// At most one sample of each topic.
     stored: Vec<StoredSample>,
 }
 
@@ -420,7 +423,7 @@ impl Candidates {
         &mut self.0[at]
     }
 
-    /// Adds `candidate`, which was not one. The oldest one has to go if there are too many.
+    /// Adds `candidate`, which is not in the list. If there are too many candidates, the oldest one is dropped.
     pub(super) fn put_back(&mut self, candidate: Candidate) {
         if self.0.len() == MAX_CANDIDATES {
             self.0.pop_front();
@@ -465,7 +468,7 @@ impl Candidate {
             arrival_ns: kept.arrival_ns,
             age_ns: kept.age_ns,
             late: false,
-            // Nothing is a candidate if there is a key.
+            // With a key, no sensor is a candidate.
             authenticated: false,
         })
     }
@@ -495,7 +498,7 @@ mod tests {
         sent: Rc<Cell<usize>>,
     }
 
-    /// Sensor in the store, whose room is free again when this is dropped.
+    /// Sensor in the store. Dropping it frees its room.
     struct TestSensor(TestStore);
 
     impl TopicStore for TestStore {
@@ -559,7 +562,8 @@ mod tests {
             Network { incoming: Incoming::new(&Topic::ALL), republisher, sequence: 0 }
         }
 
-        /// Receives a datagram of gateway `hub` at `ms`. Returns the sensor that is published with it.
+        /// Receives a datagram of gateway `hub` at `ms`. Returns the sensor's name if the sensor is published from this
+        /// datagram on.
         fn receive(
             &mut self,
             hub: u64,
@@ -614,7 +618,7 @@ mod tests {
         let DroppedSamples { unproven, shortage, .. } = network.republisher.dropped;
         assert_eq!((unproven, shortage), (1, 0), "the last sample is published late");
         assert_eq!(network.republisher.store.sent.get(), 2);
-        // Announced only after its gateway is known to deliver.
+        // The next sensor is announced only after its gateway is known to deliver.
         assert_eq!([network.zones(6, 2_000), network.zones(6, 3_000)], [None, None]);
         assert_eq!(network.announce(6, 3_000), Some("h6.front".to_owned()));
     }
@@ -632,7 +636,7 @@ mod tests {
         }
         assert_eq!(network.republisher.dropped.no_room, 3);
         assert_eq!((network.republisher.names(), network.republisher.evicted_active), (vec!["h5.front"], 0));
-        // A silent sensor returns its memory.
+        // A silent sensor is evicted, and its memory is used for the other one.
         assert_eq!(network.zones(6, 5_000), Some("h6.front".to_owned()));
         assert_eq!((network.republisher.names(), network.republisher.evicted_active), (vec!["h6.front"], 1));
     }

@@ -2,13 +2,13 @@
 //! other's. Their samples must not become one stream.
 //!
 //! Gateways with the same epoch are distinguished by their senders and by the run of the hub (`boot`) that they
-//! announce. A sender is any number that differs between two of them. If the epochs differ, the gateway with the lower
-//! one is refused for as long as both send. Time is an argument.
+//! announce. A sender is identified by a number that differs between two gateways, such as its address and port. If the
+//! epochs differ, the gateway with the lower epoch is refused for as long as both send. Time is an argument.
 
 /// Senders of one run of a gateway.
 #[derive(Clone, Copy)]
 pub(super) struct Senders {
-    /// The first one is the sender that the run belongs to.
+    /// Known senders. The first one is the sender to which the run belongs.
     all: [Sender; MAX_SENDERS],
     count: usize,
     is_shared: bool,
@@ -18,11 +18,11 @@ pub(super) struct Senders {
 #[derive(Clone, Copy, Default)]
 struct Sender {
     from: u64,
-    /// Runs of the hub that it has announced, the latest one first. 0 is none.
+    /// Runs of the hub that the sender has announced, the latest one first. 0 stands for no run.
     boots: [u64; MAX_BOOTS],
     last_datagram_ns: u64,
     announced_ns: u64,
-    /// Time since which it has announced a run of the hub that the first sender does not announce.
+    /// Time since which the sender has announced a run of the hub that the first sender does not announce.
     other_since_ns: Option<u64>,
 }
 
@@ -38,15 +38,16 @@ pub(super) enum SenderMatch {
     Next,
 }
 
-/// Senders that are distinguished: the sockets of the gateway, another gateway, and one for a sender that appears in
-/// between.
+/// Maximum number of senders that are distinguished. It is enough for the sockets of the gateway, another gateway, and
+/// a sender that appears in between.
 const MAX_SENDERS: usize = 4;
-/// A hub that restarts announces another run, and announcements of the previous run may arrive late.
+/// Maximum number of runs of the hub that are kept for each sender. One would not be enough: after a restart of the
+/// hub, announcements of its previous run may arrive late.
 const MAX_BOOTS: usize = 4;
-/// Time without a datagram after which a sender counts as silent: three announcements.
+/// Time without a datagram after which a sender counts as silent, in ns: three times the interval of announcements.
 pub(super) const SILENCE_NS: u64 = 3_000_000_000;
-/// Time for which two senders announce different runs of a hub before they count as two gateways. The sockets of one
-/// gateway change their run within milliseconds of each other.
+/// Time for which two senders must announce different runs of a hub before they count as two gateways, in ns. The
+/// sockets of one gateway change to a new run of the hub within milliseconds of each other.
 const MIN_SHARED_TIME_NS: u64 = 500_000_000;
 
 impl Senders {
@@ -63,8 +64,9 @@ impl Senders {
         is_shared: false,
     };
 
-    /// Returns the owner of a datagram of sender `from`. `boot` is the run of the hub if the datagram is an
-    /// announcement. A sender that has not announced itself does not count as the same gateway.
+    /// Returns whether a datagram of sender `from` belongs to the gateway of this run. `boot` is the run of the hub if
+    /// the datagram is an announcement. A further sender that has sent no announcement does not count as the same
+    /// gateway.
     pub(super) fn match_sender(&self, from: u64, boot: Option<u64>, now_ns: u64) -> SenderMatch {
         let known = &self.all[..self.count];
         let Some(first) = known.first().filter(|first| first.from != from) else { return SenderMatch::Own };
@@ -150,23 +152,26 @@ impl Sender {
     }
 }
 
-/// Detects that a gateway of a lower epoch continues to send, unlike a gateway that was restarted, from whose previous
-/// run a few datagrams arrive late.
+/// Detector of two gateways with different epochs that send under one number. The one with the lower epoch then
+/// continues to send. After a restart of a single gateway, in contrast, only a few datagrams of its previous run arrive
+/// late.
 #[derive(Default)]
 pub(super) struct DuplicateDetector {
     /// Start of the window, which begins with a refused datagram.
     since_ns: Option<u64>,
-    /// Refused datagrams in the window that followed an accepted one.
+    /// Number of refused datagrams in the window that directly followed an accepted one.
     alternations: u32,
     /// Whether the last datagram was accepted.
     is_accepted: bool,
     is_reported: bool,
 }
 
-/// Minimum number of turns, and minimum time that they cover, of two gateways.
+/// Minimum number of alternations after which there are two gateways.
 const MIN_ALTERNATIONS: u32 = 8;
+/// Minimum time that these alternations must cover, in ns.
 const MIN_ALTERNATION_SPAN_NS: u64 = 3_000_000_000;
-/// Length of the window. Each restart of a gateway may cause some turns.
+/// Length of the window in which alternations are counted, in ns. It is limited because each restart of a gateway may
+/// cause some alternations.
 const ALTERNATION_WINDOW_NS: u64 = 30_000_000_000;
 
 impl DuplicateDetector {
@@ -175,8 +180,8 @@ impl DuplicateDetector {
         self.is_accepted = true;
     }
 
-    /// Records that a datagram was refused because of its epoch or sender. Returns whether two gateways are known to
-    /// send since this datagram.
+    /// Records that a datagram was refused because of its epoch or sender. Returns `true`, once, if this datagram shows
+    /// that two gateways send.
     pub(super) fn on_refused(&mut self, now_ns: u64) -> bool {
         let is_accepted = std::mem::take(&mut self.is_accepted);
         let Some(since_ns) = self.since_ns else {
@@ -244,7 +249,7 @@ mod tests {
     fn sockets_of_one_gateway_match_after_a_hub_restart() {
         let mut senders = Senders::NONE;
         for second in 0..20 {
-            // Copies arrive first, one of them late. The hub restarts every five seconds.
+            // The announcements of sender 2 arrive first, and one of them is late. The hub restarts every five seconds.
             let boot = 7 + second / 5;
             let late = if second == 11 { boot - 1 } else { boot };
             send(&mut senders, 2, Some(late), 1000 * second);
@@ -280,8 +285,8 @@ mod tests {
         assert_eq!(send(&mut senders, 2, Some(7), 1000), SenderMatch::Own);
     }
 
-    /// Each datagram that is accepted is followed by one that is refused, every `every_ms`, `count` times. Returns
-    /// which of them report two gateways.
+    /// Records an accepted datagram followed by a refused one, every `every_ms`, `count` times. Returns the indices of
+    /// the refused datagrams that report two gateways.
     fn reports(detector: &mut DuplicateDetector, begin_ms: u64, every_ms: u64, count: u64) -> Vec<u64> {
         let turn = |n: &u64| {
             detector.on_accepted();

@@ -1,6 +1,8 @@
-//! Counters of one sensor and topic in one run of a gateway: which sequence numbers arrived, late, again or not at all.
+//! Counters of one sensor and topic in one run of a gateway: which sequence numbers arrived, arrived late, arrived
+//! again or did not arrive.
 
-/// Sequence numbers below the highest one that are still distinguished. Older ones are stale.
+/// Number of sequence numbers, counted down from the highest one, for which it is known whether they have arrived.
+/// Lower numbers are stale.
 pub const WINDOW_LEN: usize = 1024;
 
 /// Counters of one sensor and topic in one run of a gateway. Sequence numbers have 32 bits, wrap, and may arrive in any
@@ -9,7 +11,7 @@ pub const WINDOW_LEN: usize = 1024;
 pub struct StreamCounters {
     /// Number of the gateway.
     pub hub: u64,
-    /// Epoch of its run.
+    /// Epoch of the gateway's run.
     pub epoch: u32,
     /// Position of the sensor's link in the hub's configuration.
     pub sensor: u8,
@@ -27,7 +29,7 @@ pub struct StreamCounters {
     highest: i64,
     /// One more than the highest number that is known to have been sent.
     next: i64,
-    /// Bit n % WINDOW is set if number n of the window has arrived.
+    /// Bit n % WINDOW_LEN is set if number n of the window has arrived.
     arrived: [u64; WINDOW_LEN / 64],
 }
 
@@ -63,19 +65,19 @@ impl StreamCounters {
 
     /// Creates a row that expects all numbers from `first` on.
     pub(super) fn new((hub, epoch, sensor, topic): StreamKey, first: u32) -> StreamCounters {
-        // Numbers before the first one must not become negative.
+        // Add 2^32, so that late numbers before the first one do not become negative.
         let first = i64::from(first) + (1 << 32);
         StreamCounters { hub, epoch, sensor, topic, lowest: first, next: first, ..StreamCounters::EMPTY }
     }
 
-    /// Returns the count of numbers that were sent since the first known one and have not arrived. The first known
-    /// number is the lowest that arrived, or the next number of an earlier announcement. The last known number is the
-    /// highest that arrived, or the one before the next number of an announcement.
+    /// Returns how many numbers from the first to the last known one have not arrived. The first known number is the
+    /// lowest that arrived, or the next number of an earlier announcement. The last known number is the highest that
+    /// arrived, or the one before the next number of an announcement.
     pub fn lost(&self) -> u64 {
         (self.next - self.lowest) as u64 - self.received
     }
 
-    /// Returns whether the number is so far below the highest one that it may be a duplicate.
+    /// Returns whether the number is so far below the highest one that it is no longer known whether it has arrived.
     pub(super) fn is_stale(&self, sequence: u32) -> bool {
         self.received > 0 && self.highest - self.number(sequence) >= WINDOW_LEN as i64
     }
@@ -95,8 +97,9 @@ impl StreamCounters {
         !self.is_ahead(sequence) && self.has(self.number(sequence))
     }
 
-    /// Returns how many numbers between the one before `sequence` and `sequence` have not arrived. 0 for a number that
-    /// is late, or that was sent before the first announcement.
+    /// Returns how many numbers between the highest one that has arrived and `sequence` are missing. If none has
+    /// arrived, counts from the first known number. 0 for a number that is late, or that was sent before the first
+    /// announcement.
     pub(super) fn missed_before(&self, sequence: u32) -> u32 {
         let before = if self.received > 0 { self.highest + 1 } else { self.lowest };
         u32::try_from(self.number(sequence) - before).unwrap_or_default()
@@ -125,12 +128,13 @@ impl StreamCounters {
         SequenceStatus::New
     }
 
-    /// Records that all numbers before `next` were sent. An announcement that samples have overtaken changes nothing.
+    /// Records that all numbers before `next` were sent. If a sample with a higher number arrived before the
+    /// announcement, nothing changes.
     pub(super) fn announce(&mut self, next: u32) {
         self.next = self.next.max(self.number(next));
     }
 
-    /// Returns the number without wrapping: the value nearest to the known ones.
+    /// Converts `sequence` to a number that does not wrap, the one nearest to the known numbers.
     fn number(&self, sequence: u32) -> i64 {
         let known = if self.received > 0 { self.highest } else { self.next };
         known.saturating_add(i64::from(sequence.wrapping_sub(known as u32) as i32))
@@ -141,7 +145,7 @@ impl StreamCounters {
         self.arrived[word] & bit != 0
     }
 
-    /// Moves the window up to `number`. Neither that number nor those in between have arrived.
+    /// Moves the window up to `number`. Neither `number` nor the numbers that the window now includes have arrived.
     fn advance(&mut self, number: i64) {
         if self.received == 0 || number - self.highest >= WINDOW_LEN as i64 {
             self.arrived = [0; WINDOW_LEN / 64];

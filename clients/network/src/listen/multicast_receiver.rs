@@ -20,23 +20,23 @@ use socket2::{Domain, InterfaceIndexOrAddress, Protocol, SockRef, Socket, Type};
 use crate::interface::{Interface, InterfaceChanges, by_name, interfaces};
 use crate::lan::WallTimestamp;
 
-/// Receiver of groups.
+/// Socket that receives from multicast groups, and the interfaces on which it has joined them.
 pub(super) struct MulticastReceiver {
     socket: UdpSocket,
     groups: Vec<Ipv4Addr>,
-    /// The only interface to receive on; `None`: all suitable ones.
+    /// The only interface to receive on; `None` for all suitable interfaces.
     only_interface: Option<String>,
     joined: Vec<JoinedInterface>,
     changes: InterfaceChanges,
     /// Whether the kernel has reported a change that was not handled yet.
     is_changed: bool,
-    /// Time of the next update without a report.
+    /// Time of the next update of the interfaces if the kernel reports no change before.
     update_at: Instant,
-    /// Reason for which groups could not be joined or interfaces could not be listed, until it is taken.
+    /// Reason why groups could not be joined or interfaces could not be listed, until it is taken.
     problem: Option<String>,
     /// Buffer for the kernel's timestamp of a datagram.
     timestamp: Vec<u8>,
-    /// CLOCK_MONOTONIC when no datagram was waiting last, in ns.
+    /// Last time at which no datagram was waiting, in ns of CLOCK_MONOTONIC.
     empty_ns: u64,
 }
 
@@ -58,7 +58,8 @@ struct JoinedInterface {
     running: bool,
 }
 
-/// Interval between updates of the interfaces without a report of the kernel. Each one retries what has failed before.
+/// Interval between updates of the interfaces while the kernel reports no change. Each update retries what has failed
+/// before.
 const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Size of the kernel's buffer for datagrams that arrive while this process does not run, in bytes. The system may
@@ -112,8 +113,9 @@ impl MulticastReceiver {
     }
 
     /// Joins the groups on interfaces that have a new carrier, if the kernel has reported a change or an update is due.
-    /// This is necessary even for a known interface: a switch that filters by group forgets its members when a cable is
-    /// unplugged. If the system cannot list interfaces, the groups remain as they are until the next update.
+    /// The groups are joined again even on a known interface, because a switch that filters by group forgets the
+    /// members of a group when their cable is unplugged. If the system cannot list interfaces, the groups remain as
+    /// they are until the next update.
     pub(super) fn update_interfaces(&mut self, now: Instant) {
         if !self.is_changed && now < self.update_at {
             return;
@@ -159,7 +161,7 @@ impl MulticastReceiver {
         self.joined.iter().map(|joined| joined.name.as_str()).collect()
     }
 
-    /// Returns the last reason for which groups could not be joined or interfaces could not be listed, once.
+    /// Returns the last reason why groups could not be joined or interfaces could not be listed, but each reason once.
     pub(super) fn take_problem(&mut self) -> Option<String> {
         self.problem.take()
     }
@@ -207,7 +209,7 @@ impl MulticastReceiver {
     pub(super) fn wait(&mut self, at_most: Duration) {
         let timeout =
             Timespec { tv_sec: at_most.as_secs() as i64, tv_nsec: i64::from(at_most.subsec_nanos()) };
-        // If this fails, receiving fails, too, and returns the error.
+        // Ignore an error: receiving then fails, too, and returns the error.
         let mut both = [PollFd::new(&self.socket, PollFlags::IN), PollFd::new(&self.changes, PollFlags::IN)];
         let _ = poll(&mut both, Some(&timeout));
         self.is_changed = !both[1].revents().is_empty();
@@ -217,7 +219,8 @@ impl MulticastReceiver {
     fn is_suitable(&self, interface: &Interface) -> bool {
         match &self.only_interface {
             Some(name) => interface.name == *name,
-            // Interfaces of containers and bridges have no address, and a socket cannot join on all of them.
+            // Interfaces without an address, such as those of containers and bridges, are not used, because a socket
+            // cannot join on all of them.
             None => interface.multicast && interface.address.is_some(),
         }
     }
@@ -244,16 +247,17 @@ impl MulticastReceiver {
     }
 }
 
-/// Leaves the groups that were joined on the interface with this index. This is necessary even if the interface no
-/// longer exists: a socket keeps its memberships there, and has 20 at most (`net.ipv4.igmp_max_memberships`).
+/// Leaves the groups that were joined on the interface with this index. The call is necessary even if the interface no
+/// longer exists: the socket keeps its memberships on it, and can have 20 at most (`net.ipv4.igmp_max_memberships`).
 fn leave(socket: &UdpSocket, groups: &[Ipv4Addr], index: u32) {
     for group in groups {
         let _ = SockRef::from(socket).leave_multicast_v4_n(group, &InterfaceIndexOrAddress::Index(index));
     }
 }
 
-/// Returns how long a datagram has waited that arrived at `arrived_ns`. Both times come from the wall clock, which may
-/// have been set in between, so the result is limited to `at_most_ns`, the time since no datagram was waiting.
+/// Returns how long a datagram that arrived at `arrived_ns` has waited until `wall_ns`. Both times come from the wall
+/// clock, which may have been set in between, so the result is limited to `at_most_ns`, the time since no datagram was
+/// waiting.
 fn waited_ns(arrived_ns: Option<u64>, wall_ns: u64, at_most_ns: u64) -> u64 {
     arrived_ns.map_or(0, |arrived_ns| wall_ns.saturating_sub(arrived_ns)).min(at_most_ns)
 }
@@ -269,10 +273,11 @@ fn bind() -> io::Result<UdpSocket> {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_reuse_address(true)?;
     socket.set_multicast_all_v4(false)?;
-    // With a smaller buffer, more datagrams are lost, and they are counted.
+    // If the system refuses this length, more datagrams are lost, but lost datagrams are counted.
     let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER_LEN);
     socket.set_nonblocking(true)?;
-    // Datagrams that waited while this process did not run must not count as new.
+    // Request the time of arrival of each datagram, because a datagram that waited while this process did not run must
+    // not count as new.
     setsockopt(socket.as_raw_fd(), ReceiveTimestampns, &true)?;
     socket.bind(&SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, PORT).into())?;
     Ok(socket.into())

@@ -1,5 +1,5 @@
-//! File with the highest epochs of the gateways that have the key. With it, datagrams of an older run are refused even
-//! after a restart of the listener.
+//! File with the highest epochs of the gateways that have the key. With this file, datagrams of an older run are
+//! refused even after a restart of the listener.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
@@ -9,7 +9,7 @@ use scanhub_shm::StateDirectory;
 
 use crate::lan::{Key, MAX_EPOCHS};
 
-/// File with the epochs. Without a state directory, they are not kept.
+/// File with the epochs. Without a state directory, the epochs are not kept.
 pub(super) struct Epochs {
     state: Option<StateDirectory>,
     name: String,
@@ -31,14 +31,14 @@ impl Epochs {
         Ok(text.unwrap_or_default().lines().filter_map(parse).collect())
     }
 
-    /// Keeps `epochs`, and those that another listener has kept, as far as there is room.
+    /// Saves `epochs` together with the epochs that other listeners have saved, as far as there is room.
     ///
     /// # Errors
     ///
     /// Returns the same errors as [`StateDirectory::lock`] and [`StateDirectory::write`].
     pub(super) fn store(&self, epochs: &HashMap<u64, u32>) -> Result<(), Failure> {
         let Some(state) = &self.state else { return Ok(()) };
-        // Without the lock, two listeners that merge at once would lose the epochs of one of them.
+        // Without the lock, if two listeners saved at the same time, the epochs of one of them would be lost.
         let _lock = state.lock(&self.name)?;
         // A file that cannot be read is replaced.
         let mut all = self.read().unwrap_or_default();
@@ -47,7 +47,7 @@ impl Epochs {
             *kept = epoch.max(*kept);
         }
         let mut all: Vec<_> = all.into_iter().collect();
-        // First those of this listener, then the latest runs of others.
+        // Keep the epochs of this listener first, and then the highest epochs of other listeners.
         all.sort_unstable_by_key(|&(hub, epoch)| (!epochs.contains_key(&hub), Reverse(epoch), hub));
         all.truncate(MAX_EPOCHS);
         let mut lines: Vec<String> = all.iter().map(|(hub, epoch)| format!("{hub:016x} {epoch}\n")).collect();
@@ -61,7 +61,7 @@ fn parse(line: &str) -> Option<(u64, u32)> {
     Some((u64::from_str_radix(hub, 16).ok()?, epoch.parse().ok()?))
 }
 
-/// Maximum length of the file, in bytes: more than it has with all epochs.
+/// Maximum length of the file, in bytes. A file with the maximum number of epochs is shorter.
 const MAX_LEN: u64 = 1 << 20;
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ impl Names {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`] if a name or a number is not valid, or if one is given twice.
+    /// Returns [`Kind::Configuration`] if a name or a number is not valid, or if a name or a number is given twice.
     pub(super) fn parse(given: &[String]) -> Result<Names, Failure> {
         let mut names: Vec<(String, u64)> = Vec::new();
         for text in given {
@@ -44,7 +44,7 @@ impl Names {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`] if one is neither.
+    /// Returns [`Kind::Configuration`] if a text is neither a name nor 16 hex digits.
     pub(super) fn hubs(&self, given: &[String]) -> Result<Vec<u64>, Failure> {
         let hub = |text: &String| {
             let named = self.0.iter().find(|(name, _)| name == text).map(|(_, hub)| *hub);
@@ -67,15 +67,15 @@ fn number(text: &str) -> Option<u64> {
     u64::from_str_radix(text, 16).ok().filter(|_| is_hex)
 }
 
-/// Form of a hub's name. Its sensors are called `HUB.SENSOR`, and both halves have the same form. `robot` means all
-/// sensors.
+/// Form of a hub's name. It is the same as that of a sensor's name, because remote sensors are called `HUB.SENSOR`.
+/// `robot` is excluded, because it means all sensors.
 const HUB_NAMES: &str = "1 to 24 of a-z, 0-9, _ and -, but not robot";
 
-/// Returns the topics that `texts` name, each as `*/TOPIC`, or all if there are none.
+/// Returns the topics that `texts` name, each as `*/TOPIC`, or all topics if `texts` is empty.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Usage`] if there is no such topic, or if a sensor or a thinning factor is named: a receiver counts
+/// Returns [`Kind::Usage`] if a topic does not exist, or if a sensor or a thinning factor is named: a receiver counts
 /// all samples of a topic, and learns the names of sensors only from announcements.
 pub fn received_topics(texts: &[String]) -> Result<Vec<Topic>, Failure> {
     let mut selected = Vec::new();

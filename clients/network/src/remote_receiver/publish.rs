@@ -22,23 +22,23 @@ pub(super) struct SharedMemory {
     budget: Rc<Budget>,
 }
 
-/// Topics of one sensor in shared memory. Announcements do not have the length of samples: topics are created for an
-/// LMS, and created again if a longer sample arrives. Their subscribers stay.
+/// Topics of one sensor in shared memory. Announcements do not contain the length of samples. Topics are therefore
+/// created with room for the samples of an LMS, and created again when a longer sample arrives. Their subscribers stay.
 pub(super) struct SharedTopics {
-    /// By topic.
+    /// Existing topics, by topic.
     topics: [Option<CreatedTopic>; Topic::ALL.len()],
     /// Next number of each topic that could not be created again because memory was short.
     next_numbers: [Option<u64>; Topic::ALL.len()],
-    /// Limits of the next topic, from the samples so far.
+    /// Limits with which the next topic is created. Each longer sample raises them.
     limits: TopicLimits,
     /// Number of times that the limits were raised.
     widen_count: u32,
-    /// Number of samples without memory of topics that were created again or no longer exist.
+    /// Number of samples for which there was no memory, of topics that were created again or no longer exist.
     failed: u64,
-    // This field is after the topics, because it wakes their subscribers.
+    // This field is after the topics, so that it is dropped later, because it wakes their subscribers.
     sensor: SensorPublisher,
     budget: Rc<Budget>,
-    /// Memory of the doorbell and the event.
+    /// Share of the budget for the sensor's doorbell and event.
     _share: Share,
 }
 
@@ -50,18 +50,18 @@ struct CreatedTopic {
     share: Share,
 }
 
-/// Number of times that limits are raised to exactly what is needed. After that, they are raised to the maximum,
-/// because a sender could require one more beam with each sample.
+/// Number of times that limits are raised to exactly what a sample needs. After that, they are raised to the maximum,
+/// because a sender could otherwise require one more beam with each sample.
 const MAX_EXACT_WIDENINGS: u32 = 4;
 
-/// Takes the lock of the domain's listener. All topics are created with `limits`, and take at most `memory` bytes
-/// together.
+/// Takes the lock of the domain's listener. All topics are created with `limits`, and together take at most `memory`
+/// bytes.
 ///
 /// Returns [`Kind::Configuration`] if `memory` is too small for a sensor, and [`Kind::DomainHeld`] if another listener
 /// has the lock. Returns [`Kind::ResourceExhausted`] if there is no memory for even one sensor, and [`Kind::Failed`] if
-/// shared memory refuses.
+/// shared memory cannot be used.
 pub(super) fn open(domain: &Domain, limits: TopicLimits, memory: u64) -> Result<Publication, Failure> {
-    // With a lower limit, fewer subscribers can attach.
+    // If the limit cannot be raised, fewer subscribers can attach.
     let _ = raise_descriptor_limit();
     let needed = sensor_bytes(&Topic::ALL, &limits);
     if memory < needed {
@@ -110,7 +110,7 @@ impl TopicStore for SharedMemory {
 }
 
 impl SharedTopics {
-    /// Returns the limits with which `topic` has room for `payload`. `None` if it has room.
+    /// Returns raised limits with which `topic` has room for `payload`. `None` if the topic has enough room already.
     fn widened_limits(&self, topic: Topic, payload: CheckedPayload<'_>) -> Option<TopicLimits> {
         let mut limits = self.topics[topic as usize].as_ref()?.limits;
         if payload.room <= topic.max_payload_len(&limits) {
@@ -144,7 +144,7 @@ impl SharedTopics {
             return;
         };
         let (next, failed) = (publisher.next_number(), publisher.failed());
-        // A topic has one publisher at a time.
+        // Drop the publisher first, because a topic has only one publisher at a time.
         drop((publisher, share));
         self.failed += failed;
         self.topics[topic as usize] =
@@ -153,7 +153,7 @@ impl SharedTopics {
         self.skip(topic, next);
     }
 
-    /// Creates `topic` again, which no longer exists, once there is memory.
+    /// Creates `topic` again if it could not be created for lack of memory, and there is memory now.
     fn recreate(&mut self, topic: Topic) {
         let Some(next) = self.next_numbers[topic as usize] else { return };
         if self.budget.has_left(topic_bytes(topic, &self.limits))
@@ -217,7 +217,7 @@ impl SensorTopics for SharedTopics {
     }
 
     fn wake(&self, event: WakeEvent) {
-        // Subscribers that cannot be woken poll ten times a second.
+        // Ignore an error: subscribers that cannot be woken poll ten times a second.
         let _ = self.sensor.wake(event);
     }
 
@@ -226,7 +226,8 @@ impl SensorTopics for SharedTopics {
     }
 }
 
-/// Returns the memory of a `topic` with these `limits`, without that of its sensor's event.
+/// Returns the number of bytes of memory that `topic` takes with these `limits`, without the memory of the sensor's
+/// event.
 fn topic_bytes(topic: Topic, limits: &TopicLimits) -> u64 {
     sensor_bytes(&[topic], limits) - sensor_bytes(&[], limits)
 }
@@ -237,14 +238,14 @@ fn has_memory(topic: Topic, limits: &TopicLimits) -> bool {
     check_memory(needed, needed).is_ok()
 }
 
-/// Bytes of shared memory, and the number of those in use.
+/// Number of bytes of shared memory that may be used, and number of bytes in use.
 #[derive(Debug)]
 struct Budget {
     bytes: u64,
     used: Cell<u64>,
 }
 
-/// Part of a budget that is in use. Dropping it returns it.
+/// Part of a budget that is in use. Dropping the share returns its bytes to the budget.
 #[derive(Debug)]
 struct Share {
     budget: Rc<Budget>,
@@ -270,7 +271,7 @@ impl Budget {
 }
 
 impl Share {
-    /// Returns its size.
+    /// Returns the size of the share.
     fn bytes(&self) -> u64 {
         self.bytes
     }
@@ -282,14 +283,14 @@ impl Drop for Share {
     }
 }
 
-/// A publisher of any payload that takes it as it is in a datagram.
+/// Publisher that takes a payload in the form that it has in a datagram.
 trait PublishPacked {
     fn publish(&mut self, header: &Header, payload: CheckedPayload<'_>);
 }
 
 impl<P: Payload + DatagramPayload + ?Sized> PublishPacked for scanhub_client::Publication<P> {
     fn publish(&mut self, header: &Header, CheckedPayload { bytes, room }: CheckedPayload<'_>) {
-        // The topic counts what fails.
+        // Ignore an error: the topic counts samples that fail.
         let _ = self.send_len_with(header, room, |sample| {
             let _ = sample.fill(bytes, room);
         });

@@ -1,5 +1,5 @@
-//! Output of a receiver: its samples as lines, notices about problems, and the counters of everything that arrived and
-//! did not.
+//! Output of a receiver: its samples as lines, notices about problems, and the counters of everything that arrived or
+//! was lost.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -18,7 +18,7 @@ use super::publish::Publication;
 use crate::lan::incoming::ReceivedSample;
 use crate::lan::{EvictedTotals, GatewayTable, StreamCounters};
 
-/// Names of the classes of counters, which depend on the network.
+/// Names of the classes of JSON lines with counters. They depend on the network.
 #[derive(Clone, Copy, Debug)]
 pub struct ClassNames {
     counters: &'static str,
@@ -61,7 +61,7 @@ pub(crate) struct Report<'a> {
     pub(super) names: Names,
     /// Name of the key that datagrams are authenticated with.
     key: Option<String>,
-    /// Number of lines of counters on the terminal.
+    /// Number of lines of counters that were drawn on the terminal.
     drawn: usize,
 }
 
@@ -121,7 +121,7 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{hub}.{sensor}/{}: missed {missed}", topic.name()))
     }
 
-    /// Reports the name of the sensor that sent `head`, and was printed under its number before.
+    /// Reports the name of the sensor that sent `head`. The sensor was printed under its number before.
     pub(super) fn name_announced(&mut self, head: &Head, sensor: &str) -> Result<(), ExitReason> {
         let number = head.sensor;
         if self.json {
@@ -132,7 +132,8 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{hub}.#{number} is {hub}.{sensor}"))
     }
 
-    /// Reports that the clock of the gateway that sent `head` lags this machine's by `behind_ns`, or leads if negative.
+    /// Reports that the clock of the gateway that sent `head` lags this machine's clock by `behind_ns`, or is ahead of
+    /// it if the value is negative.
     pub(super) fn clocks_differ(&mut self, head: &Head, behind_ns: i64) -> Result<(), ExitReason> {
         let behind_ms = behind_ns as f64 / 1e6;
         if self.json {
@@ -146,7 +147,7 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// Reports that a remote sensor is published as `name`. `here` says whether its gateway is on this machine.
+    /// Reports that a remote sensor is published as `name`. `here` is true if the sensor's gateway is on this machine.
     pub(super) fn published(&mut self, head: &Head, name: &str, here: bool) -> Result<(), ExitReason> {
         if self.json {
             return self.out.json(&NoticeJson {
@@ -275,7 +276,7 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Class `lan` or `bridge` of a receiver.
+/// JSON line of class `lan` or `bridge`, with the counters of one topic of a sensor.
 #[derive(Serialize)]
 struct CountersJson<'a> {
     class: &'static str,
@@ -288,10 +289,10 @@ struct CountersJson<'a> {
     lost: u64,
     duplicate: u64,
     reordered: u64,
-    /// Only for datagrams, which may have a MAC.
+    /// Present only for `listen`, because only UDP datagrams may have a MAC.
     #[serde(skip_serializing_if = "Option::is_none")]
     authenticated: Option<bool>,
-    /// Only for a bridge: the count that the sender announced.
+    /// Number of samples that the sender has replaced, as it announced. Present only for a bridge.
     #[serde(skip_serializing_if = "Option::is_none")]
     replaced: Option<Option<u32>>,
 }
@@ -496,7 +497,7 @@ fn known_id<S: Serializer>(hub: &Option<u64>, serializer: S) -> Result<S::Ok, S:
 
 /// Prints a sample of `sensor` as JSON.
 fn sample_json(remote: &ReceivedSample<'_>, sensor: &str, out: &mut Output<'_>) -> Result<(), ExitReason> {
-    // The flags are written after all other keys.
+    // Leave out the flags here, because they are written after all other keys.
     let header = Header { flags: 0, ..remote.header(std::process::id()) };
     show(remote, JsonLine { remote, sensor, header: &header, out })
 }
@@ -587,7 +588,7 @@ impl Keys for JsonLine<'_, '_> {
     }
 }
 
-/// Serializes a hub's ID as in all output.
+/// Serializes a hub's ID in the form that all output has: 16 hex digits.
 fn id<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&format_args!("{id:016x}"))
 }

@@ -1,5 +1,5 @@
-//! A machine with a listener that publishes, and a robot that subscribes to the zones, in virtual time. Topics are
-//! queues in memory.
+//! Receiving machine in virtual time: a listener that publishes remote sensors, and a robot that subscribes to their
+//! zones. Topics are queues in memory.
 
 use std::collections::VecDeque;
 
@@ -34,7 +34,7 @@ pub(crate) struct ReceivingMachine {
 /// A published sample of topic zones.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PublishedZones {
-    /// Position of its sensor.
+    /// Position of the sensor in the robot.
     pub(crate) position: usize,
     pub(crate) header: Header,
     pub(crate) zones: Zones,
@@ -84,7 +84,7 @@ impl ReceivingMachine {
         self.stalled_until = until;
     }
 
-    /// Returns the time of the next event without a datagram.
+    /// Returns the time of the next event if no datagram arrives before.
     pub(crate) fn next(&self, now: Nanos) -> Nanos {
         let moment = self.moment(now);
         let left = self.subscriptions.iter().filter_map(|(_, state)| state.time_left(moment));

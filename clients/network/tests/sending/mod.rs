@@ -1,5 +1,5 @@
-//! A machine with a hub of two sensors and a gateway, in virtual time. Sensors fall silent, and hub and gateway
-//! restart. Keeps everything that was sent.
+//! Sending machine in virtual time: a hub with two sensors, and a gateway. Sensors fall silent, and hub and gateway
+//! restart. The machine keeps all datagrams that it has sent.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU64;
@@ -62,7 +62,7 @@ pub(crate) struct SendingMachine {
 /// A program that is stopped and restarted.
 struct ProcessState {
     is_running: bool,
-    /// Time at which it is stopped or started.
+    /// Time at which the program is stopped or started next.
     changes_at: Nanos,
 }
 
@@ -74,7 +74,7 @@ struct SimulatedSensor {
     scan_at: Nanos,
     unknown_at: Nanos,
     status_at: Nanos,
-    /// State of its zones in the gateway.
+    /// State of the sensor's zones in the gateway.
     state: ZonesState,
 }
 
@@ -152,7 +152,7 @@ impl SendingMachine {
         sending
     }
 
-    /// Starts everything that is stopped. No further faults occur.
+    /// Ends all faults: starts the programs and sensors that are stopped.
     pub(crate) fn stop_faults(&mut self, now: Nanos) {
         self.faults = MachineFaults::default();
         for runs in [&mut self.hub, &mut self.gateway] {
@@ -244,7 +244,7 @@ impl SendingMachine {
         self.sensors.iter_mut().for_each(|sensor| sensor.state = ZonesState::new(moment));
     }
 
-    /// Kills half of the gateways. The others send a last announcement.
+    /// Ends the run of a gateway. In half of the cases, the gateway is killed. Otherwise, it sends a last announcement.
     fn end_gateway(&mut self, now: Nanos, network: &mut Network) {
         if self.gateway.is_running && self.rng.bool() {
             self.announce(now, network);

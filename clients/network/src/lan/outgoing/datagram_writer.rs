@@ -1,5 +1,5 @@
-//! Writes the datagrams of a gateway: numbers each sample, and seals it in one datagram or in parts. Without a queue,
-//! it transmits a sample at once. With a queue, the newest sample of each topic waits until it is taken.
+//! Writes the datagrams of a gateway: numbers each sample, and seals it in one datagram or in parts. Without a queue, a
+//! sample is transmitted at once. With a queue, the newest sample of each topic waits until it is taken.
 
 use std::collections::VecDeque;
 
@@ -12,8 +12,9 @@ use crate::lan::{Key, WallTimestamp};
 
 /// Destination of datagrams: sockets, or a model of a network.
 pub trait Transmit {
-    /// Sends a whole datagram to the group with this last byte, and to the port that is `above` ports after the usual
-    /// one. Returns whether it was sent. If not, its number counts as failed, and receivers count it as lost.
+    /// Sends a whole datagram to the port that is `above` ports after the usual one. `group` is the last byte of the
+    /// group's address. Returns whether the datagram was sent. If not, its sequence number counts as failed here, and
+    /// as lost at receivers.
     fn transmit(&mut self, datagram: &[u8], group: u8, above: u8) -> bool;
 }
 
@@ -24,12 +25,12 @@ pub enum Form {
     Sealed,
     /// A header, the payload and a MAC of this key.
     Authenticated(Key),
-    /// Only the payload, to a port of its sensor.
+    /// Only the payload. Each sensor has its own port.
     Bare,
 }
 
 impl Form {
-    /// Returns the number of bytes that are added to a payload.
+    /// Returns the number of bytes that are reserved for the header and the MAC, besides the payload.
     fn overhead(&self) -> usize {
         if matches!(self, Form::Authenticated(_)) { HEADER_LEN + MAC_LEN } else { HEADER_LEN }
     }
@@ -54,11 +55,11 @@ pub(super) struct DatagramWriter {
     queue: Option<Queue>,
 }
 
-/// Samples that wait until they are taken, and those that may be sent again.
+/// Samples that wait until they are taken, and taken samples that may be sent again.
 #[derive(Default)]
 struct Queue {
     waiting: LatestQueue,
-    /// Last announcement, status and background of each sensor that were taken.
+    /// Last announcement, status and background of each sensor that were taken from the queue.
     last: Vec<(Head, Vec<u8>)>,
 }
 
@@ -76,7 +77,7 @@ pub struct QueuedSample<'a> {
 /// Counters of one sensor.
 #[derive(Default)]
 pub struct SensorStats {
-    /// Name of the sensor that had this number last.
+    /// Name of the sensor to which this number was assigned last.
     pub name: String,
     topics: [TopicStats; STREAM_COUNT],
 }
@@ -86,18 +87,18 @@ pub struct SensorStats {
 pub struct TopicStats {
     /// Samples that were sent.
     pub sent: u64,
-    /// Samples that have a number and were not sent, or not all parts of them.
+    /// Samples that have a sequence number, but were not sent, or not with all parts.
     pub failed: u64,
     /// Bytes of the datagrams that were sent.
     pub bytes: u64,
-    /// Samples that the hub sent and the gateway did not receive; they have no number.
+    /// Samples that the hub sent and the gateway did not receive; they have no sequence number.
     pub missed: u64,
-    /// Samples that a newer one replaced while they waited; they have no number.
+    /// Samples that were replaced by newer ones while they waited; they have no sequence number.
     pub replaced: u64,
     oversize: Oversize,
 }
 
-/// Whether a sample of a topic did not fit into datagrams.
+/// Whether a sample of a topic did not fit into datagrams, and whether that was reported.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum Oversize {
     #[default]
@@ -107,7 +108,7 @@ enum Oversize {
 }
 
 impl TopicStats {
-    /// Returns the number of the next sample.
+    /// Returns the sequence number of the next sample.
     pub fn next_number(&self) -> u32 {
         (self.sent + self.failed) as u32
     }
@@ -121,8 +122,8 @@ impl SensorStats {
     }
 
     /// Writes `payload`, which waited with `head`, to the start of `room`, and returns its length. An announcement gets
-    /// the numbers of this moment: with those of the moment at which it began to wait, a receiver that starts late
-    /// would count samples as lost that were sent before.
+    /// the current sequence numbers. With the numbers from the time at which it was queued, a receiver that starts late
+    /// would count samples as lost that were sent before the announcement.
     fn write(&self, head: &Head, payload: &[u8], room: &mut [u8]) -> Option<usize> {
         if head.topic == Announce::NUMBER {
             return self.updated_announcement(&Announce::unpack(payload)?).pack(room);
@@ -131,7 +132,7 @@ impl SensorStats {
         Some(payload.len())
     }
 
-    /// Returns the announcement `old` with the numbers of this moment.
+    /// Returns the announcement `old` with the current sequence numbers.
     fn updated_announcement(&self, old: &Announce) -> Announce {
         let mut announce = Announce::new(old.boot, old.sensor(), old.kind());
         for topic in old.topics() {
@@ -148,7 +149,7 @@ impl DatagramWriter {
     pub(super) fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> DatagramWriter {
         let overhead = form.overhead();
         let longest = longest.clamp(overhead + 1, MTU_ETHERNET);
-        // Bare telegrams have no header with the number of a part.
+        // A bare telegram is never sent in parts, because it has no header with the index of a part.
         let parts = if form.is_bare() { 1 } else { MAX_PARTS };
         let buffer = vec![0; overhead + parts * (longest - overhead)];
         DatagramWriter {
@@ -191,8 +192,8 @@ impl DatagramWriter {
         stats.map_or(0, |stats| stats.topics[usize::from(topic.number())].replaced)
     }
 
-    /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none
-    /// waits.
+    /// Takes the sample that has waited for longest, numbers it, and returns its datagram for sending at `now`. `None`
+    /// if no sample waits.
     pub(super) fn take_next(&mut self, now: WallTimestamp) -> Option<QueuedSample<'_>> {
         let Queue { waiting, last } = self.queue.as_mut()?;
         let (head, payload) = waiting.take()?;
@@ -220,7 +221,7 @@ impl DatagramWriter {
         Some(QueuedSample { sensor: (head.sensor, name), topic, datagram })
     }
 
-    /// Returns the last sample of a kept topic as it is sent again at `now`, under the number that it has.
+    /// Returns the last sample of a stored topic for sending it again at `now`. It keeps its sequence number.
     pub(super) fn resend_last(
         &mut self,
         name: &str,
@@ -231,7 +232,8 @@ impl DatagramWriter {
         let last = &self.queue.as_ref()?.last;
         let is_requested =
             |head: &Head| self.sensors[usize::from(head.sensor)].name == name && head.topic == number;
-        // After a restart of the hub, a sensor may have two numbers. The later one is valid.
+        // After a restart of the hub, samples of the sensor may be stored under two sensor numbers. The later one is
+        // valid.
         let (head, payload) = last.iter().rev().find(|(head, _)| is_requested(head))?;
         let head = Head { stamp_ns: stamp_ns(head, now), ..*head };
         let len =
@@ -301,12 +303,12 @@ impl DatagramWriter {
         }
     }
 
-    /// Returns whether `number` is assigned to `name`. A hub that restarts may number its sensors differently.
+    /// Returns whether `number` is still assigned to `name`. After a restart, a hub may number its sensors differently.
     pub(super) fn is_claimed(&self, number: u8, name: &str) -> bool {
         self.sensors.get(usize::from(number)).is_some_and(|stats| stats.name == name)
     }
 
-    /// Returns the number of the next sample of this sensor and topic.
+    /// Returns the sequence number of the next sample of this sensor and topic.
     pub(super) fn next(&self, number: u8, topic: Topic) -> u32 {
         let stats = self.sensors.get(usize::from(number));
         stats.map_or(0, |stats| stats.topics[usize::from(topic.number())].next_number())
@@ -325,7 +327,8 @@ impl DatagramWriter {
     }
 
     /// Sends the payload that `pack` writes, under the next number of this sensor and topic. `head` has no hub, epoch
-    /// and sequence number yet. A failure uses the number up. With a queue, the payload waits and gets no number yet.
+    /// and sequence number yet. A sample that fails uses its number up. With a queue, the payload waits and gets no
+    /// number yet.
     pub(super) fn send(
         &mut self,
         head: Head,
@@ -372,8 +375,8 @@ impl DatagramWriter {
     /// Sends the payload of `len` bytes in the buffer, in as few parts as possible. Returns the bytes of all datagrams
     /// if all were sent.
     ///
-    /// The parts are sealed in place. The header of a part overwrites the end of the part before it, which was sent
-    /// already. Its MAC overwrites the start of the part after it, which is restored afterward.
+    /// The parts are sealed in place. The header of a part overwrites the end of the previous part, which was already
+    /// sent. The MAC of a part overwrites the start of the next part, which is restored afterward.
     fn send_sealed(&mut self, head: Head, len: usize, group: u8, to: &mut impl Transmit) -> Option<usize> {
         let room = self.max_datagram_len - self.form.overhead();
         let parts = len.div_ceil(room).max(1);
@@ -400,7 +403,7 @@ impl DatagramWriter {
         bytes
     }
 
-    /// Returns a `SENSOR/TOPIC` whose samples do not all fit into datagrams, each of them once.
+    /// Returns the `SENSOR/TOPIC` of a sample that did not fit into datagrams. Returns each name only once.
     pub(super) fn take_oversized(&mut self) -> Option<String> {
         self.sensors.iter_mut().find_map(|SensorStats { name, topics }| {
             let (number, row) =
@@ -425,7 +428,8 @@ fn stamp_ns(head: &Head, now: WallTimestamp) -> u64 {
     }
 }
 
-/// Returns whether the last sample of this topic is kept for receivers that query it. It is valid until the next one.
+/// Returns whether the last sample of this topic is kept for receivers that query it. Such a sample is valid until the
+/// next one.
 fn is_stored(topic: Topic) -> bool {
     matches!(topic, Topic::Status | Topic::Background)
 }

@@ -1,4 +1,5 @@
-//! One sensor of the hub on the sending side: decides which of its samples become datagrams, and announces it.
+//! One sensor of the hub on the sending side of a network. It decides which samples of the sensor become datagrams, and
+//! announces the sensor.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU64;
@@ -14,12 +15,12 @@ use crate::lan::WallTimestamp;
 /// A subscribed sensor.
 pub(super) struct Sensor {
     pub(super) name: String,
-    /// One for each of [`Topic::ALL`].
+    /// State of each topic, in the order of [`Topic::ALL`].
     streams: [Stream; Topic::ALL.len()],
     /// Header of the last sample of any topic.
     last: Option<Header>,
     revolutions: RevolutionCounter,
-    /// Type in the last status; empty if unknown.
+    /// The sensor's type from its last status; empty if unknown.
     kind: String,
     sent_background: Option<SentBackground>,
 }
@@ -30,20 +31,22 @@ struct Stream {
     /// Thinning factor; `None` if the topic is not sent.
     every: Option<NonZeroU64>,
     last: Option<Header>,
-    /// Whether the last zones that were sent were unknown.
+    /// Whether the last zones that were sent had the verdict `unknown`.
     is_unknown: bool,
 }
 
-/// Counts the revolutions of a rotating scanner, for thinning. The telegrams that complete them have sequence numbers
-/// with gaps, which may all have the same length.
+/// Counter of the revolutions of a rotating scanner, for thinning. The sequence number of a sample is not suitable for
+/// that, because it is the number of the packet that completed the revolution. The steps between these numbers may all
+/// have the same length, so that none or all of them are multiples of the thinning factor.
 #[derive(Default)]
 struct RevolutionCounter {
-    /// Sequence number of the telegram and index of the revolution, of the last revolutions.
+    /// For each of the last revolutions: the sequence number of its samples, and its index.
     last: VecDeque<(u64, u64)>,
 }
 
 impl RevolutionCounter {
-    /// Returns the index of the revolution that a sample with `header` is computed from. `None` if it is too old.
+    /// Returns the index of the revolution that a sample with `header` is computed from. `None` if the revolution is
+    /// too old.
     fn index(&mut self, header: &Header) -> Option<u64> {
         let newest = self.last.back().copied();
         if newest.is_none_or(|(seq, _)| header.seq > seq) && header.hub_time_ns().is_some() {
@@ -55,7 +58,7 @@ impl RevolutionCounter {
         self.last.iter().rev().find(|(seq, _)| *seq == header.seq).map(|(_, index)| *index)
     }
 
-    /// Returns the index of the revolution in progress, which an early warning belongs to.
+    /// Returns the index of the revolution in progress. An early warning belongs to that revolution.
     fn next_index(&self) -> u64 {
         self.last.back().map_or(0, |(_, index)| index + 1)
     }
@@ -65,12 +68,13 @@ impl RevolutionCounter {
 struct SentBackground {
     background: Box<Background>,
     header: Header,
-    /// CLOCK_MONOTONIC, in ns.
+    /// Time of the last transmission, in ns of CLOCK_MONOTONIC.
     sent_ns: u64,
 }
 
 impl Sensor {
-    /// Creates the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent.
+    /// Creates the sensor called `name`. `every` returns the thinning factor of a topic, or `None` if the topic is not
+    /// sent.
     pub(super) fn new(name: &str, every: impl Fn(Topic) -> Option<NonZeroU64>) -> Sensor {
         let stream = |topic| Stream { topic, every: every(topic), last: None, is_unknown: false };
         Sensor {
@@ -88,7 +92,7 @@ impl Sensor {
         self.streams[topic as usize].every.is_some()
     }
 
-    /// Sends the background again if it was sent `every` or longer ago.
+    /// Sends the background again if its last transmission is `every` or longer ago.
     pub(super) fn repeat(
         &mut self,
         every: Duration,
@@ -107,7 +111,8 @@ impl Sensor {
         }
     }
 
-    /// Announces the sensor's name, and the next number of each topic. Sends nothing before the sensor's first sample.
+    /// Announces the sensor's name, and the next sequence number of each topic. Sends nothing before the sensor's first
+    /// sample.
     pub(super) fn announce(&self, now: WallTimestamp, writer: &mut DatagramWriter, to: &mut impl Transmit) {
         let is_announced = writer.announces();
         let last = self.last.filter(|last| is_announced && writer.is_claimed(last.sensor, &self.name));
@@ -133,7 +138,7 @@ impl Sensor {
         writer.send(head, to, |room| announce.pack(room));
     }
 
-    /// Sends `sample`, unless it is thinned out, is a known background or comes from another machine.
+    /// Sends `sample`, unless it is thinned out, is a background that was already sent, or comes from another machine.
     pub(super) fn send(
         &mut self,
         sample: &Sample<'_>,
@@ -145,8 +150,8 @@ impl Sensor {
         let Sensor { name, streams, last, kind, .. } = self;
         let stream = &mut streams[topic as usize];
         let Some(header) = sample.header.copied() else {
-            // A silence has no header of its own. It gets that of the last sample, if its number still belongs to this
-            // sensor.
+            // A silence has no header. It gets the header of the topic's last sample, if the sensor number in that
+            // header still belongs to this sensor.
             let last = stream.last.filter(|last| writer.is_claimed(last.sensor, name));
             if let Some(last) = last.filter(|_| stream.every.is_some()) {
                 stream.is_unknown = true;
@@ -162,7 +167,7 @@ impl Sensor {
         if is_new {
             writer.claim(header.sensor, name);
         } else if !writer.is_claimed(header.sensor, name) {
-            // The sample comes from an earlier run of the hub, and its number belongs to another sensor now.
+            // The sample comes from an earlier run of the hub, and its sensor number now belongs to another sensor.
             return;
         }
         *last = Some(header);
@@ -170,7 +175,8 @@ impl Sensor {
         if let PayloadRef::Status(status) = sample.payload {
             status.sensor_type().clone_into(kind);
         }
-        // Announce first. Listeners would otherwise assign the sample to the sensor that had the number before.
+        // Announce the sensor before sending its sample. Listeners would otherwise assign the sample to the sensor that
+        // had the number before.
         if is_new {
             self.announce(now, writer, to);
         }
@@ -213,10 +219,12 @@ impl Sensor {
     }
 }
 
-/// Number of revolutions that are kept. A topic never lags another one by more, because its buffer holds fewer samples.
+/// Number of revolutions whose indices are kept. No topic lags another one by more revolutions, because the buffer of a
+/// topic holds fewer samples.
 const MAX_REVOLUTIONS: usize = 64;
 
-/// Returns the header of a datagram with a sample of `topic`, without hub, epoch and sequence number.
+/// Returns the header of a datagram with a sample of `topic`, without hub, epoch and sequence number, which the writer
+/// adds.
 fn head(topic: Topic, header: &Header, stamp_ns: u64) -> Head {
     Head {
         topic: topic.number(),

@@ -305,7 +305,7 @@ fn wait(out: &mut Outgoing, sensor: usize, seq: u64) {
     assert_eq!(send(out, sensor, Some(header(1, 0, seq)), Verdict::Clear), []);
 }
 
-/// Takes everything that waits, in its order.
+/// Takes all waiting samples in order, and returns their datagrams.
 fn take_all(out: &mut Outgoing) -> Vec<Vec<u8>> {
     let mut all = Vec::new();
     while let Some(sample) = out.take_next(at(700)) {
@@ -332,7 +332,7 @@ fn late_receiver_counts_no_earlier_samples_as_lost() {
         wait(&mut out, front, seq);
         take_all(&mut out);
     }
-    // Zones wait before the announcement, so that they get a number before it is sent.
+    // Zones are queued before the announcement, so that they get a number before the announcement is sent.
     wait(&mut out, front, 100);
     out.announce(at(0), &mut RecordingNetwork::default());
     let [_, announced] = &take_all(&mut out)[..] else { panic!("zones and an announcement") };

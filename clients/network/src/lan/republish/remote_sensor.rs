@@ -1,4 +1,4 @@
-//! The topics of one remote sensor: their numbers and periods, and its state while nothing arrives.
+//! One remote sensor: the numbers and periods of its topics, and the state that it publishes while nothing arrives.
 
 use scanhub_schema::datagram::{Announce, DatagramPayload, Head, MTU_ETHERNET};
 use scanhub_schema::{Failure, Header, State, Status, Topic, WakeEvent, Zones};
@@ -14,13 +14,13 @@ pub(super) struct RemoteSensor<T: SensorTopics> {
     pub(super) name: String,
     /// Gateway, its epoch, and the sensor's number, as last announced.
     source: Option<(u64, u32, u8)>,
-    /// Bit n is set if the last announcement has topic number n.
+    /// Bit n is set if the last announcement contains topic number n.
     announced: u64,
-    /// Rank when there is no room for another sensor.
+    /// Rank by which sensors are compared if one of them must be evicted to make room for another.
     pub(super) rank: EvictionRank,
     /// Whether it was reported that all announced topics exist.
     pub(super) is_reported: bool,
-    /// By topic.
+    /// Numbers and period of each topic; `None` for a topic that does not exist.
     streams: [Option<Stream>; Topic::ALL.len()],
     /// Last status with its header.
     last_status: Option<(Status, Header)>,
@@ -28,14 +28,14 @@ pub(super) struct RemoteSensor<T: SensorTopics> {
     last_zones: Option<Header>,
     /// Time of the last sample, in ns of CLOCK_MONOTONIC; `None` while the sensor is silent.
     last_sample_ns: Option<u64>,
-    /// Reason for which subscribers must be woken.
+    /// Event with which subscribers must be woken; `None` if nothing was published since they were woken last.
     pending_wake: Option<WakeEvent>,
-    /// Process that publishes it.
+    /// ID of the process that publishes the sensor.
     pid: u32,
     topics: T,
 }
 
-/// Outcome of a sample.
+/// Outcome of publishing a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Outcome {
     /// The sample was published.
@@ -46,7 +46,7 @@ pub(super) enum Outcome {
     NoRoom,
 }
 
-/// Time without a sample after which the sensor counts as silent: three announcements.
+/// Time without a sample after which the sensor counts as silent, in ns: three times the interval of announcements.
 const SILENT_AFTER_NS: u64 = 3_000_000_000;
 
 impl<T: SensorTopics> RemoteSensor<T> {
@@ -94,7 +94,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
         self.announced = numbers.fold(0, |bits, number| bits | 1 << number);
     }
 
-    /// Publishes that the sensor is silent, because another one has its number or its place from now on.
+    /// Publishes that the sensor is silent, because its number or its room belongs to another sensor from now on.
     pub(super) fn retire(&mut self, now: WallTimestamp) {
         self.source = None;
         self.last_sample_ns = None;
@@ -106,7 +106,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
         self.wake();
     }
 
-    /// Returns whether its gateway sends this topic.
+    /// Returns whether the sensor's gateway announces this topic.
     pub(super) fn is_announced(&self, topic: Topic) -> bool {
         self.announced >> topic.number() & 1 == 1
     }
@@ -116,7 +116,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
         self.source == Some((head.hub, head.epoch, head.sensor))
     }
 
-    /// Returns whether it belongs to this gateway and epoch.
+    /// Returns whether the sensor belongs to this gateway and epoch.
     pub(super) fn belongs_to(&self, hub: u64, epoch: u32) -> bool {
         self.source.is_some_and(|source| (source.0, source.1) == (hub, epoch))
     }
@@ -127,7 +127,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
         self.rank.take(Arrival { is_sample: true, now_ns: remote.arrival_ns });
         let topic = remote.topic;
         let Some(stream) = &mut self.streams[topic as usize] else { return Outcome::NoTopic };
-        // Its number is skipped before the next sample that fits.
+        // The number of this sample is skipped later, before the next sample that fits.
         if !self.topics.fits(topic, remote.payload) {
             return Outcome::NoRoom;
         }
@@ -174,8 +174,8 @@ impl<T: SensorTopics> RemoteSensor<T> {
         self.topics.failed()
     }
 
-    /// Publishes a received status. The start of its state is in time of another machine's clock, so it is replaced by
-    /// the time at which the state was received first.
+    /// Publishes a received status. The time at which its state began comes from another machine's clock. It is
+    /// replaced by the time at which this machine first received the state.
     fn publish_status(&mut self, mut status: Status, header: &Header) {
         let same = self.last_status.filter(|(last, _)| last.state == status.state);
         status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
@@ -197,7 +197,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
         }
     }
 
-    /// Publishes a payload that was not received in this form.
+    /// Publishes a payload that this process has created or changed.
     fn send(&mut self, topic: Topic, header: &Header, payload: &impl DatagramPayload) {
         let mut room = [0; MTU_ETHERNET];
         let Some(len) = payload.pack(&mut room) else { return };
@@ -206,18 +206,19 @@ impl<T: SensorTopics> RemoteSensor<T> {
     }
 }
 
-/// Returns `header` with the stamps of this moment, for a sample that was not received.
+/// Returns `header` with `now` as its stamps, for a sample that was not received.
 fn stamped(header: Header, now: WallTimestamp) -> Header {
     let WallTimestamp { monotonic_ns, wall_ns } = now;
     Header { stamp_first_ns: monotonic_ns, stamp_last_ns: monotonic_ns, wall_ns, ..header }
 }
 
-/// Numbers and period of one topic. Its numbers continue over runs of the gateway, and restart with each run of the
-/// hub, so that subscribers see what the network lost.
+/// Numbers and period of one topic. The numbers continue over runs of the gateway, so that subscribers see what the
+/// network lost.
 #[derive(Default)]
 struct Stream {
-    /// Epoch, sensor's number and sequence number of the last sample. The first sample keeps its sequence number, so
-    /// that subscribers that outlive a listener see what was lost in between.
+    /// Epoch, sensor's number and sequence number of the last sample. The first sample after a start of the listener is
+    /// published under the sequence number of its datagram. Subscribers that outlive a listener therefore see what was
+    /// lost in between.
     last: Option<(u32, u8, u32)>,
     period_estimator: PeriodEstimator,
 }
@@ -225,17 +226,17 @@ struct Stream {
 /// Number and header of a sample in this domain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct LocalNumber {
-    /// Numbers of the topic that are skipped before it, because their samples are missing.
+    /// Count of numbers of the topic that are skipped before this sample, because their samples are missing.
     skip_count: u64,
-    /// Header with the period of sending, without the number in the topic.
+    /// Header with the estimated period, and without the number in the topic.
     header: Header,
 }
 
 impl Stream {
-    /// Places `remote`, which is not late, as the next sample of the topic, which process `pid` publishes. All numbers
-    /// between the last one and it are skipped, whether they were lost or not published. In a new run of the gateway,
-    /// these are all numbers before it. If the sensor has another number than before, none is skipped, because they may
-    /// belong to another sensor.
+    /// Assigns the next number of the topic to `remote`, which is not late and is published by process `pid`. The
+    /// numbers between the last sample and `remote` are skipped, whether their samples were lost or not published. In a
+    /// new run of the gateway, all numbers before `remote` are skipped. If the sensor's number in the hub has changed,
+    /// none is skipped, because the numbers in between may belong to another sensor.
     fn assign_number(&mut self, remote: &ReceivedSample<'_>, pid: u32) -> LocalNumber {
         let head = &remote.head;
         let next = (head.epoch, head.sensor, head.sequence);
@@ -259,26 +260,28 @@ fn steps(last: (u32, u8, u32), next: (u32, u8, u32)) -> Option<u32> {
     ((next.0, next.1) == (last.0, last.1) && steps <= u32::MAX / 2).then_some(steps)
 }
 
-/// Estimates the period at which samples of a topic are sent. A gateway may leave out samples, which its datagrams do
-/// not indicate.
+/// Estimator of the period at which samples of a topic are sent. A gateway may thin out samples, and its datagrams do
+/// not contain the thinning factor.
 #[derive(Default)]
 struct PeriodEstimator {
     last_ns: Option<u64>,
-    /// Times between the last samples as they were sent, in ns.
+    /// Times between consecutive samples as they were sent, in ns; the last few of them.
     distances_ns: [u64; MEDIAN_SAMPLES],
     count: usize,
 }
 
-/// Number of distances whose median is the period. Two gaps and a burst among them do not change the median.
+/// Number of times between samples whose median is the period. Two gaps and a burst among them do not change the
+/// median.
 const MEDIAN_SAMPLES: usize = 5;
 
-/// Maximum period. A longer time is a silence, and a verdict of that age is useless.
+/// Maximum period, in ns. A longer time between samples is a silence, and a verdict of that age is useless.
 const MAX_PERIOD_NS: u64 = 2_500_000_000;
 
 impl PeriodEstimator {
     /// Records a sample that arrived at `now_ns`, `steps` numbers after the last one; 0 if that is unknown. Returns the
-    /// period in us: the median of the last times, the shorter one of two, or 0 while it is unknown. Lost samples do
-    /// not extend it, because a verdict would otherwise be valid for longer on a bad link than on a good one.
+    /// period in us, or 0 while it is unknown. The period is the median of the last times between samples, and of two
+    /// middle ones the shorter. Lost samples do not extend the period, because a verdict would otherwise be valid for
+    /// longer on a bad link than on a good one.
     fn period_us(&mut self, now_ns: u64, steps: u64) -> u32 {
         let before_ns = self.last_ns.replace(now_ns);
         let distance_ns = before_ns.and_then(|before_ns| now_ns.checked_sub(before_ns)?.checked_div(steps));
@@ -300,7 +303,7 @@ mod tests {
 
     use scanhub_schema::datagram::{Datagram, HEADER_LEN};
 
-    /// Published statuses of a sensor: the state, and its stamps in ms.
+    /// Published statuses of a sensor: the state, the stamp, and the start of the state, both in ms.
     #[derive(Default)]
     struct StatusLog(Vec<(Option<State>, u64, u64)>);
 
@@ -351,7 +354,7 @@ mod tests {
         };
         let read = |ms| WallTimestamp { monotonic_ns: ms * MS, wall_ns: ms * MS };
         assert_eq!(sensor.publish(&arrived(1_000)), Outcome::Published);
-        // The listener lags: it reads next what arrived at 4.6 s.
+        // The listener lags. It reads the sample that arrived at 4.6 s only after these calls.
         [3_999, 4_500, 4_550].into_iter().for_each(|ms| sensor.do_periodic_work(read(ms)));
         assert_eq!(sensor.publish(&arrived(4_600)), Outcome::Published);
         sensor.do_periodic_work(read(5_000));
@@ -388,7 +391,7 @@ mod tests {
             periods_ms(&[0, 100, 200, 500, 600, 901, 902, 903]),
             [0, 100, 100, 100, 100, 100, 100, 100]
         );
-        // Samples are thinned from now on. Three of them change the median.
+        // After 100 ms, samples are thinned. Three of the longer times change the median.
         assert_eq!(periods_ms(&[0, 20, 40, 60, 80, 100, 1100, 2100, 3100]).split_off(6), [20, 20, 1000]);
     }
 
@@ -409,8 +412,9 @@ mod tests {
         assert_eq!(periods_ms(&[500, 400, 300]), [0, 0, 0], "a clock that is set back");
     }
 
-    /// Follows a stream whose samples arrive every `period_ms` for a minute; one in `sent` samples arrives. Returns how
-    /// often its verdict becomes unknown before the end, and how long after the end it does, in ms.
+    /// Simulates a stream for a minute. A sample arrives every `period_ms`, and it is the only one of `sent` samples
+    /// that arrives. Returns how often the verdict becomes unknown before the end of the stream, and after how many ms
+    /// without a sample it does so at the end.
     fn follow(period_ms: u64, jitter_ms: u64, sent: u64) -> (u32, u64) {
         let (mut arrivals, mut freshness) = (PeriodEstimator::default(), StalenessTimer::new(at(0)));
         let mut silences = 0;
