@@ -33,7 +33,8 @@ function ink(color, width) {
   pen.lineWidth = width;
 }
 
-/** Sets the font of the following texts. They are centered horizontally, and `baseline` defines their vertical position. */
+/** Sets the font of the following texts. They are centered horizontally, and `baseline` defines their vertical
+ * position. */
 function font(size, baseline) {
   pen.font = `${size}px system-ui, sans-serif`;
   pen.textAlign = "center";
@@ -52,7 +53,7 @@ function stroke(...points) {
   pen.stroke();
 }
 
-/** Clears another canvas, and calls `paint` to draw on it. */
+/** Clears `canvas`, and calls `paint`, whose drawing goes to `canvas` instead of the picture. */
 function drawOn(canvas, paint, width = size.width, height = size.height) {
   [canvas.width, canvas.height] = [width * size.ratio, height * size.ratio];
   const before = pen;
@@ -78,8 +79,8 @@ function label(text, x, y) {
   pen.fillText(text, x, y);
 }
 
-/** Returns both axes, the vertical one first: a function to the screen from a position along the axis and the other coordinate,
- * and the side on which the axis has its numbers. */
+/** Returns both axes, the vertical axis first. `at` converts a position along the axis, and the position along the
+ * other axis, to the screen. `right` and `down` point to the side on which the axis has its numbers. */
 function axes() {
   return [
     { center: view.x, at: (n, other) => toScreen(n, other), other: view.y, right: cos, down: sin, sign: 1,
@@ -116,7 +117,8 @@ function drawGrid() {
   });
 }
 
-/** Writes the name of each axis near its positive end, between two numbers. Called last, so that points do not hide it. */
+/** Writes the name of each axis near its positive end, between two numbers. Called last, so that points do not hide
+ * the name. */
 function drawAxisNames() {
   const [step, reach] = [gridStep(), gridReach()];
   ink(colors.soft, 1);
@@ -171,8 +173,8 @@ function drawField(sensor) {
 // Distance between two points in pixels. If it is smaller, the previous point hides the next one.
 const MIN_DOT_DISTANCE = 0.8;
 
-/** Draws squares of `width` pixels at `points` of a sensor at `pose`, with the canvas method `method`. Returns the number of points
- * that are not NaN. */
+/** Draws squares of `width` pixels at `points` of a sensor at `pose`, with the canvas method `method`. Returns the
+ * number of points that are not NaN. */
 function dots(points, width, pose, method = "fillRect") {
   if (!points || !pose) return 0;
   const [a, b, c, d, e, f] = onScreen(pose);

@@ -52,7 +52,7 @@ function draw(now) {
 }
 
 let isDrawRequested = false;
-// Whether data has arrived, or the view has changed.
+// Whether data has arrived, or the view has changed, since the last frame.
 let isFitDue = false;
 
 function requestDraw() {

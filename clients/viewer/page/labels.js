@@ -95,7 +95,8 @@ function updateTexts() {
   measureMargins();
 }
 
-/** Returns the people in each room as text. If an ID is greater than the number of people, adds the number of tracks so far. */
+/** Returns the people in each room as text. If an ID is greater than the number of people, adds the number of tracks so
+ * far. */
 function peopleText() {
   if (!isReceiving() || !robot.people) return "";
   const all = allPeople();
@@ -234,8 +235,8 @@ function roundUp(value) {
   return power * [1, 2, 5, 10].find((step) => step * power >= value || step === 10);
 }
 
-/** Draws the values of the last two minutes. The scale starts at 0, so that small variations do not look like a problem. Returns
- * the scale as text. */
+/** Draws the values of the last two minutes. The scale starts at 0, so that small variations do not look like a
+ * problem. Returns the scale as text. */
 function sparkline(canvas, history, series) {
   const { clientWidth: width, clientHeight: height } = canvas;
   const now = performance.now();

@@ -49,7 +49,8 @@ function drawLines() {
   return walls.length;
 }
 
-/** Draws people with ID, tail and uncertainty. People who are not seen are dashed and pale. Returns the number. */
+/** Draws people with ID, tail and uncertainty. People who are not seen are dashed and pale. Returns the number of
+ * people. */
 function drawPeople() {
   ink(colors.person, 2);
   font("600 13", "bottom");

@@ -41,7 +41,8 @@ const TRAIL_MS = 1600;
 const TRAIL_STEP_MS = 90;
 const HISTORY_MS = 120_000;
 
-/** Returns the entry of `all` that a topic belongs to, and creates it with `create`. It belongs to this run of the server. */
+/** Returns the entry of `all` for the namespace of a topic, and creates the entry with `create` if the namespace is
+ * new. Marks the entry as one of this run of the server. */
 function entryFor(all, topic, create) {
   const space = topic.slice(0, topic.lastIndexOf("/"));
   if (!all.has(space)) all.set(space, { space, name: space.slice(1).replaceAll("/", "."), ...create() });

@@ -2,10 +2,11 @@
 // is turned.
 
 const CLASSES = ["unknown", "background", "foreground", "behind"];
-/** Class, color, width, method of the pen, and layer. Not by color alone, for the color-blind. Later ones are drawn above earlier ones. */
+/** Class, color, width, method of the pen, and layer. Classes differ in width and shape too, because not everyone can
+ * distinguish the colors. Points of later entries are drawn above points of earlier entries. */
 const CLASS_STYLES = [["background", "old", 2, "fillRect", "background"], ["unknown", "soft", 2.5, "fillRect", "scan"],
   ["behind", "line", 5, "strokeRect", "foreground"], ["foreground", "new", 4, "fillRect", "foreground"]];
-/** Transforms pairs of right and up into the view, in the form of a sensor's pose. */
+/** Transform of pairs of right and up to the view. It has the form of a sensor's pose. */
 const SIDE_POSE = [0, 1, -1, 0, 0, 0];
 
 function takeCloud(topic, buffer, offset) {
@@ -28,7 +29,8 @@ const sideAxisName = () => (view.turn ? "to the right" : "ahead");
 
 const rightOf = (x, y) => x * Math.cos(view.turn) - y * Math.sin(view.turn);
 
-/** Returns a list of pairs of right and up for each class of each sweep. They are computed once for a sweep and a turn of the view. */
+/** Returns a list of pairs of right and up for each class of each sweep. The lists of a sweep are computed again only
+ * if the view is turned. */
 const sidePoints = () => allSweeps().filter(({ points }) => points).flatMap((one) => {
   if (one.turn !== view.turn) {
     one.turn = view.turn;
@@ -48,7 +50,8 @@ const pointsCanvas = make("canvas");
 // Content of the canvas, and number of points on the canvas.
 let pointsCanvasState = {};
 
-/** Draws all points, and returns their number. They are drawn once for a sweep and a view, on a canvas that each frame copies. */
+/** Draws all points, and returns their number. The points are drawn on a canvas that each frame copies. They are drawn
+ * again only if a sweep or the view changes. */
 function drawPoints() {
   const all = sidePoints();
   const key = JSON.stringify([view, size, layers, colors.paper, allSweeps().map(({ at, points }) => points && at)]);
@@ -65,7 +68,8 @@ function drawPoints() {
   return pointsCanvasState.count;
 }
 
-/** Draws a box around each obstacle with its distance, in either view; `!` if it is near. Returns the number of obstacles. */
+/** Draws a box around each obstacle, with the obstacle's distance, and `!` if the obstacle is near. Both views use this
+ * function. Returns the number of obstacles. */
 function drawObstacles() {
   const all = allSweeps().flatMap(({ obstacles }) => obstacles);
   font("600 12", "bottom");

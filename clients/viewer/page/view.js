@@ -14,7 +14,7 @@ try {
 const views = ["above", "aside"].map(() => ({ x: 1, y: 0, scale: 60, turn: 0, fits: true, isFitted: false, goal: null }));
 let view = views[0];
 const isSideView = () => view === views[1];
-// The only sensor that is shown; null for all.
+// Namespace of the only sensor that is shown; null for all sensors.
 let shownSpace = null;
 const isMotionReduced = matchMedia("(prefers-reduced-motion: reduce)");
 // Position of the pointer over the picture, in pixels.
@@ -27,7 +27,8 @@ let size = { width: 1, height: 1, ratio: 1 };
 /** Widths of the margins that boxes cover, in pixels. */
 let covered = { top: 0, right: 0, bottom: 0 };
 
-/** Measures the margins. They do not shrink while the window keeps its size: text that changes must not move the picture. */
+/** Measures the margins. The margins do not shrink while the window keeps its size, because text that changes must not
+ * move the picture. */
 function measureMargins() {
   const box = (name) => document.querySelector(name).getBoundingClientRect();
   const isNarrow = size.width <= 720;
@@ -54,7 +55,7 @@ function toScreen(x, y) {
   return [cx + a * cos - b * sin, cy + a * sin + b * cos];
 }
 
-/** Transforms a point from a sensor's frame to the robot's. */
+/** Transforms a point from a sensor's frame to the robot's frame. */
 const inFrame = ([xx, xy, yx, yy, x, y], px, py) => [xx * px + xy * py + x, yx * px + yy * py + y];
 
 /** Returns the transform from a sensor's frame to the screen, as the six numbers of a canvas transform. */
@@ -77,7 +78,8 @@ function updateView() {
   [cos, sin] = isSideView() ? [1, 0] : [Math.cos(view.turn), Math.sin(view.turn)];
 }
 
-/** Returns the scanner on the mount; null if it is unknown, because this machine has more than one scanner. */
+/** Returns the scanner on the mount. Returns null if no sweep has arrived, or if this machine has several scanners,
+ * because then it is unknown which scanner is on the mount. */
 function tiltedSensor() {
   const local = allSensors().filter(({ status }) => status && !status.remote);
   return allSweeps().some(({ sweep }) => sweep) && local.length === 1 ? local[0] : null;
@@ -92,7 +94,8 @@ const allPoints = () => (isSideView() ? sidePoints() : shownSensors().filter((on
 
 const MARGIN = 1.1;
 
-/** Fits the visible points into the picture, without a few outliers. Keeps the view if it is about right. */
+/** Fits the visible points into the picture, without a few outliers. Keeps the current view if the points fit well
+ * enough. */
 function fit() {
   const visible = allPoints();
   // A few hundred points are enough to find the edges of the picture.

@@ -108,8 +108,8 @@ function toPoints(ranges, first, step) {
   return xy;
 }
 
-/** Returns the pose of a sensor as a transform [xx, xy, yx, yy, x, y], which mirrors if the sensor is upside down. Returns null
- * while the pose is unknown; the sensor's data is then not drawn. */
+/** Returns the pose of a sensor as a transform [xx, xy, yx, yy, x, y], which mirrors if the sensor is upside down.
+ * Returns null while the pose is unknown; the sensor's data is then not drawn. */
 function poseOf({ status }) {
   if (!status?.pose) return null;
   const { x_m, y_m, yaw_rad, upside_down } = status.pose;
@@ -171,7 +171,7 @@ const rosHandlers = { scan: takeScan, foreground: takeForeground, background: ta
 const jsonHandlers = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: takeLines, tracks: takeTracks, obstacles: takeObstacles,
   marks: (update) => { marks = spheres(update); }, replay: (progress) => { player = progress; } };
 
-/** Topics that change only the texts next to the picture. */
+/** Topics that change only the texts next to the picture. They are shown even while the picture is frozen. */
 const LIVE_TOPICS = ["robot", "status", "replay"];
 // Newest message of each topic while the picture is frozen.
 let heldMessages = null;
@@ -206,8 +206,8 @@ let retryDelay = 250;
 // Topics by channel ID, which is also the ID of the subscription.
 const topics = new Map();
 
-/** Returns whether the page needs `topic` now. Line features and clouds cost CPU time elsewhere, so the page subscribes to them
- * only while it shows them. */
+/** Returns whether the page needs `topic` now. Line features and clouds cost other programs CPU time, so the page
+ * subscribes to them only while it shows them. */
 function isNeeded(topic) {
   const kind = lastPart(topic);
   return kind === "lines" ? layers.lines : kind === "cloud" ? isSideView() : !["tilt", "tf_static"].includes(kind);

@@ -1,8 +1,8 @@
 //! Live pictures of a hub's sensors: `watch` in a terminal, and `web` for browsers and Foxglove.
 //!
 //! Both verbs update a [`scene`] from the topics of a hub, so their pictures always agree. Only the [`server`] of `web`
-//! handles untrusted input. The server only has channels of bytes, and a test checks that it uses neither a hub nor a
-//! file.
+//! handles untrusted input. The server only handles channels of bytes. A test checks that its code uses neither a hub
+//! nor a file.
 #![forbid(unsafe_code)]
 
 #[cfg(any(feature = "tui", feature = "web"))]

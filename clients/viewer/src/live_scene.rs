@@ -14,8 +14,8 @@ use scanhub_verbs::names::TopicName;
 
 use crate::scene::Scene;
 
-/// Topics that every picture needs. The status is first, because it has the pose of the sensor. [`Topic::Lines`] costs
-/// the hub CPU time while it has a subscriber, so a picture subscribes to it only while it shows lines.
+/// Topics of every picture. The status is first, because it has the pose of the sensor. [`Topic::Lines`] costs the hub
+/// CPU time while it has a subscriber, so a picture subscribes to it only while it shows lines.
 pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Status,
     Topic::Scan,
@@ -28,8 +28,9 @@ pub(crate) const TOPICS: [Topic; 8] = [
 ];
 
 /// Returns the topics to subscribe to for the named `sensors`, and the topics to subscribe to for every sensor. Without
-/// names, returns the topics of all sensors of a hub and of all programs that publish. If a name belongs to a program
-/// in the first live domain of `locations`, the picture also has all sensors.
+/// names, the second list has all requested topics: those of sensors, and those of programs that publish. If a name
+/// belongs to a program that publishes in the first live domain of `locations`, the second list has the topics of all
+/// sensors, so that the picture has the sensors too.
 pub(crate) fn topics_to_follow(
     sensors: &[String],
     requested: &[Topic],
@@ -57,7 +58,7 @@ pub(crate) fn topics_to_follow(
 #[derive(Default)]
 pub(crate) struct LiveScene {
     pub(crate) scene: Scene,
-    /// Scans and foregrounds of each sensor that wait for their partner.
+    /// For each sensor, the scans that wait for their foreground, and the foregrounds that wait for their scan.
     joins: BTreeMap<String, Join<StampedScan, Box<Foreground>>>,
     cpu: CpuUsage,
 }
@@ -69,7 +70,7 @@ type StampedScan = (Header, Box<Scan>);
 pub(crate) type Pair = (StampedScan, Box<Foreground>);
 
 impl LiveScene {
-    /// Adds the sensor of a topic that will be subscribed to, if the topic belongs to a link.
+    /// Adds the sensor of the topic `name`, to which the caller will subscribe, if the topic belongs to a link.
     pub(crate) fn begin(&mut self, name: &TopicName) {
         if name.topic.publisher_kind() == PublisherKind::Link {
             self.scene.sensor(&name.sensor);
@@ -144,18 +145,19 @@ impl LiveScene {
         }
     }
 
-    /// Deletes data that is too old. Returns whether any was deleted.
+    /// Deletes data that is too old. Returns whether any data was deleted.
     pub(crate) fn expire(&mut self) -> bool {
         self.scene.expire(clock::now_ns())
     }
 
-    /// Drops samples whose partners do not arrive. Call this function after all waiting samples were taken.
+    /// Drops scans whose foreground has not arrived in time, and foregrounds whose scan has not. Call this function
+    /// after all waiting samples were taken.
     pub(crate) fn expire_joins(&mut self) {
         let now_ns = clock::now_ns();
         self.joins.values_mut().for_each(|join| join.expire(now_ns));
     }
 
-    /// Updates the CPU time of the hub. Returns whether it has changed.
+    /// Updates the CPU time of the hub. Returns whether this value has changed.
     pub(crate) fn measure_hub(&mut self, now: Instant) -> bool {
         if self.scene.hub_pid == 0 {
             return false;
@@ -174,8 +176,8 @@ struct CpuUsage {
 }
 
 impl CpuUsage {
-    /// Measures process `pid`, at most once a second. Returns the CPU time over the last five seconds in percent of one
-    /// processor, if it is known.
+    /// Measures the CPU time of process `pid`, at most once a second. Returns the CPU time over the last five seconds
+    /// in percent of one processor; `None` if it is unknown.
     fn measure(&mut self, pid: u32, now: Instant) -> Option<f64> {
         if self.pid != pid {
             *self = CpuUsage { pid, samples: VecDeque::new() };
@@ -193,7 +195,7 @@ impl CpuUsage {
 }
 
 /// Returns the CPU time of process `pid` in ns: user and system time, including threads that have ended. Returns `None`
-/// if it is not accessible.
+/// if the process is not accessible.
 ///
 /// The sum over the running threads would have a finer resolution than a tick, but it decreases when a thread ends.
 fn used_ns(pid: u32) -> Option<u64> {
@@ -210,7 +212,7 @@ const TICK_NS: u64 = 10_000_000;
 
 /// Minimum interval between measurements.
 const MEASUREMENT_INTERVAL: Duration = Duration::from_secs(1);
-/// Number of measurements that are kept.
+/// Maximum number of stored measurements. At one per second, the first and the last one are five seconds apart.
 const MAX_MEASUREMENTS: usize = 6;
 
 #[cfg(test)]

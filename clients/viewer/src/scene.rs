@@ -65,7 +65,7 @@ impl Scene {
     }
 
     /// Returns the sensor `name`, from which a sample with this `header` arrived. A sample with a header shows that a
-    /// hub runs. Unless the sensor is remote, the header has the hub's process ID.
+    /// hub runs. The header of a local sensor's sample has the process ID of the hub.
     pub fn sensor_of_sample(&mut self, name: &str, header: Option<&Header>) -> &mut Sensor {
         if let Some(header) = header {
             self.hub_is_running = true;
@@ -96,13 +96,14 @@ impl Scene {
         self.trackers.iter().flat_map(|(_, people)| people.known())
     }
 
-    /// Returns whether the picture is the map of a site. It is if a tracker has sent poses of sensors in its map.
+    /// Returns whether the picture is the map of a site. This is the case if a tracker has sent poses of sensors in its
+    /// map.
     pub fn is_in_map(&self) -> bool {
         self.sensors.iter().any(|sensor| sensor.placement.is_in_map())
     }
 
-    /// Returns the sensors of the robot with their indices, or all sensors if the robot has none. Remote sensors belong
-    /// to other robots.
+    /// Returns the sensors of the robot with their indices, or all sensors if all are remote. Remote sensors belong to
+    /// other robots.
     pub fn robot(&self) -> impl Iterator<Item = (usize, &Sensor)> {
         let has_own = self.sensors.iter().any(|sensor| !is_remote(&sensor.name));
         self.sensors.iter().enumerate().filter(move |(_, sensor)| !has_own || !is_remote(&sensor.name))
@@ -125,7 +126,7 @@ impl Scene {
         self.sensors.iter_mut().for_each(|sensor| sensor.lines = None);
     }
 
-    /// Deletes all data of a hub that has exited. The background stays, because it is only drawn.
+    /// Deletes all data of a hub that has exited. The background stays, because it is used only for drawing.
     pub fn on_hub_exit(&mut self) {
         (self.hub_is_running, self.hub_pid, self.hub_percent) = (false, 0, None);
         self.trackers.clear();
@@ -148,7 +149,7 @@ pub fn verdict<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> (Verdict, Optio
     (worst.map_or(Verdict::Unknown, |(verdict, _)| verdict), worst.map(|(_, name)| name), nearest)
 }
 
-/// A zone of the robot: a circle around its center. The hub decides whether a circle is violated.
+/// A zone of the robot: a circle around the robot's center. The hub decides whether a circle is violated.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Circle {
     /// Radius in meters.
@@ -175,8 +176,8 @@ impl Circle {
     }
 }
 
-/// Returns the circles of `sensors`, each once, in the order of the sensors. Sensors in a map have none, because the
-/// position of the robot's center in the map is unknown.
+/// Returns the circles of `sensors` in the order of the sensors, and each circle only once. Sensors in a map have no
+/// circles, because the position of the robot's center in the map is unknown.
 pub fn circles<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> Vec<Circle> {
     let mut radii: Vec<(u16, bool)> = Vec::new();
     let on_robot = sensors.filter(|sensor| !sensor.placement.is_in_map());

@@ -1,6 +1,6 @@
 //! Web server with one page and one WebSocket. The page and other viewers use the WebSocket with the protocol
 //! `foxglove.sdk.v1`. One thread serves all clients. A slow client gets only the newest messages, and does not delay
-//! the others.
+//! other clients.
 
 mod channels;
 mod connection;
@@ -43,9 +43,9 @@ const SEND_BUFFER_LEN: usize = 64 << 10;
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 /// Minimum interval between two reports that no connection can be accepted.
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
-/// Maximum time that the thread sleeps.
+/// Maximum time for which the thread sleeps.
 const MAX_SLEEP: Duration = Duration::from_secs(1);
-/// Errors of a single connection, after which the next one can be accepted.
+/// Errors of a single connection. After such an error, the next connection can be accepted.
 const CONNECTION_ERRORS: [io::ErrorKind; 3] =
     [io::ErrorKind::ConnectionAborted, io::ErrorKind::ConnectionReset, io::ErrorKind::Interrupted];
 
@@ -65,7 +65,7 @@ pub struct ViewerEvent {
     pub address: SocketAddr,
     /// Whether the viewer connected.
     pub connected: bool,
-    /// Number of messages that newer ones replaced before they were sent.
+    /// Number of messages that newer messages replaced before they could be sent.
     pub replaced: u64,
     /// Number of viewers that are connected now.
     pub viewers: usize,
@@ -110,7 +110,7 @@ impl Server {
     }
 
     /// Serves `channels`, and passes commands of viewers to the `player`, until `stop` is set and
-    /// [`ChannelStore::wake`] is called. Reports to `events`.
+    /// [`ChannelStore::wake`] is called. Sends reports to `events`.
     ///
     /// # Errors
     ///

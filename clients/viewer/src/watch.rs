@@ -1,5 +1,5 @@
-//! `scanhub watch`: the live picture in the terminal. It sleeps until new data arrives, limits the frame rate on slow
-//! lines, and always restores the terminal.
+//! `scanhub watch`: the live picture in the terminal. The verb sleeps until new data arrives, limits the frame rate for
+//! slow terminals, and always restores the terminal.
 
 mod draw;
 mod map;
@@ -45,7 +45,7 @@ Examples:
 
 Keys: q quits, ? lists the other keys. NO_COLOR=1 shows signs instead of colors. From another machine: ssh -t robot scanhub watch.";
 
-/// Minimum interval between frames, so that a scan is on the screen within 50 ms.
+/// Minimum interval between frames. With this interval, a scan is on the screen within 50 ms.
 const FRAME_INTERVAL: Duration = Duration::from_millis(45);
 /// Maximum number of bytes of frames per second. Large frames are drawn less often.
 const BYTES_PER_SECOND: f64 = 80_000.0;
@@ -118,10 +118,10 @@ pub fn can_show_pictures() -> bool {
 struct Watcher<'a> {
     /// Locations where the domain may be.
     locations: &'a [Domain],
-    /// Whether the run ends by itself. Ctrl-C is then a failure.
+    /// Whether the arguments limit the run. Ctrl-C before the limit is then a failure.
     is_bounded: bool,
     live: LiveScene,
-    /// Scene of the frozen picture. Its verdict and the lines of sensors are still live.
+    /// Scene of the frozen picture; `None` if the picture is live. The verdict and the lines of the sensors stay live.
     held_scene: Option<Scene>,
     view: View,
     terminal: Terminal<'a>,
@@ -172,8 +172,8 @@ impl Watcher<'_> {
         Ok(())
     }
 
-    /// Sends the request `verb` for the backgrounds of the shown sensors. If all of them are frozen, a freeze becomes a
-    /// thaw.
+    /// Sends the request `verb` for the backgrounds of the shown sensors. If all these backgrounds are frozen, a freeze
+    /// becomes a thaw.
     fn request(&mut self, verb: Verb, now: Instant) {
         let shown = self.view.shown(&self.live.scene);
         let own: Vec<_> = shown.into_iter().filter(|(_, sensor)| !is_remote(&sensor.name)).collect();
@@ -256,8 +256,8 @@ impl Watcher<'_> {
     }
 }
 
-/// Request to the hub to reset, freeze or thaw backgrounds. It runs in its own thread, so that a slow hub does not
-/// delay the picture. At most one runs at a time.
+/// Request to the hub to reset, freeze or thaw backgrounds. A request runs in its own thread, so that a slow hub does
+/// not delay the picture. At most one request runs at a time.
 #[derive(Default)]
 struct BackgroundRequest {
     running: Option<JoinHandle<RequestOutcome>>,
@@ -282,7 +282,7 @@ impl BackgroundRequest {
         true
     }
 
-    /// Returns the outcome after the request has ended. Returns it to only one call.
+    /// Returns the outcome once the request has ended. Later calls return `None`.
     fn outcome(&mut self) -> Option<RequestOutcome> {
         self.running.take_if(|running| running.is_finished())?.join().ok()
     }
@@ -291,7 +291,7 @@ impl BackgroundRequest {
 impl Drop for BackgroundRequest {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
-        // The thread occupies a slot of the domain until it ends.
+        // Wait for the thread, because it occupies a slot of the domain until it ends.
         let _ = self.running.take().map(JoinHandle::join);
     }
 }

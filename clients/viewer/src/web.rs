@@ -1,5 +1,5 @@
-//! `scanhub web`: the live picture for browsers and for viewers of `foxglove.sdk.v1`. This thread subscribes to the hub
-//! and publishes on channels; another thread serves them.
+//! `scanhub web`: the live picture for browsers and for viewers of `foxglove.sdk.v1`. The main thread subscribes to the
+//! hub and publishes on channels. Another thread serves these channels.
 
 mod channels;
 mod feed;
@@ -107,7 +107,7 @@ impl WebArgs {
     ///
     /// - [`Kind::Input`] or [`Kind::Configuration`] if the token cannot be read from its file.
     /// - [`Kind::Usage`] if a sensor's name is not valid, or if other machines could connect without a token.
-    /// - [`Kind::Failed`] if the server cannot listen or wait, or its thread ends.
+    /// - [`Kind::Failed`] if the server cannot listen, if waiting for its sockets fails, or if its thread panics.
     /// - [`Kind::NoHub`], [`Kind::NoTopic`], [`Kind::Timeout`] and [`Kind::Interrupted`] in the same cases as `scanhub
     ///   echo`.
     pub fn run(
@@ -142,7 +142,7 @@ impl WebArgs {
         thread::scope(|scope| {
             let served = thread::Builder::new()
                 .name("web".into())
-                // The thread owns `report`, so its end closes the channel of events.
+                // The thread owns `report`, so the end of the thread closes the channel of events.
                 .spawn_scoped(scope, {
                     let (server, channels, is_over) = (&server, &channels, &is_over);
                     move || server.run(channels, player, &report, is_over)
@@ -183,7 +183,7 @@ fn listen_address(text: &str) -> Result<SocketAddr, String> {
     Err("use localhost or an IP address, a port, or both, such as 8090, 0.0.0.0 or [::]:8090".to_owned())
 }
 
-/// Parses a token. It must be valid in a URL without escapes.
+/// Parses a token. The token must be valid in a URL without escapes.
 fn token(text: &str) -> Result<String, String> {
     let is_plain = |sign: char| sign.is_ascii_alphanumeric() || "-._~".contains(sign);
     match !text.is_empty() && text.chars().all(is_plain) {
@@ -214,7 +214,7 @@ fn read_token(file: &Path) -> Result<String, Failure> {
 }
 
 /// Returns the URLs of the page. If the server listens on all addresses, the first URL has the name of this machine, if
-/// it is known, and the others have the addresses in `reachable` that the server accepts.
+/// `host` is not empty. The other URLs have the addresses in `reachable` that the server accepts.
 fn urls(address: SocketAddr, reachable: &[IpAddr], host: &str, token: Option<&str>) -> Vec<String> {
     let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
     let of = |host: &dyn fmt::Display| format!("http://{host}/{token}");
@@ -231,7 +231,7 @@ fn urls(address: SocketAddr, reachable: &[IpAddr], host: &str, token: Option<&st
 }
 
 /// Returns the addresses by which other machines can reach this machine. The list is empty if the system does not
-/// report them. Omits link-local IPv6 addresses, because a browser needs the interface too.
+/// report them. Omits link-local IPv6 addresses, because a browser would also need the name of an interface.
 fn reachable_addresses() -> Vec<IpAddr> {
     let up = getifaddrs().into_iter().flatten().filter(|entry| entry.flags.contains(InterfaceFlags::IFF_UP));
     let addresses = up.filter_map(|entry| {
@@ -271,8 +271,8 @@ struct Reporter<'a> {
 }
 
 impl Reporter<'_> {
-    /// Prints the URLs of the page. As text, also prints notes about access: with a local address the flags for other
-    /// machines, and with `--open` a warning.
+    /// Prints the URLs of the page. As text, also prints a note about access. For a local address, the note has the
+    /// flags for access from other machines. With `--open`, it is a warning.
     fn ready(&mut self, urls: &[String], args: &WebArgs) -> Result<(), ExitReason> {
         #[derive(Serialize)]
         struct ReadyJson<'a> {
@@ -309,7 +309,7 @@ impl Reporter<'_> {
         self.output.line(|line| write!(line, "for other machines: --listen 0.0.0.0{port} {token}"))
     }
 
-    /// Prints why there is no hub yet, and the command that serves another one. With JSON, only viewers get the reason.
+    /// Prints the reason why no hub runs yet, and a hint. With JSON, only viewers get the reason.
     fn no_hub(&mut self, failure: &Failure) -> Result<(), ExitReason> {
         match self.json {
             true => Ok(()),
@@ -321,7 +321,7 @@ impl Reporter<'_> {
     ///
     /// # Errors
     ///
-    /// Returns [`ExitReason::ReaderClosed`] if the server has ended. Its thread has the reason.
+    /// Returns [`ExitReason::ReaderClosed`] if the server has ended. The result of its thread has the reason.
     fn report_events(&mut self) -> Result<(), ExitReason> {
         loop {
             match self.events.try_recv() {
@@ -361,8 +361,8 @@ impl Reporter<'_> {
         }
     }
 
-    /// Prints that a topic is not served because the system lacks a resource, unless a line about this was just
-    /// printed.
+    /// Prints that a topic is not served because the system lacks a resource, unless a line about a topic that is not
+    /// served was printed in the last 10 s.
     fn not_served(&mut self, name: &TopicName, failure: &Failure) -> Result<(), ExitReason> {
         let now = Instant::now();
         if self.next_shortage_report.is_some_and(|at| now < at) {
@@ -507,7 +507,7 @@ mod tests {
             let ready = received.recv_timeout(Duration::from_secs(60)).unwrap_or_default();
             let address = ready.lines().next().unwrap_or_default();
             let sent = send_command(address.trim().trim_start_matches("ready http://").trim_end_matches('/'));
-            // Stop the verb if the command could not be sent, because it would not end by itself.
+            // Stop the verb if the command could not be sent, because the verb would not end by itself.
             stop.store(sent.is_err(), Ordering::Relaxed);
             (sent, verb.join().unwrap())
         });

@@ -24,7 +24,7 @@ pub struct Person {
     pub position: (f64, f64),
     /// Uncertainty of the position.
     pub ellipse: Ellipse,
-    /// Name of the room, if the person is in one.
+    /// Name of the room; `None` if the person is outside all rooms.
     pub room: Option<String>,
     /// Positions of the last seconds, the oldest first, each with its time in ns of CLOCK_MONOTONIC.
     tail: VecDeque<(u64, (f64, f64))>,
@@ -42,9 +42,9 @@ pub struct Ellipse {
 }
 
 impl Ellipse {
-    /// Computes the ellipse of a normal distribution with this covariance in m2: xx, xy, yy. The axes are the
-    /// eigenvectors. Their length is the root of the eigenvalue times the 95 % quantile of chi-squared with two degrees
-    /// of freedom.
+    /// Computes the ellipse of a normal distribution with this covariance in m2: xx, xy, yy. The axes have the
+    /// directions of the eigenvectors. Half of an axis is the square root of the product of its eigenvalue and the 95 %
+    /// quantile of chi-squared with two degrees of freedom.
     pub fn of(covariance: [f32; 3]) -> Ellipse {
         let [xx, xy, yy] = covariance.map(f64::from);
         let (mean, half) = ((xx + yy) / 2.0, ((xx - yy) / 2.0).hypot(xy));
@@ -140,11 +140,11 @@ pub fn rooms<'a>(people: impl Iterator<Item = &'a Person>) -> Option<String> {
     (count > 0).then(|| format!("{count} {persons}: {}", words.join(", ")))
 }
 
-/// Minimum interval between two positions of a tail.
+/// Minimum interval between two positions of a tail, in ns.
 const STEP_INTERVAL_NS: u64 = 150_000_000;
-/// Duration of a tail.
+/// Duration of a tail, in ns.
 const TAIL_NS: u64 = 5_000_000_000;
-/// Maximum age of the last sample of a tracker.
+/// Maximum age of the last sample of a tracker, in ns.
 const MAX_AGE_NS: u64 = 1_000_000_000;
 /// 95 % quantile of chi-squared with two degrees of freedom: -2 ln 0.05.
 const CHI_SQUARED_95: f64 = 5.991_464_547_107_979;

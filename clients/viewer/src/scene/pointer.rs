@@ -6,7 +6,7 @@ use super::{Point, Sensor};
 /// Position under the pointer.
 #[derive(Clone, Copy, Debug)]
 pub struct PointerPosition<'a> {
-    /// Meters ahead of the robot's center. If there is a reading, this is the coordinate of its point.
+    /// Meters ahead of the robot's center. If `reading` is set, this is the coordinate of its point.
     pub x_m: f64,
     /// Meters to the left of the robot's center.
     pub y_m: f64,
@@ -28,8 +28,8 @@ pub struct Reading<'a> {
 }
 
 impl<'a> PointerPosition<'a> {
-    /// Returns the nearest point of `sensors`, if it is within `within_m` of `at_m`, and otherwise the position `at_m`.
-    /// `at_m` is in meters ahead and to the left.
+    /// Returns the point of `sensors` that is nearest to `at_m`, if their distance is at most `within_m`, and otherwise
+    /// the position `at_m`. `at_m` is in meters ahead and to the left.
     pub fn of(
         sensors: impl Iterator<Item = &'a Sensor>,
         at_m: (f64, f64),

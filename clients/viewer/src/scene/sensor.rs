@@ -23,7 +23,7 @@ pub struct Sensor {
     pub scan: Option<Box<Scan>>,
     /// The last foreground, unless it is too old.
     pub foreground: Option<Box<Foreground>>,
-    /// Positions of the foreground over the last moments.
+    /// Positions of the foreground over the last 1.6 s.
     pub trail: Trail,
     /// Line features of the last scan, while they are shown.
     pub lines: Option<Box<Lines>>,
@@ -37,7 +37,7 @@ pub struct Sensor {
     pub meter: RateMeter,
     /// Number of scans that this program missed.
     pub missed: u64,
-    /// Highest intensity of the last minutes, in the sensor's units. It decreases slowly.
+    /// Highest intensity of the last minutes, in the sensor's units. This value decreases slowly.
     brightest: f64,
     /// Time from which on the last scan is too old to be shown, in ns of CLOCK_MONOTONIC.
     old_at_ns: u64,
@@ -71,7 +71,7 @@ impl Sensor {
         self.flags = header.flags;
     }
 
-    /// Stores a foreground. It is drawn on the last scan, even if the scan comes from another telegram.
+    /// Stores a foreground. The foreground is drawn on the last scan, even if this scan comes from another telegram.
     pub fn take_foreground(&mut self, foreground: &Foreground) {
         self.foreground = Some(foreground.boxed());
     }
@@ -85,7 +85,7 @@ impl Sensor {
         });
     }
 
-    /// Stores the status of the sensor's link, which has its pose on the robot.
+    /// Stores the status of the sensor's link. The status has the sensor's pose on the robot.
     pub fn take_status(&mut self, status: &Status) {
         self.status = Some(*status);
         if !self.placement.is_in_map() {
@@ -104,15 +104,15 @@ impl Sensor {
         self.trail.expire(now_ns) | is_old
     }
 
-    /// Deletes all data of a hub that has exited. The background stays, because it is only drawn.
+    /// Deletes all data of a hub that has exited. The background stays, because it is used only for drawing.
     pub(super) fn on_hub_exit(&mut self) {
         let background = self.background.take();
         let Sensor { placement, missed, .. } = *self;
         *self = Sensor { placement, background, missed, ..Sensor::new(&self.name) };
     }
 
-    /// Returns the brightness of a point with this `intensity`, from 0 to 1. It is the square root of `intensity`
-    /// divided by the highest intensity, because most points are dark.
+    /// Returns the brightness of a point with this `intensity`, from 0 to 1. The brightness is the square root of the
+    /// ratio of `intensity` to the highest intensity, because most points are dark.
     pub fn shade(&self, intensity: u16) -> f64 {
         (f64::from(intensity) / self.brightest).min(1.0).sqrt()
     }
@@ -166,7 +166,8 @@ impl Sensor {
         points.collect()
     }
 
-    /// Returns the line features of the last scan. They are in the robot's frame, so a sensor in a map has none.
+    /// Returns the line features of the last scan. Line features are in the robot's frame, so a sensor in a map has
+    /// none.
     pub fn lines(&self) -> Option<&Lines> {
         self.lines.as_deref().filter(|_| !self.placement.is_in_map())
     }
@@ -208,7 +209,7 @@ impl SensorPlacement {
     }
 }
 
-/// Positions of a sensor's foreground over the last moments. The number of steps is small enough to draw all of them.
+/// Positions of a sensor's foreground over the last 1.6 s. The number of steps is small, so that all can be drawn.
 #[derive(Clone, Debug, Default)]
 pub struct Trail {
     /// Steps, the oldest first: the time in ns of CLOCK_MONOTONIC, and the points in meters in the robot's frame.
@@ -237,10 +238,11 @@ impl Trail {
     }
 }
 
-/// Rate and age of a sensor's scans over a short window.
+/// Rate and age of a sensor's scans over the last two seconds.
 #[derive(Clone, Debug, Default)]
 pub struct RateMeter {
-    /// Stamp of the first byte of each scan, and its age on arrival if that is known, in ns.
+    /// Stamp of the first byte of each scan, and age of the scan on arrival, in ns. The age is `None` if the stamp is
+    /// estimated.
     scans: VecDeque<(u64, Option<u64>)>,
 }
 
@@ -248,7 +250,7 @@ impl RateMeter {
     /// Counts a scan with `header` that arrived at `now_ns` of CLOCK_MONOTONIC.
     pub fn scan(&mut self, header: &Header, now_ns: u64) {
         if self.scans.back().is_some_and(|(last_ns, _)| *last_ns > header.stamp_first_ns) {
-            // The stamps come from another recording, or from another machine's clock.
+            // An earlier stamp comes from another recording, or from another machine's clock.
             self.scans.clear();
         }
         let is_known = header.flags & Flags::STAMP_ESTIMATED == 0;
@@ -259,13 +261,13 @@ impl RateMeter {
         }
     }
 
-    /// Returns the scans per second, or `None` while they span less than [`scanhub_schema::MIN_RATE_SPAN`].
+    /// Returns the scans per second, or `None` while the stored scans span less than [`scanhub_schema::MIN_RATE_SPAN`].
     pub fn hz(&self) -> Option<f64> {
         let (first, last) = (self.scans.front()?.0, self.scans.back()?.0);
         scanhub_schema::rate_hz(self.scans.len() as u64 - 1, Duration::from_nanos(last - first))
     }
 
-    /// Returns mean and maximum age on arrival in ms. The age counts from the telegram's last byte.
+    /// Returns mean and maximum age on arrival in ms. The age is measured from the stamp of the telegram's last byte.
     pub fn age_ms(&self) -> Option<(f64, f64)> {
         let ages = || self.scans.iter().filter_map(|(_, age)| *age);
         let maximum = ages().max()?;
@@ -297,7 +299,7 @@ pub struct Problem {
 
 impl Problem {
     /// Returns the reason why `sensor` sends no scans. `status` is the status of its link. An error in the status takes
-    /// precedence.
+    /// precedence over the state.
     fn of_silent(sensor: &str, status: Option<&Status>) -> Problem {
         let Some(status) = status else {
             return Problem { description: "no data from it yet".into(), remedy: String::new() };
@@ -325,13 +327,13 @@ impl Problem {
 
 /// Share of the highest intensity that remains after each scan.
 const BRIGHTNESS_DECAY: f64 = 0.9995;
-/// Minimum time for which the last scan is shown.
+/// Time for which the last scan is shown, in ns. If three periods of the scans are longer, they are used instead.
 const MAX_SCAN_AGE_NS: u64 = 1_000_000_000;
-/// Minimum interval between two steps of a trail.
+/// Minimum interval between two steps of a trail, in ns.
 const STEP_INTERVAL_NS: u64 = 90_000_000;
-/// Duration of a trail.
+/// Duration of a trail, in ns.
 const TRAIL_NS: u64 = 1_600_000_000;
-/// Window of the rate. It is long enough that users can read the number.
+/// Window of the rate, in ns. The window is so long that the rate changes slowly enough to be read.
 const RATE_WINDOW_NS: u64 = 2_000_000_000;
 
 #[cfg(test)]

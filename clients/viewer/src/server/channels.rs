@@ -1,8 +1,8 @@
 //! Channels that viewers can subscribe to, each with a short queue of its last messages. All viewers share the queues,
 //! so memory does not depend on their number.
 //!
-//! A queue covers 250 ms, so a server that was delayed by less still sends every message. A viewer with a longer delay
-//! gets the newest message next, so that it never shows old data.
+//! A queue covers 250 ms, so a server that was delayed by less still sends every message. A viewer that is delayed by
+//! more gets the newest message next, so that it never shows old data.
 
 use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -198,7 +198,7 @@ impl ChannelPublisher<'_> {
 const MIN_LEN: usize = 2;
 /// Maximum number of messages in a queue.
 const MAX_LEN: usize = 16;
-/// Time that a queue covers, if its length is between [`MIN_LEN`] and [`MAX_LEN`].
+/// Time that a queue covers, in ns, if the number of its messages is between [`MIN_LEN`] and [`MAX_LEN`].
 const QUEUE_SPAN_NS: u64 = 250_000_000;
 
 #[cfg(test)]
@@ -248,7 +248,7 @@ mod tests {
     #[test]
     fn queue_covers_a_quarter_of_a_second() {
         let store = ChannelStore::new().unwrap();
-        // Interval of the messages in milliseconds, and how many of them are queued.
+        // Interval of the messages in milliseconds, and number of messages that the queue holds.
         for (interval, queued) in [(1000, 2), (100, 3), (27, 10), (5, 16), (0, 16)] {
             let scan = store.open(channel(&format!("/scan{interval}"), false));
             let before = store.subscribe(scan.id).unwrap();

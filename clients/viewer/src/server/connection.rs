@@ -19,7 +19,7 @@ pub const MAX_VIEWERS: usize = 32;
 
 /// Timeout for the request of a client.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
-/// Timeout for sending the response. It allows for a slow network.
+/// Timeout for sending the response. This time allows for a slow network.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// State that all connections share.
@@ -141,8 +141,8 @@ impl Connection {
         }
     }
 
-    /// Replies to a request whose head has `length` bytes. A WebSocket uses the same socket, so it needs no further
-    /// descriptor.
+    /// Replies to a request whose head has `length` bytes. A WebSocket uses the socket of the request, so it needs no
+    /// further descriptor.
     fn reply(
         &mut self,
         context: &ServerContext<'_>,

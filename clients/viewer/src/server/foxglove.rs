@@ -5,11 +5,11 @@ use serde::{Deserialize, Serialize};
 use super::channels::Channel;
 use super::player::PlayerCommand;
 
-/// Subprotocols of the WebSocket, the preferred one first. The second is the former name of the same protocol. Some
-/// clients only support the former name (npm's `@foxglove/ws-protocol`, older versions of Lichtblick).
+/// Subprotocols of the WebSocket, the preferred one first. The second one is the former name of this protocol. Some
+/// clients support only the former name (npm's `@foxglove/ws-protocol`, older versions of Lichtblick).
 pub(crate) const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 
-/// Returns the first message of the server.
+/// Returns the first message that the server sends to a viewer.
 pub(crate) fn server_info(session: &str) -> String {
     text(&serde_json::json!({
         "op": "serverInfo",
@@ -58,7 +58,7 @@ pub(crate) fn warning(id: &str, message: &str) -> String {
     text(&serde_json::json!({ "op": "status", "level": WARNING, "message": message, "id": id }))
 }
 
-/// Returns a message of a subscription with its time in ns since 1970.
+/// Returns a message for a subscription. `wall_ns` is the time of the message in ns since 1970.
 pub(crate) fn message(subscription: u32, wall_ns: u64, payload: &[u8]) -> Vec<u8> {
     const MESSAGE_DATA: u8 = 1;
     let mut frame = Vec::with_capacity(13 + payload.len());

@@ -13,10 +13,10 @@ pub(crate) struct Request {
     /// Text after `?` in the path.
     query: String,
     pub(crate) host: Option<String>,
-    /// Header `Origin`. Only browsers send it.
+    /// Header `Origin`. Only browsers send this header.
     origin: Option<String>,
     authorization: Option<String>,
-    /// Key of the WebSocket handshake, if the request is one.
+    /// Key of the WebSocket handshake; `None` if the request is not a handshake.
     pub(crate) key: Option<String>,
     /// Subprotocols that the client offers.
     protocols: String,
@@ -79,7 +79,7 @@ impl Request {
 /// not even through DNS rebinding.
 #[derive(Clone, Debug, Default)]
 pub struct AccessPolicy {
-    /// Token that the URL or a header must have, if one is set.
+    /// Token that the URL or a header must have; `None` if no token is required.
     pub token: Option<String>,
     /// Origins of other pages that may connect, such as `https://app.example.org`.
     pub origins: Vec<String>,
@@ -90,7 +90,7 @@ pub struct AccessPolicy {
 /// Reason why a request is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Refusal {
-    /// The browser used a host name that is not one of this machine.
+    /// The browser used a host name that does not belong to this machine.
     Host,
     /// The request was made by a page of another site.
     Origin,
@@ -136,7 +136,7 @@ impl AccessPolicy {
     }
 }
 
-/// Compares a candidate with the token. The time for this depends only on the lengths of the two.
+/// Compares a candidate with the token. The time of the comparison depends only on the lengths of the two texts.
 fn is_equal(candidate: &str, token: &str) -> bool {
     let differing = candidate.bytes().zip(token.bytes()).fold(0, |all, (a, b)| all | (a ^ b));
     candidate.len() == token.len() && differing == 0
@@ -157,8 +157,8 @@ impl Refusal {
     }
 }
 
-/// Returns a response that ends the connection. Other pages cannot embed the response. Browsers neither store it nor
-/// guess its type.
+/// Returns a response that ends the connection. Other pages cannot embed the response. Browsers neither store the
+/// response nor guess its type.
 pub(crate) fn response(status: &str, kind: &str, policy: &str, body: &[u8]) -> Vec<u8> {
     let head = format!(
         "HTTP/1.1 {status}\r\nContent-Type: {kind}; charset=utf-8\r\nContent-Length: {}\r\nCache-Control: no-store\r\n\

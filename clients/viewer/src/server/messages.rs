@@ -1,5 +1,5 @@
 //! Channels for viewers, and encoders of their messages from a scene and from samples. Scans and poses have types of
-//! ROS, which every viewer draws. Circles and marks have types of Foxglove. States and the verdict are JSON objects.
+//! ROS, which every viewer can draw. Circles and marks have types of Foxglove. States and the verdict are JSON objects.
 
 mod scene_update;
 
@@ -190,7 +190,8 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
     })
 }
 
-/// Encodes the background of `sensor` as a scan: NaN where it is unknown, +inf where it is out of range.
+/// Encodes the background of `sensor` as a scan. A range is NaN where the background is unknown, and +inf where the
+/// background is out of range.
 pub(crate) fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Background) {
     let as_scan = |range: &u16| match *range {
         Background::UNKNOWN => Scan::NOT_MEASURED,
@@ -211,7 +212,7 @@ pub(crate) fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, mode
     scanhub_ros::laser_scan(message, scanhub_ros::frame(sensor), &header, &Scan::of(head, &ranges));
 }
 
-/// Value for ranges that are out of range.
+/// Value in the scan where the background is out of range.
 const BEYOND_RANGE: u16 = u16::MAX - 1;
 
 /// Encodes the known poses of the sensors.

@@ -1,4 +1,4 @@
-//! Control of a player by viewers: their commands, and its progress as a message.
+//! Control of a player by viewers: the viewers' commands, and the player's progress as a message.
 
 use serde::{Deserialize, Serialize};
 
@@ -32,7 +32,7 @@ pub struct Progress {
     pub paused: bool,
     /// Whether the end has been reached.
     pub over: bool,
-    /// Number of restarts.
+    /// Number of times that the player has restarted the recording.
     pub lap: u32,
     /// Number of telegrams of all sensors that were played, in all laps.
     pub telegrams: u64,

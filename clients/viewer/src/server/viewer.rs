@@ -19,7 +19,8 @@ const MAX_MESSAGE_LEN: usize = 64 << 10;
 /// Maximum number of messages from a viewer that are handled in one call, so that a flood does not starve other
 /// viewers.
 const BATCH_SIZE: usize = 32;
-/// Number of bytes that are written at once: few system calls for many small messages, and little data in flight.
+/// Number of bytes that are collected before they are written. With this size, many small messages need few system
+/// calls, and little data is in flight.
 const WRITE_SIZE: usize = 16 << 10;
 /// Send timeout. A viewer that does not accept a message in this time is disconnected.
 const SEND_TIMEOUT: Duration = Duration::from_secs(30);
@@ -32,7 +33,7 @@ pub(crate) struct Viewer {
     subscriptions: Vec<Subscription>,
     /// Number of channels that were advertised.
     advertised: usize,
-    /// Subscription that is served next.
+    /// Index of the subscription that is served next.
     next: usize,
     /// Time since which the socket has been full; `None` if it has accepted all bytes.
     pending: Option<Instant>,
@@ -41,9 +42,9 @@ pub(crate) struct Viewer {
     replaced: ReplacedMessages,
     reported: ReplacedMessages,
     report_at: Instant,
-    /// Last subscription to an unknown channel that was not refused yet.
+    /// Unknown channel to which the viewer subscribed last; `None` once the error message was sent.
     unknown_channel: Option<usize>,
-    /// Whether received messages may still be unread, even if the socket receives nothing new.
+    /// Whether messages that have already arrived may still be unread, so that the socket does not report them again.
     has_unread: bool,
 }
 
@@ -55,7 +56,7 @@ struct Subscription {
     number: u64,
 }
 
-/// Counts of messages that were replaced by newer ones before they were sent.
+/// Counts of messages that newer messages replaced before they could be sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct ReplacedMessages {
     /// Number of messages that were replaced because the viewer or its network was too slow.
@@ -69,7 +70,8 @@ struct ReplacedMessages {
 pub(crate) struct Disconnected;
 
 impl Viewer {
-    /// Creates a viewer after its handshake. `early` are the bytes that it sent after the handshake.
+    /// Creates a viewer after its handshake. `early` has the bytes that the viewer has already sent after its
+    /// handshake.
     pub(crate) fn new(
         stream: TcpStream,
         early: Vec<u8>,
@@ -108,8 +110,8 @@ impl Viewer {
         self.pending.is_some()
     }
 
-    /// Returns the number of messages that newer ones replaced before they were sent. Messages that are a state do not
-    /// count.
+    /// Returns the number of messages that newer messages replaced before they could be sent. Messages that are a state
+    /// do not count.
     pub(crate) fn replaced_count(&self) -> u64 {
         self.replaced.by_viewer + self.replaced.by_server
     }
@@ -184,7 +186,7 @@ impl Viewer {
         Ok(())
     }
 
-    /// Sends messages until there are no more, or the socket is full.
+    /// Sends messages until no message is left, or the socket is full.
     pub(crate) fn serve(&mut self, channels: &ChannelStore, now: Instant) -> Result<(), Disconnected> {
         self.flush(now)?;
         while !self.is_pending() {
@@ -196,7 +198,7 @@ impl Viewer {
         Ok(())
     }
 
-    /// Buffers about [`WRITE_SIZE`] bytes for the viewer. Returns whether there are any.
+    /// Buffers about [`WRITE_SIZE`] bytes for the viewer. Returns whether any bytes were buffered.
     fn gather(&mut self, channels: &ChannelStore, now: Instant) -> Result<bool, Disconnected> {
         let mut length = 0;
         while length < WRITE_SIZE {
@@ -245,7 +247,7 @@ impl Viewer {
         None
     }
 
-    /// Buffers `message`, and may send some of the buffer.
+    /// Buffers `message`, and may send a part of the buffer.
     fn send(&mut self, message: Message, now: Instant) -> Result<(), Disconnected> {
         match self.socket.write(message) {
             Err(Error::Io(error)) if error.kind() != io::ErrorKind::WouldBlock => return Err(Disconnected),

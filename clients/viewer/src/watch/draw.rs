@@ -13,8 +13,8 @@ use super::map::{DOTS_PER_CELL, color, map};
 use super::view::View;
 use crate::scene::{PointerPosition, Scene, Sensor, rooms, verdict};
 
-/// Draws `scene` as in `view`. If the picture is frozen, it shows `held`. The verdict and the lines of sensors always
-/// come from `scene`.
+/// Draws `scene` with the settings in `view`. If the picture is frozen, the picture shows `held`. The verdict and the
+/// lines of sensors always come from `scene`.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
     let areas = ScreenAreas::of(frame.area(), scene);
     let heading = heading(scene, view, areas.heading.width);
@@ -169,8 +169,8 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
     Line::styled(text, style)
 }
 
-/// Returns the counters of the links for `area`: a heading, the shares of the line, and all counters, with a column for
-/// each of the `shown` sensors. Columns and rows that do not fit are omitted.
+/// Returns the counters of the links for `area`: a heading, the shares of data that was damaged and lost on the line,
+/// and all counters. Each of the `shown` sensors has a column. Columns and rows that do not fit are omitted.
 fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
     let room = usize::from(area.width).saturating_sub(NAME_WIDTH) / COLUMN_WIDTH;
     let columns = &shown[..shown.len().min(room)];
@@ -191,7 +191,7 @@ fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
         row("scans this program missed", &|sensor| sensor.missed.to_string()),
     ];
     lines.extend(shares.map(Line::raw));
-    // The last line has the scale bar.
+    // Leave the last row empty. In the picture, it has the scale bar.
     let rows = usize::from(area.height).saturating_sub(lines.len() + 1);
     lines.extend(Counter::ALL.iter().take(rows).map(|counter| {
         let value = |status: &Status| Some(status.counters[*counter].to_string());
@@ -200,7 +200,7 @@ fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
     lines
 }
 
-/// Returns the end of a name that fits in a column. The end distinguishes the sensors of one machine.
+/// Returns as much of the end of a name as fits in a column. The end distinguishes the sensors of one machine.
 fn short_name(name: &str) -> String {
     let excess = name.chars().count().saturating_sub(COLUMN_WIDTH - 1);
     name.chars().skip(excess).collect()
@@ -230,7 +230,7 @@ fn pointer_text(scene: &Scene, view: &View, room: usize) -> String {
     text
 }
 
-/// Appends `parts`, separated by `between`, until one does not fit in `room` columns.
+/// Appends `parts`, separated by `between`, until a part does not fit. `text` has at most `room` columns.
 fn append_fitting(text: &mut String, parts: Vec<String>, between: &str, room: usize) {
     for part in parts {
         let between = if text.is_empty() { "" } else { between };

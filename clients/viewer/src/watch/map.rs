@@ -54,8 +54,8 @@ struct Grid {
 }
 
 impl Grid {
-    /// Returns the position at which a sign is drawn in the cell of the point's dot. The canvas maps signs and dots to
-    /// its axes in different ways.
+    /// Returns the position at which a sign must be drawn to appear in the cell that has the point's dot. The canvas
+    /// assigns signs and dots to cells in different ways.
     fn cell(&self, (x, y): (f64, f64)) -> (f64, f64) {
         let cell = |from_m: f64, dots: f64, cells: u16, length: f64| {
             let cell = ((from_m / self.dot_m).round() / dots).floor() + 0.25;
@@ -98,7 +98,7 @@ struct Layers {
 
 struct Circle {
     dots: Dots,
-    /// Position and text.
+    /// Position and text of the label; `None` for a small circle.
     label: Option<(f64, f64, String)>,
     color: Color,
 }
@@ -227,7 +227,7 @@ impl Layers {
         draw(context, &self.corners, ink(Color::LightBlue));
         context.marker(Marker::Custom('*'));
         draw(context, &self.marks, ink(Color::Cyan));
-        // A label has the color of the dots below it, unless it has its own.
+        // A label without a color has the color of the dots below it.
         let mut print = |x, y, label: &str, color| context.print(x, y, Line::styled(label.to_owned(), color));
         if let Some((x, y)) = self.robot {
             print(x, y, "^", Color::Reset);
@@ -249,7 +249,7 @@ impl Layers {
     }
 }
 
-/// Converts meters ahead and to the left to the right and up.
+/// Converts a position, in meters ahead and to the left, to the coordinates of the canvas: to the right, and up.
 fn to_canvas((x, y): (f64, f64)) -> (f64, f64) {
     (-y, x)
 }
@@ -276,12 +276,13 @@ fn dotted(circle: &crate::scene::Circle, dot_m: f64) -> Circle {
     }
 }
 
-/// Returns the distance between two crossings of the grid in meters: a round length of at least [`GRID_DOTS`].
+/// Returns the distance between two crossings of the grid in meters: a round length of at least [`GRID_DOTS`] dots.
 fn grid_step_m(dot_m: f64) -> f64 {
     STEPS_M.into_iter().find(|step| *step >= GRID_DOTS * dot_m).unwrap_or(50.0)
 }
 
-/// Colors of points. The first is for points without an intensity; the others are from the darkest to the brightest.
+/// Colors of points. The first color is for points without an intensity. The others are for points with an intensity,
+/// from the darkest to the brightest.
 const SHADES: [Color; 5] = [Color::Reset, Color::Blue, Color::Cyan, Color::Green, Color::Yellow];
 const STEPS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
 /// Minimum distance between two crossings of the grid, in dots.

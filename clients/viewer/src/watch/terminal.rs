@@ -1,5 +1,5 @@
 //! Terminal of the picture. It is switched to raw mode and the alternate screen at the start, and always restored at
-//! the end. A frame is one write. Keys and the mouse are read without waiting.
+//! the end. Each frame is sent with one write. Keys and the mouse are read without waiting.
 
 use std::cell::Cell;
 use std::collections::VecDeque;
@@ -32,7 +32,7 @@ pub(super) struct Terminal<'a> {
     keys: Keys,
     /// Last known number of columns and rows.
     size: Option<(u16, u16)>,
-    /// Panic hook that was set before.
+    /// Panic hook that was set before the terminal was taken over.
     hook: Arc<Hook>,
     /// Whether a panic has already restored the terminal.
     is_restored: Arc<AtomicBool>,
@@ -124,7 +124,7 @@ fn size() -> Option<(u16, u16)> {
     tcgetwinsize(io::stdout()).ok().map(|size| (size.ws_col, size.ws_row))
 }
 
-/// Returns whether the terminal was closed. The program may then get no signal, and no write fails while no frame is
+/// Returns whether the terminal was closed. A signal may be missing in this case, and writes fail only when a frame is
 /// drawn.
 fn hung_up() -> bool {
     let stdout = io::stdout();
@@ -142,7 +142,7 @@ fn closed(error: io::Error) -> ExitReason {
     ExitReason::from(error)
 }
 
-/// Buffer of a frame, which is written at once.
+/// Buffer that collects the bytes of a frame, and writes them with one call.
 struct FrameBuffer<'a> {
     out: &'a mut dyn Write,
     bytes: Vec<u8>,
@@ -187,13 +187,13 @@ pub(super) enum Key {
 }
 
 /// Makes the terminal report where mouse buttons are pressed and dragged (xterm's mode 1002), without a maximum column
-/// (1006).
+/// (mode 1006).
 const MOUSE_ON: &str = "\x1b[?1002h\x1b[?1006h";
 /// Ends the reports of the mouse.
 const MOUSE_OFF: &str = "\x1b[?1006l\x1b[?1002l";
 
-/// Reader of keys from stdin if it is a terminal, otherwise from the terminal of the process. It distinguishes a closed
-/// terminal from one at which no key is pressed.
+/// Reader of keys from stdin if it is a terminal, otherwise from the terminal of the process. The reader distinguishes
+/// a closed terminal from an open terminal at which no key is pressed.
 struct Keys {
     terminal: File,
     pending: VecDeque<u8>,
@@ -218,7 +218,7 @@ impl Keys {
         let mut key = next(&mut self.pending);
         if key.is_none() {
             let mut fds = [PollFd::new(&self.terminal, PollFlags::IN)];
-            // The caller handles a signal that arrived during the call.
+            // An error means that a signal arrived. The caller handles signals.
             let is_there = poll(&mut fds, Some(&Timespec::default())).is_ok_and(|count| count > 0);
             if is_there {
                 let mut piece = [0; 256];
@@ -297,7 +297,8 @@ fn mouse(parameters: &[u8]) -> Option<Key> {
 const ESC: u8 = 0x1b;
 /// Maximum length of a sequence in bytes.
 const MAX_SEQUENCE_LEN: usize = 32;
-/// Bits of a mouse button: Shift, Alt and Ctrl; moved while it was down; the wheel.
+/// Bits and values of the button in a report of the mouse: Shift, Alt and Ctrl; movement while the button is pressed;
+/// the wheel away from the user, and toward the user.
 const MODIFIERS: u16 = 0b1_1100;
 const DRAGGED: u16 = 32;
 const WHEEL: u16 = 64;

@@ -195,7 +195,7 @@ fn frozen_picture_has_the_current_verdict() {
 }
 
 /// The picture suits light and dark terminals: no cell is black or white, or has a background color. Without colors,
-/// other signs replace them.
+/// signs replace the colors.
 #[test]
 fn uses_the_colors_of_the_terminal() {
     let scene = scene();
@@ -385,7 +385,7 @@ fn shows_counters_the_pointer_and_line_features() {
     }
     assert!(page.lines().nth(1).unwrap().ends_with("         front          rear"), "{page}");
 
-    // The reading of the nearest point, or the position if there is none.
+    // The text has the reading of the nearest point, or the position of the pointer if no point is near.
     let front = scene.sensor("front").points().find(|point| point.beam == 180).unwrap();
     let pointing = View { pointer_m: Some((front.x_m - 0.05, front.y_m)), ..View::new(false) };
     let read = text(&screen(&scene, &pointing, (120, 40)));

@@ -29,7 +29,7 @@ pub(crate) struct View {
     pub(crate) intensity: bool,
     /// Whether line features and corners are shown. The hub computes them only while they have a subscriber.
     pub(crate) lines: bool,
-    /// Position of the pointer, in meters in the robot's frame; arrows move it.
+    /// Position of the pointer, in meters in the robot's frame. The arrow keys move the pointer.
     pub(crate) pointer_m: Option<(f64, f64)>,
     /// Whether counters are shown instead of the picture.
     pub(crate) counters: bool,
@@ -40,11 +40,11 @@ pub(crate) struct View {
     pub(crate) colors: bool,
     /// Text next to the keys.
     pub(crate) note: String,
-    /// Message that is shown instead of the keys; empty if there is none.
+    /// Message that is shown instead of the keys; empty if there is no message.
     pub(crate) message: String,
 }
 
-/// Command of a key that does not only change the view.
+/// Command that the caller must execute for a key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ViewCommand {
     /// End the program.
@@ -92,7 +92,7 @@ impl View {
         }
     }
 
-    /// Handles a key while `scene` is on the screen. Returns a command that the caller must execute.
+    /// Handles a key while `scene` is on the screen. Returns a command if the key has an effect outside the view.
     pub(crate) fn key(&mut self, key: Key, scene: &Scene) -> Option<ViewCommand> {
         match key {
             Key::Interrupt => return Some(ViewCommand::Interrupt),
@@ -179,7 +179,7 @@ impl View {
         Some((self.center_m.0 - down * self.dot_m, self.center_m.1 - right * self.dot_m))
     }
 
-    /// Changes the scale around this cell of the screen.
+    /// Changes the scale, so that the position under this cell of the screen stays there.
     fn zoom_at(&mut self, column: u16, row: u16, factor: f64) {
         let Some(before) = self.at_m(column, row) else { return };
         self.zoom(factor);
@@ -238,12 +238,12 @@ const STEP_DOTS: f64 = 8.0;
 const INITIAL_DOT_M: f64 = 0.05;
 const MIN_DOT_M: f64 = 0.001;
 const MAX_DOT_M: f64 = 1.0;
-/// Maximum distance of the center from the robot. It exceeds the range of a sensor (82 m) plus its maximum distance
-/// from the robot (100 m).
+/// Maximum distance of the center from the robot. This distance exceeds the range of a sensor (82 m) plus the sensor's
+/// maximum distance from the robot (100 m).
 const MAX_CENTER_M: f64 = 200.0;
-/// Minimum distance around the robot that is shown.
+/// Minimum distance around the robot that the picture shows, in meters.
 const MIN_REACH_M: f64 = 0.5;
-/// Size of the picture relative to the points.
+/// Size of the picture relative to the area of the points.
 const MARGIN_FACTOR: f64 = 1.1;
 /// Minimum share of the picture that the points must fill. If they fill less, the scale changes.
 const MIN_FILL_SHARE: f64 = 0.6;

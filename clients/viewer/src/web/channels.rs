@@ -1,5 +1,5 @@
 //! Channels of sensors, mounts, and programs such as `tilt`. A channel is opened when `web` subscribes to its topics.
-//! It publishes samples as messages.
+//! Each sample is published as a message.
 
 use std::collections::BTreeMap;
 
@@ -43,7 +43,7 @@ impl<'a> SensorChannels<'a> {
         }
     }
 
-    /// Publishes a foreground. The angles of the beams are taken from its scan.
+    /// Publishes a foreground. The angles of the beams are taken from the scan of the same telegram.
     pub(super) fn publish_foreground(&mut self, ((header, scan), foreground): &Pair) {
         if self.foreground.is_needed() {
             let (message, frame) = (&mut self.message, scanhub_ros::frame(&self.sensor));
@@ -72,7 +72,7 @@ impl<'a> SensorChannels<'a> {
     }
 }
 
-/// Channels of mounts, and of programs that publish sweeps. Their topics with angles and points are only subscribed to
+/// Channels of mounts, and of programs that publish sweeps. `web` subscribes to the topics with angles and points only
 /// while a viewer needs them.
 pub(super) struct TiltChannels<'a> {
     channels: &'a ChannelStore,

@@ -20,12 +20,12 @@ use crate::server::player::{self, Playback, Progress};
 use crate::server::{ChannelPublisher, ChannelStore, messages};
 
 /// Interval at which the verdict and the distance are repeated. If no message arrives for half a second, the page shows
-/// the verdict as unknown. Users cannot read a distance that changes with every scan. A changed verdict is published at
-/// once.
+/// the verdict as unknown. A changed verdict is published at once. A changed distance waits for the interval, because
+/// users cannot read a distance that changes with every scan.
 const ROBOT_INTERVAL: Duration = Duration::from_millis(90);
 /// Minimum interval between messages of the player if only its position has changed.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(50);
-/// Minimum interval between messages of circles, marks or line features. A message has the figures of all sensors.
+/// Minimum interval between messages of circles, marks or line features. One message has the figures of all sensors.
 const OVERLAY_INTERVAL: Duration = Duration::from_millis(50);
 /// Interval at which unchanged circles are repeated, because viewers delete them after a second.
 const CIRCLES_INTERVAL: Duration = Duration::from_millis(300);
@@ -270,7 +270,7 @@ impl<'a> SensorFeed<'a> {
             .for_each(|sensor| self.channels_of(&sensor.name).publish_status(wall_ns, sensor));
     }
 
-    /// Removes the scans of a sensor.
+    /// Removes the messages with scans of a sensor.
     fn clear(&self, sensor: &Sensor) {
         self.sensors.get(&sensor.name).into_iter().for_each(SensorChannels::clear);
     }
@@ -387,7 +387,7 @@ impl<'a> PlayerFeed<'a> {
         PlayerFeed { player, channel: channels.open(player::channel()), published: None, publish_at: now }
     }
 
-    /// Publishes the progress if it has changed. Returns the last published one.
+    /// Publishes the progress if it has changed. Returns the progress that was published last.
     fn publish(&mut self, now: Instant) -> Progress {
         let progress = self.player.progress();
         let is_only_later =

@@ -49,8 +49,8 @@ pub(crate) fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 }
 
 /// Encodes the people of one tracker with their IDs and tails. The ellipse around a person contains the true position
-/// in 95 of 100 cases. The frame has the name of the robot's frame. With a tracker, this frame is the map of the site.
-/// People who are not seen are pale.
+/// in 95 of 100 cases. The frame has the name of the robot's frame, but it is the map of the site. People who are not
+/// seen are pale.
 pub(crate) fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
     let entities = people.known().map(|person| {
         let (x, y) = person.position;
@@ -98,8 +98,9 @@ pub(crate) fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 
 /// Encodes the obstacles of a sweep as boxes with the metadata `distance_m`, `points`, `foreground` and `near`. The
 /// first entity has no shape. It has the metadata of the sweep: `sweep`, `generation`, `complete`, `unreliable`,
-/// `dropped`, and `words`, a summary as text. A sweep ends when the mount reverses. Therefore each message deletes all
-/// earlier entities, and has its own lifetime.
+/// `dropped`, and `words`, a summary as text. A sweep may last longer than a second, because it ends only when the
+/// mount reverses. Therefore each message deletes all earlier entities, and the lifetime of its entities depends on the
+/// duration of the sweep.
 pub(crate) fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
     let lifetime = || Time::of(lifetime_ns(header));
     let mut sweep = Entity { lifetime: lifetime(), ..Entity::new("sweep".to_owned(), header.wall_ns) };
@@ -356,7 +357,7 @@ const CORNER_M: f64 = 0.06;
 const LINE: Color = Color { r: 0.45, g: 0.33, b: 0.8, a: 1.0 };
 const PERSON: Color = Color { r: 0.2, g: 0.65, b: 0.3, a: 1.0 };
 const PERSON_M: f64 = 0.5;
-/// Opacity of a person who is not seen, and of an ellipse.
+/// Opacity of a person who is not seen, and opacity of an ellipse.
 const PALE: f64 = 0.5;
 const FAINT: f64 = 0.15;
 const MARK: Color = Color { r: 0.05, g: 0.55, b: 0.75, a: 1.0 };

@@ -1,5 +1,5 @@
-//! Comparison of the picture in the terminal with the messages for a browser: both must have the same points. The tests
-//! read the messages as the page does.
+//! Comparison of the picture in the terminal with the messages for a browser: picture and messages must have the same
+//! points. The tests read the messages as the page does.
 
 use crate::server::messages;
 use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value, read};
@@ -131,7 +131,8 @@ fn browser_and_terminal_draw_the_same_scene() {
             models.extend(points(&message, &placed));
         }
     }
-    // The terminal draws the foreground instead of points of the scan. The browser draws it on top of them.
+    // For a beam in the foreground, the terminal draws only one point. The browser draws a point of the scan, and a
+    // point of the foreground on top.
     let drawn: Dots = layers.walls.iter().flatten().chain(&layers.foreground).copied().collect();
     assert_same_points("scans", scans, &drawn);
     assert_same_points("foreground", found, &layers.foreground);
