@@ -26,18 +26,18 @@ use self::delay::{Delay, MAX_DELAY_S};
 pub use self::mount::{Floor, Mount, MountCheck, Wall};
 use self::sweep::{Ray, SweepAnalyzer};
 
-/// Runs the examples of the page as tests.
+/// Runs the examples in docs/tilt.md as tests.
 #[cfg(doctest)]
 #[doc = include_str!("../../../docs/tilt.md")]
 struct Page;
 
-/// Maximum number of scans that wait for angles. If one more scan arrives, the oldest is processed at once.
+/// Maximum number of scans that wait for angles. If one more scan arrives, the oldest scan is processed at once.
 const MAX_WAITING_SCANS: usize = 64;
 /// Maximum number of beams of a sweep. A sweep that reaches this number ends without a reversal.
 const MAX_RAYS: usize = 262_144;
-/// Minimum time by which a stamp must be earlier than the last one to show that the clock was set back, in ns.
+/// Minimum step backward from one scan's stamp to the next that shows that the clock was set back, in ns.
 const CLOCK_JUMP_NS: u64 = 1_000_000_000;
-/// Counters since the creation of the scanner.
+/// Counters since the [`TiltScanner`] was created.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
     /// Sweeps that were passed to the caller.
@@ -46,22 +46,23 @@ pub struct Counts {
     pub incomplete: u64,
     /// Sweeps that were passed to the caller and contradict the background.
     pub unreliable: u64,
-    /// Resets of the background, because scans changed or sweeps contradicted it for too long.
+    /// Resets of the background: the shape of the scans changed, sweeps contradicted the background for too long, or
+    /// the delay of the angles was corrected.
     pub background_resets: u64,
     /// Processed scans.
     pub scans: u64,
-    /// Scans that were dropped because later ones had arrived.
+    /// Scans that were dropped because a later scan had already arrived.
     pub out_of_order: u64,
     /// Created points.
     pub points: u64,
-    /// Beams that have a reading but produced no point, by [`DropReason`].
+    /// Beams that have a reading but produced no point, counted separately for each [`DropReason`].
     #[serde(serialize_with = "by_reason")]
     pub points_dropped: [u64; DropReason::COUNT],
     /// Accepted angles.
     pub angles: u64,
-    /// Angles that were dropped because later ones had arrived.
+    /// Angles that were dropped because a later angle had already arrived.
     pub angles_out_of_order: u64,
-    /// Angles that were dropped because their stamps are later than the stamps of all scans.
+    /// Angles that were dropped because their stamps are more than 1 s later than the latest scan's stamp.
     pub angles_in_future: u64,
     /// Angles that were dropped because they are not numbers.
     pub angles_invalid: u64,
@@ -83,7 +84,8 @@ struct PendingScan {
 #[derive(Clone, Copy)]
 struct SweepEnd {
     stamp_ns: u64,
-    /// Whether the mount reversed. If false, the mount's angle is unknown after `stamp_ns`.
+    /// Whether the mount reversed. If false, the mount's angle is unknown after `stamp_ns`, or the sweep has too many
+    /// beams.
     is_reversal: bool,
 }
 
@@ -139,8 +141,8 @@ impl TiltScanner {
         Counts { background_resets: self.analyzer.background_resets, ..self.counts }
     }
 
-    /// Returns the estimated delay of the mount's stamps in ns. All angles are corrected by it. It is computed from the
-    /// difference between up and down sweeps.
+    /// Returns the estimated delay of the mount's stamps in ns. All angles are corrected by this delay, which is
+    /// computed from the difference between up and down sweeps.
     pub fn late_ns(&self) -> i64 {
         self.angles.late_ns()
     }
@@ -152,7 +154,7 @@ impl TiltScanner {
         if is_silent { Some(DropReason::Silent) } else { self.angles.problem() }
     }
 
-    /// Handles the next angle, and passes each complete sweep to `show`.
+    /// Handles the next angle, and passes each sweep that has ended to `show`.
     pub fn take_angle(&mut self, angle: Angle, mut show: impl FnMut(&Sweep<'_>)) {
         let before_ns = self.angles.last_ns();
         match self.angles.take(angle, self.scan_ns, &self.settings, &mut self.counts) {
@@ -189,8 +191,8 @@ impl TiltScanner {
         self.advance(&mut show);
     }
 
-    /// Handles the next scan, and passes each complete sweep to `show`. `stamp_ns` is the first stamp in the scan's
-    /// header.
+    /// Handles the next scan, and passes each sweep that has ended to `show`. `stamp_ns` is the first stamp in the
+    /// scan's header.
     pub fn take_scan(&mut self, stamp_ns: u64, scan: &Scan, mut show: impl FnMut(&Sweep<'_>)) {
         if let Some(last_ns) = self.scan_ns.filter(|&last_ns| stamp_ns <= last_ns) {
             if last_ns - stamp_ns < CLOCK_JUMP_NS {
@@ -237,7 +239,8 @@ impl TiltScanner {
         }
     }
 
-    /// Ends the sweep at `stamp_ns`, because the mount's angle is unknown after this time.
+    /// Ends the sweep at `stamp_ns` without a reversal, because the mount's angle is unknown after this time, or
+    /// because the sweep has too many beams.
     fn interrupt_sweep(&mut self, stamp_ns: u64) {
         if self.ends.back().is_none_or(|end| end.is_reversal || end.stamp_ns < stamp_ns) {
             self.ends.push_back(SweepEnd { stamp_ns, is_reversal: false });
@@ -294,7 +297,7 @@ impl TiltScanner {
         }
     }
 
-    /// Passes all complete sweeps to `show`.
+    /// Passes all sweeps that have ended to `show`.
     fn finish(&mut self, show: &mut impl FnMut(&Sweep<'_>)) {
         while let Some(end) = self.ends.front().copied().filter(|end| end.stamp_ns <= self.taken_ns) {
             self.ends.pop_front();
@@ -309,8 +312,8 @@ impl TiltScanner {
     }
 
     /// Adds `more_ns` to the delay of the angles' stamps. Then corrects the beams' angles in this sweep and the next
-    /// one. Returns for each sweep whether it still has all beams. The first beams may need angles that are no longer
-    /// stored, and the last ones angles that have not arrived.
+    /// one. Returns for each of these two sweeps whether it still has all beams. The angles of the first beams may no
+    /// longer be stored, and the angles of the last beams may not have arrived yet.
     fn correct(&mut self, more_ns: i64) -> [bool; 2] {
         self.angles.correct(more_ns);
         let TiltScanner { angles, rays, next_rays: later, ends, counts, .. } = self;
@@ -371,7 +374,7 @@ pub struct Point {
     pub stamp_ns: u64,
     /// Index of the beam in its scan.
     pub beam: u16,
-    /// Class of the point: the result of its comparison with the background before this sweep.
+    /// Class of the point, from a comparison with the background as it was before this sweep.
     pub class: PointClass,
 }
 
@@ -397,18 +400,19 @@ pub struct Sweep<'a> {
     pub points: &'a [Point],
     /// Obstacles, the nearest first.
     pub obstacles: &'a [Obstacle],
-    /// Number of obstacles that were dropped because a sweep has a maximum number of obstacles.
+    /// Number of obstacles that were dropped because the sweep has more than [`MAX_OBSTACLES`] of them.
     pub dropped: u32,
 }
 
 /// Parameters of sweeps, background and obstacles.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
-    /// Maximum time for which a scan waits for the angles of its beams, in ns of the stamps.
+    /// Maximum time for which a scan waits for the angles of its beams, in ns. This time is measured by the stamps of
+    /// later scans.
     pub delay_ns: u64,
     /// Maximum time between two angles for interpolation, in ns.
     pub gap_ns: u64,
-    /// Maximum speed of a mount in rad/s. A faster change counts as a jump of its encoder.
+    /// Maximum speed of a mount in rad/s. A faster change counts as a jump of the mount's encoder.
     pub max_speed_rad_s: f64,
     /// Maximum difference between the speed computed from two angles and the rates in the samples of these angles, in
     /// rad/s.
@@ -426,8 +430,8 @@ pub struct Settings {
     pub threshold_m: f64,
     /// Number of sweeps whose beams must meet a surface before it becomes background.
     pub sweeps: u16,
-    /// Maximum share of a sweep's beams on known background whose range may differ from it. If more differ, the sweep
-    /// contradicts the background.
+    /// Maximum share of beams whose range differs from the background, among the beams of a sweep whose background is
+    /// known. If the share is larger, the sweep contradicts the background.
     pub max_displaced_share: f64,
     /// Maximum error of the angles in a part of a sweep, in radians, measured on the floor. If the error is larger, the
     /// sweep contradicts the background.

@@ -1,5 +1,5 @@
-//! Tracks people across the sensors and rooms of a site. The input is the foregrounds of several sensors, and the
-//! output is people with IDs.
+//! Tracks people across the sensors and rooms of a site. The input is the scans of several sensors with their
+//! foregrounds, and the output is people with IDs.
 //!
 //! A [`Site`] describes sensors, rooms and doors. [`PeopleTracker`] takes scans with their foregrounds and returns
 //! [`Snapshot`]s: the tracks at one time, and the events since the previous snapshot. It processes the scans of all
@@ -29,15 +29,18 @@ pub use self::site::Site;
 pub use self::tracker::SNAPSHOT_INTERVAL_NS;
 use self::tracker::{MAX_PEOPLE, Tracker};
 
-/// Maximum number of waiting scans of a sensor. If one more scan arrives, the oldest is processed at once.
+/// Maximum number of waiting scans of a sensor. If one more scan arrives, the oldest scan is processed at once.
 const MAX_WAITING_SCANS: usize = 64;
-/// Minimum difference between a stamp and all other stamps that counts as a jump of the clock, in ns.
+/// Maximum difference between a stamp and the latest stamp of all scans, in ns. A larger difference counts as a jump of
+/// the clock.
 const CLOCK_JUMP_NS: u64 = 2_000_000_000;
-/// Number of stamps in a row that differ by [`CLOCK_JUMP_NS`] or more and are then accepted as the new time.
+/// Maximum number of stamps in a row that are rejected because they differ by more than [`CLOCK_JUMP_NS`]. The next
+/// stamp is accepted as the new time.
 const MAX_JUMPS: u32 = 50;
-/// Share of an offset that one correction removes.
+/// Share of an offset between two clocks that one correction removes.
 const CORRECTION_GAIN: f64 = 0.05;
-/// Minimum weight of the observations for a correction of an offset, in (m/s)2.
+/// Minimum weight of the observations that a correction of an offset needs, in (m/s)2. Each observation of a walking
+/// person has the squared speed as its weight.
 const MIN_WEIGHT: f64 = 40.0;
 /// Maximum offset between the clocks of two hubs, in ns.
 const MAX_OFFSET_NS: f64 = 250e6;
@@ -49,10 +52,10 @@ pub struct Counts {
     pub scans: u64,
     /// Scans that were dropped because they arrived later than the tracker waits.
     pub late: u64,
-    /// Scans that were dropped because their stamps differ by seconds from all other stamps.
+    /// Scans that were dropped because their stamps differ by more than 2 s from the latest stamp of all scans.
     pub jumped: u64,
-    /// Scans that were dropped because their foreground has another number of beams, or because their sensor is not in
-    /// the site.
+    /// Scans that were dropped because they have no beams, because their foreground has another number of beams, or
+    /// because their sensor is not in the site.
     pub invalid: u64,
 }
 
@@ -127,15 +130,15 @@ impl PeopleTracker {
         &self.late
     }
 
-    /// Returns the estimated offset between the clock that stamps `sensor` and the first sensor's clock, in seconds. It
-    /// is computed from people whom both sensors see.
+    /// Returns the estimated offset between the clock that stamps `sensor` and the first sensor's clock, in seconds.
+    /// The offset is computed from people whom both sensors see.
     pub fn offset_s(&self, sensor: usize) -> f64 {
         self.hub_of.get(sensor).map_or(0.0, |&hub| self.offsets[hub] * 1e-9)
     }
 
-    /// Handles a scan with its foreground and its wall clock stamp. `sensor` is the index of its sensor in the site.
-    /// Passes each snapshot that is due to `show`. Scans that arrive within the delay are processed in the order of
-    /// their stamps.
+    /// Handles a scan of a sensor, with the scan's foreground and wall clock stamp. `sensor` is the index of the sensor
+    /// in the site. Passes every due snapshot to `show`. Scans that arrive within the tracker's delay are processed in
+    /// the order of their stamps.
     pub fn take(
         &mut self,
         sensor: usize,
@@ -198,7 +201,7 @@ impl PeopleTracker {
             if at_ns > until_ns && !is_full {
                 break;
             }
-            // The corrected clock may step backward.
+            // A correction of the offset can make the corrected stamps step backward.
             let at_ns = at_ns.max(self.taken_ns + 1);
             if self.next_snapshot_ns == 0 {
                 self.next_snapshot_ns = (at_ns / SNAPSHOT_INTERVAL_NS + 1) * SNAPSHOT_INTERVAL_NS;
@@ -326,22 +329,22 @@ pub struct Event {
     pub wall_ns: u64,
     /// ID of the person's track.
     pub id: u64,
-    /// Index of the room after the event.
+    /// Index of the person's room after the event; `None` outside all rooms.
     pub room: Option<usize>,
     /// Kind of the event.
     pub kind: Kind,
 }
 
-/// A sensor that is not at its position in the site. It was detected by comparison with another sensor that sees the
-/// same people. From now on, the tracker corrects the position of the misplaced sensor.
+/// A sensor that is not at its position in the site. The tracker has detected this by comparison with another sensor
+/// that sees the same people. From now on, it corrects the position of the misplaced sensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MisplacedSensor {
     /// Index of the sensor in the site.
     pub sensor: usize,
-    /// Index of the sensor with which it was compared.
+    /// Index of the sensor with which `sensor` was compared.
     pub other: usize,
-    /// Offset of people's positions as `sensor` sees them from their positions as `other` sees them, in the map, in
-    /// meters.
+    /// Vector from the position at which `other` sees a person to the position at which `sensor` sees the same person,
+    /// in the map, in meters.
     pub offset: Point,
 }
 

@@ -10,7 +10,7 @@ pub use site::SiteArgs;
 pub use tilt::TiltArgs;
 pub use track::TrackArgs;
 
-/// Parses a name under which topics are published. It must be valid for a sensor.
+/// Parses a name under which topics are published. The name must be valid as the name of a sensor.
 fn own_name(name: &str) -> Result<String, String> {
     scanhub_schema::check_sensor(name).map(|()| name.to_owned()).map_err(|failure| format!("{failure}"))
 }

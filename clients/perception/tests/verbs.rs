@@ -30,7 +30,7 @@ polygon = [[0, 0], [5, 0], [5, 4], [0, 4]]
 const MS: u64 = 1_000_000;
 const RANGES: [u16; 4] = [300; 4];
 
-/// Runs `track`, and sends scans of `rear` that are half a second late. Continues until a line with `text` reports a
+/// Runs `track`, and sends scans of `rear` that are half a second late. Stops when a line with `text` has reported a
 /// late scan. Returns the lines and the notes.
 fn run_with_late_scans(json: bool, text: &str) -> (String, String) {
     let test_domain = TestDomain::new();

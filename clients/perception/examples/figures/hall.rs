@@ -1,5 +1,5 @@
-//! A simulated hall with a scanner on a mount, played from start to end: scans and angles in the order of their
-//! arrival, with the truth about each point. `score.rs` scores the results.
+//! A simulated hall with a scanner on a mount. The hall is played from start to end. The library receives scans and
+//! angles in the order of their arrival, and the hall stores the truth about each point. `score.rs` scores the results.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use scanhub_sim::room::BeamTarget;
 use scanhub_sim::room::Room;
 use scanhub_sim::world::World;
 
-/// Duration of a scan of 361 beams, which is two revolutions of the mirror, and its transmission time, in ns.
+/// Duration of a scan of 361 beams, which is two revolutions of the mirror, and transmission time of the scan, in ns.
 const SCAN_TIME_NS: u64 = 26_640_000;
 const LINE_TIME_NS: u64 = 15_000_000;
 
@@ -20,7 +20,7 @@ const LINE_TIME_NS: u64 = 15_000_000;
 pub(crate) struct Hall {
     room: Room,
     motor: Motor,
-    /// Described mount.
+    /// Mount as described to the library.
     pub(crate) mount: Mount,
     /// Target of each beam, by stamp and beam index.
     truth: HashMap<(u64, u16), BeamTarget>,
@@ -39,7 +39,7 @@ impl Hall {
         Hall { room: Room::new(world, seed), motor, mount, truth: HashMap::new(), stamp_delay_ns: 0 }
     }
 
-    /// Plays the hall until `until_s`, and passes each sweep with the hall to `show`.
+    /// Plays the first `until_s` seconds of the hall, and passes each sweep with the hall to `show`.
     pub(crate) fn play(
         &mut self,
         settings: Settings,
@@ -64,7 +64,8 @@ impl Hall {
         tilting.counts()
     }
 
-    /// Plays the hall until `until_s` repeatedly. Returns the library's time per scan in the fastest run.
+    /// Plays the first `until_s` seconds of the hall 30 times. Returns the time that the library needs per scan in the
+    /// fastest run.
     pub(crate) fn min_time_per_scan(&mut self, settings: Settings, until_s: u64) -> Duration {
         let ends: Vec<u64> =
             (1..until_s * 1_000_000_000 / SCAN_TIME_NS).map(|number| number * SCAN_TIME_NS).collect();
@@ -104,7 +105,7 @@ impl Hall {
         let beam_rad = (f64::from(point.beam) / 2.0 - 90.0).to_radians();
         let origin = self.mount.origin(angle_rad);
         let direction = self.mount.direction(angle_rad, beam_rad);
-        // Both use the range of the point, so the noise of the sensor does not matter.
+        // Both positions use the range of the point, so the noise of the sensor does not matter.
         let (at, range_m) = (point.at.map(f64::from), self.range_m(point));
         (0..3).map(|i| (origin[i] + range_m * direction[i] - at[i]).powi(2)).sum::<f64>().sqrt()
     }

@@ -11,8 +11,8 @@ pub(crate) fn unchanging(seed: u64) -> World {
     world(&furniture(&mut Rng::with_seed(seed)))
 }
 
-/// Returns the same hall with objects that appear one after the other from 30 s on, and a person who walks from 45 s
-/// on.
+/// Returns the hall of [`unchanging`] with objects that appear one after the other from second 30 on, and a person who
+/// walks from second 45 on.
 pub(crate) fn changing(seed: u64) -> World {
     let mut text = furniture(&mut Rng::with_seed(seed));
     let mut random = Rng::with_seed(1000 + seed);

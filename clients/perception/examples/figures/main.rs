@@ -17,7 +17,7 @@ use scanhub_sim::mount::{Fault, FaultKind};
 use scanhub_sim::world::World;
 use score::{ObstacleScore, ObstacleTimes, PointScore, seconds, share};
 
-/// Number of halls.
+/// Number of halls, each with its own seed.
 const SEED_COUNT: u64 = 10;
 
 fn main() -> Result<(), scanhub_schema::Failure> {
@@ -69,7 +69,8 @@ const FAULTS: [(&str, FaultKind); 8] = [
     ("late by 1 s", FaultKind::Delay(1.0)),
 ];
 
-/// Measures false obstacles in halls without changes, for 200 sweeps, after the background is known.
+/// Measures false obstacles in halls without changes. Each hall runs for 200 sweeps; the first seven do not count,
+/// because the background is not known yet.
 fn measure_unchanging(halls: Range<u64>) {
     let (mut sweeps, mut with, mut obstacles, mut late) = (0, 0, 0, 0);
     for seed in halls.clone() {
@@ -196,7 +197,7 @@ fn measure_people(world: &World) {
 fn measure_fault(world: &World, name: &str, kind: FaultKind) {
     let fault = Fault { kind, from_s: 20.0, until_s: 24.0 };
     let (mut maximum, mut invented) = (0.0_f64, 0);
-    // Until then, no person has appeared.
+    // No person appears before the end of this run.
     let world = world.clone().with_mount_faults(&[fault]);
     let counts = Hall::new(&world, 1).play(Settings::default(), 29, |hall, sweep| {
         if !sweep.is_unreliable {

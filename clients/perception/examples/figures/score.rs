@@ -7,20 +7,21 @@ use super::hall::Hall;
 
 const ONE_SECOND: u64 = 1_000_000_000;
 
-/// Points on people and new objects, with the number of those that were found.
+/// Number of points on people and new objects, and number of these points that were found.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct PointScore {
-    /// Points on people, and the number of these that are foreground.
+    /// Points on people, and the number of these points that are foreground.
     pub(crate) persons: (usize, usize),
-    /// Points on new objects that cannot be background yet, and the number of these that are foreground.
+    /// Points on new objects that cannot be background yet, and the number of these points that are foreground.
     pub(crate) things: (usize, usize),
     /// Points that are foreground although nothing is new at their positions.
     pub(crate) wrong: usize,
 }
 
 impl PointScore {
-    /// Adds the points of a sweep. An object counts as new until enough sweeps have met it. In the two sweeps after
-    /// that, its points are not counted. Points next to it on the same beam are never counted.
+    /// Adds the points of a sweep. An object counts as new until enough sweeps have met it to make it background. In
+    /// the two sweeps after that, the object's points are not counted. Points of beams that graze an object are never
+    /// counted.
     pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
         let new_ns = u64::from(settings.sweeps) * sweep_ns;
         for point in sweep.points {
@@ -55,7 +56,8 @@ impl PointScore {
 /// Counts of new objects, and of obstacles that were found.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ObstacleScore {
-    /// Clusters of at least [`MIN_POINTS`] points on people and new objects, and the number of these that were found.
+    /// Clusters of at least [`MIN_POINTS`] points on people and new objects, and the number of these clusters that were
+    /// found.
     pub(crate) new: (usize, usize),
     /// Obstacles on new objects.
     pub(crate) right: usize,
@@ -69,8 +71,8 @@ const MIN_POINTS: usize = 15;
 const NEIGHBOR_DISTANCE_M: f32 = 0.2;
 
 impl ObstacleScore {
-    /// Adds the obstacles of a sweep. [`PointScore::add`] defines which points are new, and which are not counted.
-    /// Obstacles at the positions of the latter are not counted either.
+    /// Adds the obstacles of a sweep. An object counts as new as in [`PointScore::add`]. In the three sweeps after
+    /// that, obstacles with its points are not counted.
     pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
         let new_ns = u64::from(settings.sweeps) * sweep_ns;
         let (mut new, mut open) = (Vec::new(), Vec::new());
@@ -135,13 +137,13 @@ fn clusters(points: &[[f32; 3]]) -> Vec<Vec<[f32; 3]>> {
     clusters
 }
 
-/// Returns a share. It is NaN if `all` is 0.
+/// Returns `part` divided by `all`; NaN if `all` is 0.
 pub(crate) fn share(part: usize, all: usize) -> f64 {
     part as f64 / all as f64
 }
 
-/// Sweeps in which the pole and the box of world `tilt` were among the obstacles: start of each sweep, and whether the
-/// object was found.
+/// For the pole and the box of world `tilt`: start of each sweep in ns, and whether the object was among the obstacles
+/// of the sweep.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ObstacleTimes {
     pole: Vec<(u64, bool)>,
@@ -170,14 +172,14 @@ impl ObstacleTimes {
         self.pole.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(POLE_PLACED_S - 2)).count()
     }
 
-    /// Returns the same number for the box.
+    /// Returns the number of sweeps in which the box was found, until it was background.
     pub(crate) fn sweeps_of_box(&self) -> usize {
         self.boxed.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(BOX_PLACED_S - 2)).count()
     }
 }
 
-/// Returns whether the middle of `obstacle` is within half of `max_width_m` of `x` and `y`, and its width is below
-/// `max_width_m`.
+/// Returns whether the middle of `obstacle` is less than half of `max_width_m` away from `x` and `y`, and the
+/// obstacle's width along x and y is below `max_width_m`.
 fn is_at(obstacle: &Obstacle, [x, y]: [f32; 2], max_width_m: f32) -> bool {
     (obstacle.middle[0] - x).hypot(obstacle.middle[1] - y) < max_width_m / 2.0
         && obstacle.high[0] - obstacle.low[0] < max_width_m
@@ -187,7 +189,7 @@ fn is_at(obstacle: &Obstacle, [x, y]: [f32; 2], max_width_m: f32) -> bool {
 /// Times at which the pole and the box of world `tilt` appear, in seconds.
 const POLE_PLACED_S: u64 = 30;
 const BOX_PLACED_S: u64 = 36;
-/// Duration of a sweep of its mount in ns: 50 degrees at 30 degrees per second.
+/// Duration of a sweep of the mount in world `tilt`, in ns: 50 degrees at 30 degrees per second.
 pub(crate) const SWEEP_TIME_NS: u64 = 1_666_666_667;
 
 /// Converts seconds to ns.

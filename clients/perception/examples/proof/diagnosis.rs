@@ -1,5 +1,5 @@
 //! Reasons for lost IDs. Each change of a person's track gets one cause, from the state of the old track and the origin
-//! of the new one. This module only counts; `motmetrics` computes the scores.
+//! of the new track. This module only counts; `motmetrics` computes the scores.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -10,21 +10,21 @@ use scanhub_schema::TrackState;
 use crate::house::CHAIRS;
 use crate::walkers::{CORRIDOR_X, Crossing};
 
-/// Maximum distance between a person and a matching track in meters, as in the score.
+/// Maximum distance between a person and a matching track in meters, the same as in `score.py`.
 const MATCH_M: f64 = 0.5;
 /// Maximum distance in meters between two people whose tracks may be swapped.
 const NEIGHBOR_M: f64 = 1.2;
 
 /// Assignment of tracks to people, frame by frame.
 pub(crate) struct Diagnosis {
-    /// Track of each person, with the last time at which they had it.
+    /// Track of each person, with the last time in seconds at which the person had this track.
     tracks: Vec<Option<(u64, f64)>>,
     /// Last owner of each track.
     owners: HashMap<u64, usize>,
     known_ids: BTreeSet<u64>,
     /// Number of changes by cause.
     pub(crate) causes: BTreeMap<&'static str, usize>,
-    /// Sum of the squared errors of confirmed tracks and their number, by possible cause.
+    /// Sum of the squared errors of confirmed tracks, and number of these errors, by possible cause.
     pub(crate) errors: BTreeMap<&'static str, (f64, usize)>,
     is_reported: bool,
 }
@@ -41,8 +41,8 @@ impl Diagnosis {
         }
     }
 
-    /// Compares the true positions of people with the tracks at this time. `crossings` are all passages through the
-    /// corridor.
+    /// Compares the true positions of people with the tracks at the time `now_s`. `crossings` are all passages through
+    /// the corridor.
     pub(crate) fn take(
         &mut self,
         now_s: f64,

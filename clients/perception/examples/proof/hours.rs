@@ -1,5 +1,5 @@
-//! A long run of the tracker. New people arrive every ten minutes, and one scan per minute is late. It shows that the
-//! tracker's memory does not grow, and that no ID is used twice.
+//! A long run of the tracker. New people arrive every ten minutes, and one scan per minute is late. The run shows that
+//! the tracker's memory does not grow, and that no ID is used twice.
 
 use std::time::Instant;
 
@@ -12,9 +12,9 @@ use crate::house::{BEAMS, House, HouseSensor};
 use crate::walkers::Crowd;
 
 const SECONDS_PER_HOUR: u64 = 3600;
-/// Shares of rests that end with a change of the room, and of rests on a chair.
+/// Share of rests that end with a change of the room, and share of rests on a chair.
 const CHANGE_SHARES: (f64, f64) = (0.25, 0.25);
-/// Scans per second, from the sensors in turn.
+/// Scans per second, from all sensors together. The sensors take turns.
 const SCAN_RATE_HZ: u64 = 100;
 const SCAN_DELAY_NS: u64 = 80_000_000;
 /// Time in seconds after which the people are replaced.
@@ -23,7 +23,7 @@ const VISIT_TIME_S: u64 = 600;
 const LATE_DELAY_NS: u64 = 300_000_000;
 const START_NS: u64 = 1_800_000_000_000_000_000;
 
-/// Tracks `people` people at a time for this number of virtual hours, and prints a line every hour.
+/// Tracks `people` people at a time for `hours` hours of virtual time, and prints a line after each of these hours.
 pub(crate) fn run(hours: u64, people: usize) {
     let house = House { is_ideal: false };
     let site = Site::parse("house.toml", &house.site()).expect("the house is right");
@@ -82,7 +82,7 @@ pub(crate) fn run(hours: u64, people: usize) {
     }
 }
 
-/// Counts of track IDs. IDs only increase, so a new ID that is not above all earlier ones was reused.
+/// Counts of track IDs. IDs only increase, so a new ID that is not above all earlier IDs was reused.
 #[derive(Default)]
 struct TrackIds {
     highest: u64,

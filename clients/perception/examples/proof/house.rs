@@ -1,5 +1,5 @@
-//! House of the proof: two rooms with furniture, a corridor between them that no sensor covers, and a sensor in two
-//! corners of each room. The simulator of the scanners measures it.
+//! House of the proof: two rooms with furniture, a corridor between them that no sensor covers, and a sensor in each of
+//! two corners of each room. The simulator of the scanners computes the scans.
 
 use std::f64::consts::PI;
 
@@ -65,7 +65,7 @@ between = [[17, 2], [17, 3]]
 
 /// Corners of the cupboards: minimum x and y, maximum x and y.
 const CUPBOARDS: [[f64; 4]; 2] = [[2.6, 3.2, 3.6, 3.6], [13.4, 1.4, 13.8, 2.4]];
-/// Corners of the tables, in the same order. A table has four legs.
+/// Corners of the tables: minimum x and y, maximum x and y. A table has four legs.
 const TABLE_CORNERS: [[f64; 4]; 2] = [[3.4, 0.5, 4.6, 1.2], [14.9, 3.5, 16.1, 4.2]];
 const TABLE_LEG_M: f64 = 0.03;
 /// Chairs: x, y, and the direction in radians in which a person sits.
@@ -77,10 +77,10 @@ pub(crate) const CHAIRS: [(Point, f64); 6] = [
     ([15.6, 0.8], 0.75 * PI),
     ([15.5, 3.1], -PI / 2.0),
 ];
-/// Distance of a chair's legs from its center along both axes, and radius of the legs.
+/// Distance of a chair's legs from the chair's center along both axes, and radius of the legs.
 const CHAIR_HALF_M: f64 = 0.2;
 const CHAIR_LEG_M: f64 = 0.014;
-/// Standard deviation of a range of the ideal sensor, and its share of beams without a range.
+/// Standard deviation of a range of the ideal sensor, and share of the ideal sensor's beams without a range.
 const IDEAL_SIGMA_MM: f64 = 10.0;
 const IDEAL_ERRORS: f64 = 1e-3;
 

@@ -106,7 +106,7 @@ fn main() {
     );
 }
 
-/// Shares of rests that end with a change of the room, and of rests on a chair.
+/// Share of rests that end with a change of the room, and share of rests on a chair.
 const USUAL_SHARES: (f64, f64) = (0.25, 0.12);
 
 fn usage() -> ! {

@@ -1,10 +1,10 @@
-//! Oracle that guesses who comes out of the corridor. It knows the exact time of each passage through a door, and the
-//! distributions of walking speed and stops in this house, but no person's own pace.
+//! Oracle that guesses who comes out of the corridor. The oracle has the exact time of each passage through a door, and
+//! the distributions of walking speed and stops in this house, but no person's own pace.
 
 use crate::walkers::{CORRIDOR_X, Crossing, Crowd, STOP_SHARE, WALKING_SPEED};
 
-/// Returns whether the oracle identifies the person of `crossing` correctly. It chooses the person inside who is most
-/// likely to come out at that time, given that they have not come out before.
+/// Returns whether the oracle identifies the person of `crossing` correctly. The oracle chooses the person in the
+/// corridor who is most likely to come out at that time, given that they have not come out before.
 pub(crate) fn is_guess_right(crowd: &Crowd, crossing: &Crossing) -> bool {
     let inside = crowd
         .crossings
@@ -18,15 +18,16 @@ pub(crate) fn is_guess_right(crowd: &Crowd, crossing: &Crossing) -> bool {
 }
 
 /// ID of each walker over time, according to an observer that sees everything in the rooms and uses the oracle for
-/// everyone who comes out of the corridor. A tracker that does not see into the corridor and does not know each
-/// person's pace cannot be expected to do better.
+/// everyone who comes out of the corridor. No tracker can be expected to do better if it neither sees into the corridor
+/// nor has each person's pace.
 pub(crate) struct Identities {
-    /// Entries and exits in order of time: time in seconds, walker, and whether it is an exit.
+    /// Entries into the corridor and exits from it in order of time: time in seconds, walker, and whether the event is
+    /// an exit.
     events: Vec<(f64, usize, bool)>,
     next_event: usize,
     /// ID of each walker.
     pub(crate) current_ids: Vec<usize>,
-    /// Time of entry and ID of everyone who is inside.
+    /// Time of entry and ID of everyone who is in the corridor.
     inside: Vec<(f64, usize)>,
 }
 
@@ -66,8 +67,8 @@ impl Identities {
     }
 }
 
-/// Returns the hazard rate of coming out after `after_s` seconds inside: the density divided by the remaining
-/// probability, for the walkers' own distribution.
+/// Returns the hazard rate of coming out of the corridor after `after_s` seconds inside: the density divided by the
+/// remaining probability. The distribution is the one from which the walkers' speeds and stops are drawn.
 fn hazard(after_s: f64) -> f64 {
     let corridor_m = CORRIDOR_X[1] - CORRIDOR_X[0];
     let (mut density, mut remains) = (1e-9, 1e-9);

@@ -19,7 +19,7 @@ use crate::walkers::{Crossing, Crowd};
 pub(crate) const EMPTY_TIME_S: f64 = 12.0;
 const SAMPLE_RATE_HZ: f64 = 25.0;
 const NS_PER_S: f64 = 1e9;
-/// Duration of a mirror revolution of an LMS 2xx in ns, and its number of simulation steps.
+/// Duration of a mirror revolution of an LMS 2xx in ns, and number of simulation steps in this time.
 const MIRROR_TURN_NS: Nanos = 13_320_000;
 const STEPS_PER_MIRROR_TURN: usize = 3;
 /// Start of the simulation as a wall clock time in ns.
@@ -51,18 +51,19 @@ pub(crate) struct Outcome {
     pub(crate) csv: String,
     /// Lines for the score of exact positions with the oracle's IDs.
     pub(crate) oracle_csv: String,
-    /// Sum of the squared distances between confirmed tracks and people, and their number.
+    /// Sum of the squared distances between confirmed tracks and people, and number of these distances.
     pub(crate) squared_errors: (f64, usize),
-    /// Passages through the corridor: all, those with the same ID before and after, and those that the oracle guessed
-    /// right.
+    /// Passages through the corridor: all passages, passages with the same ID before and after, and passages that the
+    /// oracle guessed right.
     pub(crate) crossings: (usize, usize, usize),
-    /// Passages of doors: real ones, reported ones, and reports with the right door and direction within two seconds.
+    /// Passages of doors: number of real passages, number of reported passages, and number of passages that were
+    /// reported within two seconds with the right door and direction.
     pub(crate) doors: (usize, usize, usize),
-    /// For each person, the number of tracks in the second half, and the share of that time with a track.
+    /// For each person, the number of tracks in the second half of the run, and the share of this half with a track.
     pub(crate) late_ids: Vec<(usize, f64)>,
     pub(crate) tracker_time_s: f64,
     pub(crate) simulated_s: f64,
-    /// Number of tracks. Without people, each is an error.
+    /// Number of tracks. In a run without people, each track is an error.
     pub(crate) tracks: usize,
     pub(crate) offset_error_s: f64,
     pub(crate) late: u64,
@@ -103,7 +104,7 @@ pub(crate) fn run(setup: ProofSetup) -> Outcome {
     let mut truths: Vec<Vec<Point>> = Vec::new();
     let mut samples: Vec<Snapshot> = Vec::new();
     let mut sent: Vec<SentScan> = Vec::new();
-    // Shapes during the last mirror revolutions of a scanner.
+    // Moving objects during the last mirror revolution, one entry per simulation step.
     let mut shapes: VecDeque<Vec<Shape>> = VecDeque::new();
     let steps = (setup.seconds * 200.0) as usize;
     for step in 0..steps {

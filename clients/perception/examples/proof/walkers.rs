@@ -7,7 +7,8 @@ use scanhub_sim::Shape;
 use crate::house::{CHAIRS, House, chair_legs, normal, post, wall};
 
 pub(crate) const LEG_RADIUS_M: f64 = 0.06;
-/// Half of the distance between the legs across the walking direction, and maximum distance of a foot ahead.
+/// Half of the distance between the legs across the walking direction, and maximum distance of a foot ahead of the
+/// body.
 const HALF_HIP_WIDTH_M: f64 = 0.11;
 const STRIDE_LEN_M: f64 = 0.25;
 const DOUBLE_STEP_LEN_M: f64 = 1.4;
@@ -36,9 +37,9 @@ const FREE_AREAS: [[f64; 4]; 9] = [
 ];
 /// Doors that lead outside: x, and the direction of the street.
 const OUTER_DOORS: [(f64, f64); 2] = [(0.0, -1.0), (17.0, 1.0)];
-/// Index of the first of these doors in the site.
+/// Index in the site of the first door that leads outside.
 const FIRST_OUTER_DOOR: usize = 2;
-/// Share of paths that lead outside, and time after which another person enters, in seconds.
+/// Share of paths that lead outside, and minimum and maximum time after which another person enters, in seconds.
 const LEAVE_SHARE: f64 = 0.06;
 const RETURN_TIME_S: (f64, f64) = (3.0, 12.0);
 /// Distance in meters at which a door opens for a person who wants to pass, and the duration of the opening in seconds.
@@ -88,7 +89,7 @@ pub(crate) struct Crowd {
     pub(crate) walkers: Vec<Walker>,
     random: fastrand::Rng,
     pub(crate) crossings: Vec<Crossing>,
-    /// Passages of doors: time, door, and whether from the room that the site names first.
+    /// Passages of doors: time, door, and whether the person came from the room that the site names first.
     pub(crate) passages: Vec<(f64, usize, bool)>,
     /// Share of rests that end with a change of the room. If it is negative, people stay at their first position.
     room_change_share: f64,
@@ -307,7 +308,7 @@ impl Crowd {
         }
     }
 
-    /// Returns whether another person comes through the door to which this one walks.
+    /// Returns whether another person comes through the door to which person `i` walks.
     fn must_wait(&self, i: usize, positions: &[Point]) -> bool {
         let walker = &self.walkers[i];
         let Some((goal, _)) = walker.path.last() else { return false };
@@ -387,7 +388,8 @@ impl Crowd {
         }
     }
 
-    /// Sends the person to a free chair in the room. Returns false if there is none.
+    /// Sends person `i` to a free chair in the room. Returns false if no chair is free, or if the person has just sat
+    /// on one.
     fn sit_down(&mut self, i: usize) -> bool {
         let room = self.walkers[i].room;
         let is_free = |&chair: &usize| {
@@ -396,7 +398,7 @@ impl Crowd {
                 && self.walkers.iter().all(|walker| walker.chair != Some(chair))
         };
         let free: Vec<usize> = (0..self.chairs.len()).filter(is_free).collect();
-        // A person who has just sat walks first.
+        // A person who has just sat on a chair walks before they sit down again.
         if free.is_empty() || self.walkers[i].chair.is_some() {
             self.walkers[i].chair = None;
             return false;
@@ -412,7 +414,7 @@ impl Crowd {
         true
     }
 
-    /// Ends the person's rest on a chair, which is moved a little.
+    /// Ends the rest of person `i` on a chair, and moves the chair a little.
     fn stand_up(&mut self, i: usize) {
         if let Some(chair) = self.walkers[i].chair.take() {
             self.chairs[chair] = move_chair(self.chairs[chair], &mut self.random);
@@ -488,8 +490,8 @@ impl Crowd {
     }
 }
 
-/// Returns three points on the path out of a room, seen from the corridor: in front of, in and behind its door. Also
-/// returns the door's x.
+/// Returns three points on the path from the corridor into a room: in front of the room's door, in the door, and behind
+/// the door. Also returns the door's x.
 fn doors(room: usize) -> ([Point; 3], f64) {
     match room {
         0 => ([[6.6, 2.5], [6.0, 2.5], [5.3, 2.5]], 6.0),
@@ -501,7 +503,7 @@ fn within([a, b, c, d]: &[f64; 4], margin: f64, [x, y]: Point) -> bool {
     x > a - margin && x < c + margin && y > b - margin && y < d + margin
 }
 
-/// Returns whether `position` is at the end of the path out through that door.
+/// Returns whether `position` is at the end of the path that leads outside through `door`.
 fn is_outside(door: usize, position: Point) -> bool {
     let (x, out) = OUTER_DOORS[door];
     (position[0] - x) * out > 2.0

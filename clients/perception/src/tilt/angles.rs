@@ -29,7 +29,7 @@ pub enum DropReason {
     Jumped,
     /// The angles contradict their rates.
     Inconsistent,
-    /// The mount stands, or its encoder is stuck. The angles do not show which of the two.
+    /// The mount stands, or its encoder is stuck. The angles do not distinguish these two cases.
     Standing,
 }
 
@@ -73,10 +73,10 @@ pub(crate) struct Angles {
     late_ns: i64,
 }
 
-/// Maximum number of stored angles: ten seconds at 100 Hz.
+/// Maximum number of stored angles, enough for ten seconds at 100 Hz.
 const MAX_ANGLES: usize = 1024;
-/// Two limits in ns. If a stamp is earlier than the previous angle's stamp by more than this, the clock was set back.
-/// If a stamp is later than the latest scan's stamp by more than this, the angle is dropped.
+/// Two limits in ns. If the stamp of an angle is earlier than the previous angle's stamp by more than this time, the
+/// clock was set back. If it is later than the latest scan's stamp by more than this time, the angle is dropped.
 const CLOCK_JUMP_NS: u64 = 1_000_000_000;
 
 impl Angles {
@@ -170,7 +170,7 @@ impl Angles {
         self.entries.back().map(|entry| self.true_ns(entry.angle.stamp_ns))
     }
 
-    /// Returns the reason why the angle is unknown between the last two reports; `None` if it is known.
+    /// Returns the reason why the angle is unknown between the last two reported angles; `None` if it is known.
     pub(crate) fn problem(&self) -> Option<DropReason> {
         self.entries.back().map_or(Some(DropReason::Silent), |entry| entry.drop_reason)
     }
@@ -213,7 +213,7 @@ struct StampedAngle {
 /// Direction in which the mount moves.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Direction {
-    /// Unknown direction, with the minimum and maximum angle since its start.
+    /// Unknown direction, with the minimum and maximum angle since the direction became unknown.
     Open { lowest: StampedAngle, highest: StampedAngle },
     /// Toward larger angles, with the maximum so far.
     Up(StampedAngle),

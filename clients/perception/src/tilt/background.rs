@@ -1,6 +1,6 @@
 //! Background in three dimensions: the surface that each beam usually meets, for each narrow range of the mount's
-//! angle. It is learned as the background in two dimensions: if a number of sweeps in a row meet another surface, this
-//! surface replaces the previous one.
+//! angle. It is learned in the same way as the background in two dimensions: if a number of sweeps in a row meet
+//! another surface, this surface replaces the previous one.
 
 use scanhub_schema::PointClass;
 
@@ -48,10 +48,10 @@ struct Cell {
 #[derive(Clone, Copy, Default)]
 struct NarrowSurface {
     surface: Surface,
-    /// Number of sweeps that met the surface; 0 if no surface is stored. Beams that meet a third surface decrease this
-    /// number.
+    /// Number of sweeps that met the surface; 0 if no surface is stored. A beam that meets neither the background nor a
+    /// stored narrow surface decreases the smallest of these numbers in the cell.
     hit_count: u16,
-    /// Number of times that a sweep met the surface after a sweep that missed it.
+    /// Number of times that a sweep met the surface after the previous sweep had missed the surface.
     visits: u16,
     /// Number of sweeps since a sweep last met the surface. Sweeps that did not measure the cell do not count.
     miss_count: u16,
@@ -108,9 +108,9 @@ impl SurfaceModel {
         self.background(row, reading.beam.into()).is_some()
     }
 
-    /// Returns the error of the mount's angle in radians, computed from the reading. It is the difference between the
-    /// mount's angle and the angle at which the reading would be on the background. Returns `None` unless the
-    /// background is a level surface that the beam meets at a steep angle.
+    /// Returns the error of the mount's angle in radians, computed from the reading. The error is the difference
+    /// between the mount's angle and the angle at which the reading would be on the background. Returns `None` unless
+    /// the background is a level surface that the beam meets at a steep angle.
     pub(crate) fn angle_off(&self, reading: &Reading, row: usize, threshold_m: f32) -> Option<f32> {
         let known = self.background(row, reading.beam.into())?;
         let [level, upright] = known.ends(reading);
@@ -171,7 +171,7 @@ impl SurfaceModel {
 }
 
 impl Cell {
-    /// Counts sweeps that meet other surfaces than the background.
+    /// Counts the sweeps that meet each narrow surface, with a reading that is not on the background.
     fn learn_narrow(&mut self, reading: &Reading, sweeps: u16, threshold_m: f32) {
         let explains = |narrow: &&mut NarrowSurface| {
             narrow.hit_count > 0 && narrow.surface.explains(reading, threshold_m)
@@ -244,9 +244,9 @@ impl Surface {
         self.range_m > 0.0
     }
 
-    /// Returns two ranges at which a beam with the rise of `reading` would meet the surface. The first is right if the
-    /// surface is level, so that its height is constant. The second is right if the surface is upright, so that its
-    /// horizontal distance is constant.
+    /// Returns two ranges at which a beam with the rise of `reading` would meet the surface. The first range is right
+    /// if the surface is level, so that its height is constant. The second range is right if the surface is upright, so
+    /// that its horizontal distance is constant.
     fn ends(&self, reading: &Reading) -> [f32; 2] {
         let Surface { range_m, rise, .. } = *self;
         let over_ground = |rise: f32| (1.0 - rise * rise).max(0.0).sqrt();
@@ -255,9 +255,9 @@ impl Surface {
         [if is_slope { range_m * rise / reading.rise } else { upright }, upright]
     }
 
-    /// Returns the minimum and maximum range at which a beam with the rise of `reading` would meet the surface.
-    /// Orientations that earlier beams have ruled out do not count. If the surface is neither level nor upright, the
-    /// range is between these two.
+    /// Returns the minimum and maximum range at which a beam with the rise of `reading` would meet the surface. If
+    /// earlier beams have shown that the surface is level, or that it is upright, minimum and maximum are equal. The
+    /// range for any other slope is between the range for a level surface and the range for an upright surface.
     fn expected(&self, reading: &Reading, threshold_m: f32) -> (f32, f32) {
         let [level, upright] = self.ends(reading);
         let most = (threshold_m / 2.0).powi(2);
@@ -301,8 +301,8 @@ const MIN_BIN_RAD: f64 = 0.002;
 const UPDATE_WEIGHT: f32 = 0.25;
 /// Minimum horizontal distance per meter of range, which avoids a division by zero for a vertical beam.
 const MIN_OVER_GROUND: f32 = 0.02;
-/// Minimum change of the rise per radian for a beam that shows an error of the angle. A beam along the axis has the
-/// same height at any angle.
+/// Minimum change of a beam's rise per radian at which the beam is used to measure the error of the mount's angle. A
+/// beam along the axis has the same height at any angle, so it shows no error.
 const MIN_RISE_CHANGE: f32 = 0.3;
 /// Minimum absolute rise of a beam that is compared with a level surface. A flatter beam meets a level surface within
 /// reach only if the surface's height is close to the scanner's: at 8 m, within 0.16 m.

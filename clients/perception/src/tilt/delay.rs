@@ -5,9 +5,10 @@ use super::sweep::Ray;
 
 /// Number of beam directions that are compared.
 const COLUMN_COUNT: usize = 24;
-/// Minimum number of points on slopes for a measurement of the delay.
+/// Minimum number of points on slopes that a measurement of the delay needs.
 const MIN_VOTES: usize = 60;
-/// Minimum angle between the surfaces in two sweeps that counts as a delay, in radians: 0.1 degrees.
+/// Minimum angle by which a surface must appear displaced between two sweeps to count as a delay, in radians: 0.1
+/// degrees.
 const MIN_SHIFT_RAD: f64 = 0.0017;
 /// Maximum delay that is corrected, in seconds.
 pub(crate) const MAX_DELAY_S: f64 = 0.15;
@@ -24,7 +25,7 @@ const MAX_GAP_RAD: f64 = 0.06;
 struct Sample {
     time_s: f64,
     angle_rad: f64,
-    /// One divided by the range in meters. On a plane, it changes evenly with the angle.
+    /// One divided by the range in meters. On a plane, this value changes evenly with the angle.
     inverse: f64,
 }
 
@@ -53,7 +54,7 @@ impl Delay {
     }
 
     /// Adds a sweep, whose scans have `beams` beams. Once two successive pairs of sweeps agree on the delay that
-    /// remains after earlier corrections, returns it in seconds.
+    /// remains after earlier corrections, returns this delay in seconds.
     pub(crate) fn take(
         &mut self,
         rays: &[Ray],
@@ -74,7 +75,8 @@ impl Delay {
         (agrees && is_significant).then_some(late_s)
     }
 
-    /// Returns the delay in seconds, and the rate in rad/s at which a delay moves the two sweeps apart.
+    /// Returns the delay in seconds, and the angle by which a delay moves the two sweeps apart, in rad per second of
+    /// delay.
     fn measure(&mut self) -> Option<(f64, f64)> {
         let mut late_s = 0.0;
         for _ in 0..4 {
@@ -103,8 +105,8 @@ impl Delay {
     }
 }
 
-/// Computes the delay from the middle one of three samples. Returns the part in seconds that exceeds `late_s`, and the
-/// rate in rad/s at which a delay moves the sweeps apart.
+/// Computes the delay from the second of the three samples in `window`. Returns the part of the delay that exceeds
+/// `late_s`, in seconds, and the angle by which a delay moves the two sweeps apart, in rad per second of delay.
 fn vote(window: &[Sample], before: &[Sample], late_s: f64) -> Option<(f64, f64)> {
     let [first, here, last] = window else { return None };
     let rate = (last.angle_rad - first.angle_rad) / (last.time_s - first.time_s);
@@ -125,7 +127,7 @@ struct Slopes {
     rate: f64,
 }
 
-/// Returns the slope at an angle, if the two samples on each side are on one plane.
+/// Returns the slope at an angle, if the two samples below this angle and the two samples above it are on one plane.
 fn slopes(column: &[Sample], angle_rad: f64) -> Option<Slopes> {
     let after = column.partition_point(|sample| sample.angle_rad < angle_rad);
     let [a, b, c, d] = column.get(after.checked_sub(2)?..after + 2)? else { return None };

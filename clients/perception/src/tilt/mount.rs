@@ -12,7 +12,8 @@ pub struct Mount {
     /// Direction of the axis. The vector may have any length except 0. Angles are right-handed: around y, which is the
     /// default, a larger angle tilts the scanner down; around -y, it tilts the scanner up.
     pub axis: [f64; 3],
-    /// Angle at which the scanner measures level. `sensor_at` and `yaw_rad` are given for this angle.
+    /// Angle of the mount at which the scanner is level, so that its beams are horizontal. `sensor_at` and `yaw_rad`
+    /// are given for this angle.
     pub level_rad: f64,
     /// Origin of the beams.
     pub sensor_at: [f64; 3],
@@ -58,7 +59,7 @@ impl Mount {
         std::array::from_fn(|i| origin[i] + range_m * direction[i])
     }
 
-    /// Rotates `v` by Rodrigues' formula.
+    /// Rotates `v` around the axis, from the level angle to `angle_rad`, by Rodrigues' formula.
     fn rotated(&self, v: [f64; 3], angle_rad: f64) -> [f64; 3] {
         let length = dot(self.axis, self.axis).sqrt();
         let k = self.axis.map(|value| value / length);
@@ -78,8 +79,8 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 
 /// Maximum height of the floor's points above or below 0, in meters.
 const MAX_FLOOR_OFFSET_M: f64 = 0.4;
-/// Maximum distance of a point that is used, in meters. A small error of the angle moves a point at a larger distance
-/// too much.
+/// Maximum distance of a point that is used, in meters. At a larger distance, a small error of the angle moves a point
+/// too far.
 const MAX_DISTANCE_M: f64 = 6.0;
 /// Minimum height of the points of a wall, in meters.
 const MIN_WALL_POINT_HEIGHT_M: f64 = 0.3;
@@ -91,7 +92,8 @@ const MIN_POINTS: usize = 300;
 const MIN_WALL_HEIGHT_M: f64 = 0.4;
 /// Maximum standard deviation of the points of a wall, in meters.
 const MAX_ROUGHNESS_M: f64 = 0.07;
-/// Maximum number of stored points. Each sweep gets the same share, because up and down sweeps can differ.
+/// Maximum number of points that are stored for each sweep. Each sweep has its own limit and therefore the same weight,
+/// because up and down sweeps can differ.
 const MAX_POINTS: usize = 40_000;
 
 /// Check of the mount's description, with the points of several sweeps.
@@ -148,7 +150,7 @@ impl MountCheck {
         self.points.extend(near.step_by(every));
     }
 
-    /// Returns the number of sweeps since the start of the check.
+    /// Returns the number of sweeps since the check started or restarted.
     pub fn sweeps(&self) -> u32 {
         self.sweeps
     }
@@ -193,8 +195,8 @@ impl MountCheck {
                 if distance >= 0.0
                     && let Some(area) = areas.get_mut((distance / BIN_M) as usize)
                 {
-                    // The beams diverge. Without this weight, a part of a near side wall would count more than a wall
-                    // ahead.
+                    // The beams diverge, so a near wall has more points per square meter. Without this weight, a part
+                    // of a near side wall would count more than a wall ahead.
                     *area += at[0].powi(2) + at[1].powi(2);
                 }
             }
@@ -218,7 +220,8 @@ impl MountCheck {
             return None;
         }
         let plane = Plane::of(on).filter(|plane| plane.deviation < MAX_ROUGHNESS_M)?;
-        // The wall is not exactly perpendicular to the direction of the search that found it.
+        // The search tries only whole degrees, so the wall is not exactly perpendicular to the direction that the
+        // search found.
         let [distance, slope, lean] = plane.terms;
         let across = slope.hypot(1.0);
         Some(Wall {
@@ -238,7 +241,8 @@ struct Plane {
 }
 
 impl Plane {
-    /// Fits a plane by least squares, up to 8 times. Each time, drops the points that are far from the previous plane.
+    /// Fits a plane by least squares, 8 times. After each fit, drops the points that are far from the plane. Returns
+    /// `None` if too few points remain.
     fn of(mut points: Vec<([f64; 3], f64)>) -> Option<Plane> {
         let mut plane = None;
         for _ in 0..8 {

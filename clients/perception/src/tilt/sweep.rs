@@ -31,7 +31,7 @@ pub(crate) struct SweepAnalyzer {
     /// Number of resets of the model.
     pub(crate) background_resets: u64,
     points: Vec<Point>,
-    /// Row of the model for each beam, with its reading.
+    /// For each beam, the row of the model and the reading.
     readings: Vec<(usize, Reading)>,
     /// Error of the mount's angle in radians, computed from each beam on a level surface.
     off: Vec<f32>,
@@ -112,8 +112,8 @@ impl SweepAnalyzer {
         Sweep { is_unreliable, generation, points: &self.points, obstacles, dropped, ..sweep }
     }
 
-    /// Computes the points of the rays. Returns the number of rays whose cell has a known background, and how many of
-    /// these rays have a range that differs from it.
+    /// Computes the points of the rays. Returns the number of rays whose cell has a known background, and the number of
+    /// these rays whose range differs from this background.
     fn compare(&mut self, rays: &[Ray]) -> (usize, usize) {
         self.points.clear();
         self.readings.clear();
@@ -176,7 +176,7 @@ impl SweepAnalyzer {
 }
 
 impl Ray {
-    /// Returns the row of the background for this ray, and its reading.
+    /// Returns the row of the background for this ray, and the reading of the ray.
     fn reading(&self, mount: &Mount, settings: &Settings) -> (usize, Reading) {
         row_for(mount, settings, (self.angle_rad, self.beam_rad), self.beam, self.range_m)
     }
@@ -205,8 +205,9 @@ struct ObstacleCluster {
 
 impl ObstacleCluster {
     /// Returns whether the cluster may be only the top of an object that was there from the start. Nearly level beams
-    /// graze a top in few sweeps, and each time at another range. They do so only while the mount's angle changes by
-    /// less than the angle between two scans. An object that was put down is higher.
+    /// graze this top only in few sweeps, and each time at another range. In one sweep, only one scan grazes the top,
+    /// so the mount's angle hardly differs between its beams. An object that was put down is higher, so several scans
+    /// meet the object.
     fn is_grazed(&self) -> bool {
         let [low, high] = self.angles_rad;
         self.obstacle.flags & Obstacle::NEAR == 0
@@ -225,7 +226,7 @@ const MAX_GRAZING_RISE: f32 = 0.1;
 pub(crate) struct Clusters {
     /// Cube of each point with the point's index, sorted by cube.
     cubes: Vec<([i16; 3], u32)>,
-    /// For each point: whether it is the first one of a cube that the search has not reached.
+    /// For each point, whether it is the first point of a cube that the search has not reached.
     open: Vec<bool>,
     /// Cubes at the front of the search, by the index of their first point.
     front: Vec<usize>,
@@ -234,7 +235,7 @@ pub(crate) struct Clusters {
 
 impl Clusters {
     /// Returns the obstacles with at least the given number of points, the nearest first, and the number of obstacles
-    /// beyond the maximum.
+    /// that were dropped because there are more than [`MAX_OBSTACLES`].
     pub(crate) fn find(
         &mut self,
         points: &[Candidate],

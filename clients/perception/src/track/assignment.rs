@@ -16,7 +16,7 @@ pub(crate) struct Edge {
 /// Solver of assignments, with its buffers.
 #[derive(Default)]
 pub(crate) struct Assignment {
-    /// Group of each leg, followed by the group of each position.
+    /// Group of each leg, followed by the group of each position. Edges connect the legs and positions of a group.
     group: Vec<usize>,
     legs: Vec<usize>,
     targets: Vec<usize>,
@@ -118,7 +118,8 @@ impl Assignment {
 mod tests {
     use super::*;
 
-    /// Returns the maximum sum of the gains. Tries each leg with each free position, and without a position.
+    /// Returns the maximum sum of the gains of `leg` and the legs after it. Tries each leg with each free position, and
+    /// without a position. Bit i of `taken` is set if position i is not free.
     fn best(edges: &[Edge], leg: usize, legs: usize, taken: u32) -> f64 {
         if leg == legs {
             return 0.0;

@@ -87,8 +87,8 @@ pub fn overlap(first: &[Point], second: &[Point], tolerance_m: f64) -> bool {
     let deep =
         |outer: &[Point], point| contains(outer, point) && distance_to_border(outer, point) > tolerance_m;
     let reaches_in = |outer: &[Point], inner: &[Point]| {
-        // Even if two polygons overlap, all corners may lie outside the other polygon. Points on the sides and in the
-        // middle detect crossed and equal polygons.
+        // Two polygons can overlap although all corners of each polygon lie outside the other. Points on the sides and
+        // in the middle also detect polygons that cross, and polygons that are equal.
         let centre = inner.iter().fold([0.0, 0.0], |sum, point| [sum[0] + point[0], sum[1] + point[1]]);
         let centre = [centre[0] / inner.len() as f64, centre[1] / inner.len() as f64];
         (contains(inner, centre) && deep(outer, centre))

@@ -1,18 +1,18 @@
-//! Computes the likelihood that a person who comes into view is the same person as one who went out of the sensors'
-//! view, from position, walking speed and time, and from the gaps of the site.
+//! Computes the likelihood that a person who comes into the sensors' view is a person who went out of view earlier. The
+//! likelihood depends on position, walking speed and time, and on the gaps of the site.
 
 use super::geometry::{Point, distance_to_segment, length2, middle, minus};
 use super::site::Site;
 
 /// Maximum time of a path that is not in the site file, in seconds.
 pub(crate) const MAX_GAP_S: f64 = 60.0;
-/// Standard deviation of the logarithm of a person's speed divided by their pace.
+/// Standard deviation of the logarithm of the ratio between a person's speed and the person's pace.
 const PACE_SPREAD: f64 = 0.2;
 /// Share of people who walk on without a stop. The first constant is for people who walked when they were last seen,
 /// and the second for people who stood.
 const CONTINUE_SHARE_WALKING: f64 = 0.6;
 const CONTINUE_SHARE_STANDING: f64 = 0.3;
-/// Share of people who stay at their position, and the time that they stay there, in seconds.
+/// Share of people who stay at their position, and the mean time for which they stay, in seconds.
 const STAY_SHARE: f64 = 0.4;
 const STAY_TIME_S: f64 = 4.0;
 /// Share of people who turn back.
@@ -22,7 +22,7 @@ const MIN_WALKING_SPEED_M_S: f64 = 0.5;
 /// Minimum speed of a person who turns back, in m/s.
 const MIN_RETURN_SPEED_M_S: f64 = 0.35;
 /// Standard deviations of a person's position along and across the path, in meters. The deviation across the path grows
-/// every second, up to the width of a path.
+/// by [`ACROSS_SIGMA_M_S`] every second, up to [`MAX_ACROSS_SIGMA_M`], the width of a path.
 const ALONG_SIGMA_M: f64 = 0.25;
 const ACROSS_SIGMA_M: f64 = 0.25;
 const ACROSS_SIGMA_M_S: f64 = 0.3;
@@ -34,7 +34,7 @@ const DEFAULT_PATH_M: f64 = 5.0;
 
 /// A person who is out of sight.
 pub(crate) struct DepartedPerson {
-    /// Door through which the person went.
+    /// Door through which the person entered the room in which they went out of sight; `None` if it is unknown.
     pub(crate) entry: Option<usize>,
     /// Last position in the map, in meters, and speed in m/s.
     pub(crate) at: Point,
@@ -45,7 +45,7 @@ pub(crate) struct DepartedPerson {
 
 /// A person who has come into view.
 pub(crate) struct ArrivedPerson {
-    /// Nearest door.
+    /// Door that is nearest to the position at which the person was first seen.
     pub(crate) exit: usize,
     /// Position at which the person was first seen.
     pub(crate) at: Point,
@@ -67,7 +67,8 @@ impl Site {
         let t = after_s.max(0.0);
         let off = minus(arrived.at, departed.at);
         let far_m = length2(off).sqrt();
-        // Distance that the person would be ahead, length of the rest of the path, and speed forward.
+        // Distance that the departed person would have walked forward since they were last seen, length of the rest of
+        // their path, and the arrived person's speed in this direction.
         let (ahead_m, rest_m, speed) = match departed.entry {
             Some(entry) => {
                 let door = self.doors[entry].between;

@@ -2,8 +2,8 @@
 //! velocity.
 //!
 //! The state of the filter is the middle between the legs, half of the vector from one leg to the other, and the
-//! velocities of both. The half vector oscillates. A leg is at the middle plus or minus the half vector. Both
-//! coordinates have the same covariance.
+//! velocities of the middle and of this half vector. The half vector oscillates. A leg is at the middle plus or minus
+//! the half vector. x and y have the same covariance.
 
 use nalgebra::{Matrix4, Matrix4x2, RowVector2, Vector4};
 use scanhub_schema::TrackState;
@@ -38,7 +38,7 @@ pub(crate) struct Person {
     /// Walking speed in m/s.
     pub(crate) pace: f64,
     pub(crate) room: Option<usize>,
-    /// Door through which the person entered the room, if a sensor saw that.
+    /// Door through which the person entered the room; `None` if no sensor saw the person go through a door.
     pub(crate) entry_door: Option<usize>,
     /// Share of the recent scans of the person that show both legs.
     pub(crate) both: f64,
@@ -49,20 +49,21 @@ pub(crate) struct Person {
 pub(crate) enum TrackPhase {
     Tentative,
     Known,
-    /// The person has been out of sight since a time, after passing through a door.
+    /// The person has been out of sight since `since_ns`, in a room without sensors. `door` is the door through which
+    /// they entered this room, or otherwise the nearest door.
     Away {
         since_ns: u64,
         door: usize,
     },
 }
 
-/// Minimum number of scans that must show a person to confirm it.
+/// Minimum number of scans that must show a person before the person is confirmed.
 const MIN_SCANS: f64 = 8.0;
 pub(crate) const MAX_SUPPORT: f64 = 20.0;
-/// Maximum period of a sensor whose scans count once, in seconds. Scans of a slower sensor count up to twice. If they
-/// did not, a sensor with 7.5 Hz would need a second to confirm a person.
+/// Maximum period of a sensor whose scans count once, in seconds. Scans of a slower sensor count up to twice.
+/// Otherwise, a sensor with 7.5 Hz would need a second to confirm a person.
 const FULL_WEIGHT_PERIOD_S: f64 = 0.0625;
-/// Minimum number of beams on a leg that exclude a chair leg.
+/// Minimum number of beams on a leg at which it cannot be the leg of a chair.
 const MIN_CLEAR_BEAMS: usize = 4;
 /// Weight of a leg with fewer than [`MIN_CLEAR_BEAMS`] beams, compared with a scan that sees through the position.
 pub(crate) const COARSE_WEIGHT: f64 = 0.5;
@@ -121,7 +122,8 @@ impl Person {
         self.support = (self.support + (since_s / FULL_WEIGHT_PERIOD_S).clamp(1.0, 2.0)).min(MAX_SUPPORT);
         let speed = self.speed();
         if speed > 0.5 {
-            // A person who turns or gives way is slower than their pace, so adapt more slowly to a lower speed.
+            // A person who turns or gives way is slower than their pace, so the pace adapts more slowly to a lower
+            // speed.
             self.pace += if speed > self.pace { 0.03 } else { 0.01 } * (speed - self.pace);
         }
     }
@@ -131,7 +133,7 @@ impl Person {
         (x * x + y * y).sqrt()
     }
 
-    /// Returns whether this is certainly a person, which was seen often enough, and with two legs or in motion.
+    /// Returns whether this track is certainly a person: it was seen often enough, and with two legs or in motion.
     pub(crate) fn is_certain(&self) -> bool {
         let walked_m = distance(self.filter.position(), self.first_position);
         self.support >= MIN_SCANS
@@ -175,7 +177,7 @@ const LEG_NOISE: f64 = 5.0;
 /// Maximum length of a prediction step in seconds, and maximum number of steps.
 const MAX_STEP_S: f64 = 0.05;
 const MAX_STEPS: f64 = 40.0;
-/// Standard deviations for a new person: velocity in m/s, and half of the distance between the legs in m.
+/// Standard deviations in the filter of a new person: velocity in m/s, and half of the distance between the legs in m.
 const INITIAL_SPEED_M_S: f64 = 0.9;
 const INITIAL_HALF_DISTANCE_M: f64 = 0.17;
 
@@ -189,7 +191,8 @@ pub(crate) enum Side {
 /// Kalman filter of one person.
 #[derive(Clone, Debug)]
 pub(crate) struct Filter {
-    /// Rows: middle, velocity of the middle, half vector between the legs, and its velocity. Columns: x and y.
+    /// Rows: middle, velocity of the middle, half vector between the legs, and velocity of this vector. Columns: x and
+    /// y.
     state: Matrix4x2<f64>,
     covariance: Matrix4<f64>,
 }
@@ -219,8 +222,8 @@ impl Filter {
         Filter { state, covariance }
     }
 
-    /// Predicts the state after `dt` seconds, in time steps that are short compared with a double step of a person.
-    /// With `fades`, for a person who is not seen, the velocity decays.
+    /// Predicts the state after `dt` seconds, in time steps that are short compared with a double step of a person. If
+    /// `fades` is true, the velocity decays, because no sensor sees the person.
     pub(crate) fn predict(&mut self, dt: f64, fades: bool) {
         let steps = (dt / MAX_STEP_S).ceil().clamp(1.0, MAX_STEPS);
         (0..steps as usize).for_each(|_| self.step(dt / steps, fades));

@@ -6,9 +6,9 @@ use super::MisplacedSensor;
 use super::geometry::Point;
 use super::sensor_view::Leg;
 
-/// Side of a cell of the votes, in meters.
+/// Side of a cell in the grid of votes, in meters.
 const CELL_M: f64 = 0.1;
-/// Number of cells on each side of the cell of a zero offset.
+/// Number of cells of the grid on each side of its middle cell, which has the votes for a zero offset.
 const REACH_CELLS: usize = 10;
 const GRID_WIDTH: usize = 2 * REACH_CELLS + 1;
 /// Number of votes that are collected before they are evaluated and cleared.
@@ -41,8 +41,8 @@ impl PoseVotes {
         PoseVotes { sensors, pairs: (0..sensors * sensors).map(|_| None).collect() }
     }
 
-    /// Adds the votes of the legs that two sensors see at the same time. Once the votes agree, clears them and returns
-    /// the offset of the sensor that comes later in the site.
+    /// Adds the votes of the legs that two sensors see at the same time. Once there are enough votes, clears them. If
+    /// they agree, returns the offset of the sensor that comes later in the site.
     pub(crate) fn take(&mut self, one: (usize, &[Leg]), two: (usize, &[Leg])) -> Option<MisplacedSensor> {
         let ((other, other_legs), (sensor, own)) = if one.0 < two.0 { (one, two) } else { (two, one) };
         for leg in own.iter().filter(|leg| has_vote(leg)) {

@@ -16,8 +16,8 @@ pub(crate) const LEG_M: f64 = 0.06;
 const MAX_LEG_WIDTH_M: f64 = 0.26;
 /// Minimum width of a leg with its trousers, in meters. The legs of chairs and tables are thinner.
 const MIN_LEG_WIDTH_M: f64 = 0.09;
-/// Diameter of a beam's light spot at the scanner in meters, and its growth with the range. The values are those of an
-/// LMS 2xx, which has the widest spot of all supported scanners.
+/// Diameter of a beam's light spot at the scanner in meters, and growth of this diameter per meter of range. The values
+/// are those of an LMS 2xx, which has the widest spot of all supported scanners.
 const SPOT_M: f64 = 0.01;
 const SPOT_RAD: f64 = 0.0045;
 /// Minimum width of a surface, such as the leaf of a door, in meters. A narrower straight object may be legs.
@@ -33,7 +33,7 @@ const CLOSED_POINTS: usize = 9;
 const MAX_CLOSED_OFFSET_M: f64 = 0.25;
 /// Maximum width of a person in meters.
 const MAX_PERSON_WIDTH_M: f64 = 1.3;
-/// Minimum distance between an object and the farthest range of its beam, in meters.
+/// Minimum distance by which an object must be nearer than the farthest range of its beam, in meters.
 const MIN_FOREGROUND_DISTANCE_M: f64 = 0.15;
 /// Number of scans in a row in which a beam must exceed its farthest range before this range is increased.
 const MIN_FARTHER_SCANS: u8 = 5;
@@ -47,8 +47,8 @@ pub(crate) struct Leg {
     pub(crate) at: Point,
     /// Standard deviation of each coordinate in meters.
     pub(crate) sigma_m: f64,
-    /// Whether the leg is in front of the background and has more than one beam. An object that has become background
-    /// is not fresh.
+    /// Whether the leg is in front of the background and has enough beams. A single beam is enough only where
+    /// neighboring beams are at least [`LEG_M`] apart. An object that has become background is not fresh.
     pub(crate) is_fresh: bool,
     /// Whether the leg is evidence for a person. False for an object that is as thin as a chair leg, and for a range
     /// between two surfaces, which belongs to no object. Legs that are not solid only support a track that other legs
@@ -56,11 +56,12 @@ pub(crate) struct Leg {
     pub(crate) is_solid: bool,
     /// Number of beams that the leg reflects.
     pub(crate) beams: usize,
-    /// Whether the leg is in an ignored area. Such a leg is not fresh.
+    /// Whether the leg is in an ignored area. A leg in an ignored area is not fresh.
     pub(crate) is_ignored: bool,
-    /// Whether the beams on both sides of the leg reach much farther. The points of a door's leaf are adjacent.
+    /// Whether the beams on both sides of the leg reach much farther. This excludes parts of a door's leaf, because the
+    /// points of a leaf are adjacent.
     pub(crate) is_free: bool,
-    /// Position relative to the leaves of doors.
+    /// Position of the leg relative to the leaves of doors.
     pub(crate) at_door: DoorProximity,
 }
 
@@ -160,7 +161,7 @@ impl SensorView {
         self.find_legs();
     }
 
-    /// Corrects the sensor's position. Everything that the sensor sees is displaced by `off`.
+    /// Corrects the sensor's position by `off`, by which everything that the sensor sees is displaced in the map.
     pub(crate) fn shift(&mut self, off: Point) {
         self.sensor.position = minus(self.sensor.position, off);
     }
@@ -340,7 +341,8 @@ impl SensorView {
         let mean = [sum[0] / n, sum[1] / n];
         let offset = minus(mean, self.sensor.position);
         let range = (offset[0] * offset[0] + offset[1] * offset[1]).sqrt().max(0.05);
-        // Mean depth of the near half of a circle whose points are at equal angles.
+        // Distance from the mean of the points to the center of the leg, as a share of the range. The points are on the
+        // near half of a circle, and their beams are at equal angles.
         let deeper = LEG_M * FRAC_PI_4 / range;
         let spacing = range * self.step.abs();
         let cut_off = |beam: Option<usize>| {
@@ -369,7 +371,7 @@ impl SensorView {
     }
 }
 
-/// Returns whether an object is thinner than a leg. It has this number of `beams`, which are `spacing_m` apart.
+/// Returns whether an object is thinner than a leg. The object reflects `beams` beams, which are `spacing_m` apart.
 fn is_thin(beams: usize, spacing_m: f64) -> bool {
     (beams + 1) as f64 * spacing_m < MIN_LEG_WIDTH_M
 }
@@ -388,7 +390,8 @@ fn is_flat(points: &[(usize, Point)]) -> bool {
     across < FLATNESS_M * FLATNESS_M
 }
 
-/// Updates the farthest range of a beam. A longer range in only one scan counts as noise.
+/// Updates the farthest range of a beam. A longer range counts as noise until [`MIN_FARTHER_SCANS`] scans in a row have
+/// measured one.
 fn update_farthest(range: f64, farthest: &mut f64, (scans, least): &mut (u8, f64)) {
     if range > *farthest {
         (*scans, *least) = (*scans + 1, least.min(range));

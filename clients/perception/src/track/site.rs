@@ -21,7 +21,7 @@ pub(crate) const MAX_ROOMS: usize = 64;
 /// Maximum number of ignored areas.
 pub(crate) const MAX_IGNORED: usize = 64;
 
-/// A checked plan.
+/// A checked description of a site.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Site {
     /// Sensors in the order of the file.
@@ -87,8 +87,8 @@ impl Site {
         self.ignored.iter().any(|area| contains(&area.polygon, point))
     }
 
-    /// Returns the distance between `point` and a door, in meters. If an ignored area covers the middle of the door,
-    /// for example of a revolving door, returns the distance between `point` and this area.
+    /// Returns the distance between `point` and a door, in meters. If an ignored area covers the middle of the door, as
+    /// for a revolving door, returns the distance between `point` and this area if that is shorter.
     pub(crate) fn distance_to_door(&self, point: Point, door: usize) -> f64 {
         let between = self.doors[door].between;
         let area =
@@ -129,7 +129,7 @@ impl Site {
         self.rooms.iter().position(|room| contains(&room.polygon, point))
     }
 
-    /// Returns the door that is nearest to `point`. Only doors for which `is_candidate` returns true count.
+    /// Returns the door that is nearest to `point`. Considers only doors for which `is_candidate` returns true.
     pub(crate) fn nearest_door(&self, point: Point, is_candidate: impl Fn(&usize) -> bool) -> Option<usize> {
         let off = |&door: &usize| distance_to_segment(point, self.doors[door].between);
         (0..self.doors.len()).filter(is_candidate).min_by(|a, b| off(a).total_cmp(&off(b)))
@@ -172,7 +172,7 @@ impl Sensor {
     }
 }
 
-/// Maximum length of the name of a room or door, in bytes. An event has room for this length.
+/// Maximum length of the name of a room or door, in bytes. The payload of an event has space for names of this length.
 pub(crate) const MAX_NAME_LEN: usize = 24;
 /// Name for the outside, to which a door may lead.
 pub(crate) const OUTSIDE_NAME: &str = "outside";
@@ -305,20 +305,21 @@ impl SourceText<'_> {
     }
 }
 
-/// Returns a question to the user that suggests a name: the one in `known` that is most similar to `word`.
+/// Returns a question to the user that suggests the name in `known` that is most similar to `word`. Returns an empty
+/// text if `known` has no names.
 fn nearest(word: &str, known: &[&str]) -> String {
     let near = |a: &str| strsim::jaro_winkler(a, word);
     let best = known.iter().max_by(|a, b| near(a).total_cmp(&near(b)));
     best.map_or(String::new(), |best| format!("did you mean `{best}`? "))
 }
 
-/// Maximum overlap of rooms in meters. It is allowed because rooms are measured by hand.
+/// Maximum overlap of two rooms in meters. A small overlap is allowed because rooms are measured by hand.
 const MAX_OVERLAP_M: f64 = 0.05;
-/// Maximum distance between the middle of a door and the walls of its rooms, in meters. It allows for the thickness of
-/// walls.
+/// Maximum distance between the middle of a door and the walls of its rooms, in meters. This distance allows for the
+/// thickness of walls.
 const MAX_DOOR_OFFSET_M: f64 = 0.5;
-/// Minimum area of a room, and minimum area of an ignored area, in square meters. Each has the number of decimals in
-/// errors. An ignored area may be small, because a curtain is thin.
+/// Minimum area of a room, and minimum area of an ignored area, in square meters. The second value of each constant is
+/// the number of decimals that an error message shows. An ignored area may be small, because a curtain is thin.
 const MIN_ROOM_M2: (f64, usize) = (0.25, 2);
 const MIN_IGNORED_M2: (f64, usize) = (0.02, 3);
 /// Maximum coordinate in meters. A larger number is probably in millimeters.

@@ -17,8 +17,8 @@ pub(crate) const MAX_PEOPLE: usize = 64;
 /// Interval between snapshots in ns.
 pub const SNAPSHOT_INTERVAL_NS: u64 = 40_000_000;
 
-/// Gain of a leg that is exactly at its expected position. It is also the maximum of a leg's squared distance from that
-/// position, divided by the variance.
+/// Gain of a leg that is exactly at its expected position. It is also the maximum ratio between a leg's squared
+/// distance from that position and the variance.
 const GATE: f64 = 11.0;
 /// Value of [`GATE`] for a tentative person, who has a lower priority.
 const GATE_TENTATIVE: f64 = 9.0;
@@ -36,15 +36,15 @@ const DELETE_TENTATIVE_AFTER_S: f64 = 0.25;
 const MAX_TENTATIVE_SILENCE_NS: u64 = 400_000_000;
 /// Time after which a hidden person is deleted, in ns.
 const MAX_HIDDEN_NS: u64 = 120_000_000_000;
-/// Maximum period of a sensor in seconds. A longer one counts as a gap.
+/// Maximum time between two scans of a sensor that counts in full, in seconds. A longer time is a gap, and counts only
+/// as this time.
 const MAX_PERIOD_S: f64 = 0.2;
 /// Maximum time between two scans that count as simultaneous, in ns.
 const SAME_TIME_NS: u64 = 45_000_000;
 /// Minimum distance between two people, in meters. Two people who are closer are merged, unless two pairs of legs were
 /// seen.
 const MERGE_DISTANCE_M: f64 = 0.45;
-/// Maximum time after a confirmed person enters an ignored area in which legs in this area are associated with the
-/// person, in ns.
+/// Time in ns for which legs in an ignored area are associated with a confirmed person who has entered this area.
 const IGNORED_GRACE_NS: u64 = 5_000_000_000;
 
 /// Maximum time since a confirmed person was last detected, in ns. After this time, a leg that may be a part of a
@@ -53,27 +53,27 @@ const LEAF_SILENCE_NS: u64 = 300_000_000;
 /// Maximum distance between a door and a person who was away, came through this door, and is first seen again in a room
 /// without sensors, in meters.
 const MAX_BEFORE_DOOR_M: f64 = 3.5;
-/// Maximum distance as [`MAX_BEFORE_DOOR_M`], for a person who is first seen again in a room with sensors. Sensors in
-/// the room see people as soon as they have come through the door.
+/// Maximum distance that replaces [`MAX_BEFORE_DOOR_M`] for a person who is first seen again in a room with sensors.
+/// Sensors in the room see people as soon as they have come through the door.
 const MAX_INSIDE_DOOR_M: f64 = 1.2;
 /// Minimum distance between a person and a door behind the person, in meters. At this distance, the person has gone
 /// through the door.
 const MIN_BEHIND_DOOR_M: f64 = 0.12;
 /// Minimum distance between a confirmed person and another person who rarely shows two legs, in meters. If the other
-/// person is closer, it counts as a part of the confirmed person.
+/// person is closer, the other person counts as a part of the confirmed person.
 const PART_DISTANCE_M: f64 = 0.5;
 /// Maximum distance between a door that leads out of the sensors' view and the first position of a new person who has
 /// come through it, in meters.
 const MAX_AT_DOOR_M: f64 = 0.7;
-/// Maximum distance as [`MAX_AT_DOOR_M`], for a door with leaves and a person who walks away from it. The next constant
-/// is the minimum speed of this person, in m/s.
+/// Maximum distance that replaces [`MAX_AT_DOOR_M`] for a door with leaves and a person who walks away from this door.
+/// The next constant is the minimum speed of this person, in m/s.
 const MAX_BEFORE_LEAVES_M: f64 = 1.6;
 const MIN_LEAVING_SPEED_M_S: f64 = 0.2;
-/// Minimum distance between a new person and a confirmed one, in meters. If it is smaller, the new person may be a leg
-/// of the confirmed one.
+/// Minimum distance between a new person and a confirmed person, in meters. If the distance is smaller, the new person
+/// may be a leg of the confirmed person.
 const MIN_ALONE_M: f64 = 0.9;
-/// Maximum squared distance, divided by the variance, between a hidden person and a new person who may be the same. It
-/// covers 98.9 % of the normal distribution in the plane.
+/// Maximum squared distance, divided by the variance, between a hidden person and a new person who may be the hidden
+/// one. This limit covers 98.9 % of the normal distribution in the plane.
 const HIDDEN_GATE: f64 = 9.0;
 /// Maximum time for which a person in a room without sensors may be out of sight, in ns. After this time, the person is
 /// away.
@@ -160,7 +160,7 @@ impl Tracker {
         }
     }
 
-    /// Predicts the states of all people at `at_ns`. If a person is not seen, a wall stops the person.
+    /// Predicts the states of all people at `at_ns`. The prediction for a person who is not seen stops at walls.
     fn predict(&mut self, at_ns: u64) {
         for person in self.people.iter_mut().filter(|person| !matches!(person.phase, TrackPhase::Away { .. }))
         {
@@ -544,8 +544,8 @@ impl Tracker {
 
     /// Returns whether a new person has come through a door that leads out of the sensors' view. The person must be
     /// first seen near the door. Near a door with leaves, people are not confirmed, so the person may be first seen
-    /// farther away. In this case, the person has come through the door if they walk away from it and are not a leg of
-    /// a confirmed person.
+    /// farther away from it. In this case, the person has come through the door if they walk away from the door and are
+    /// not a leg of a confirmed person.
     fn has_passed_door(&self, number: usize, door: usize) -> bool {
         let person = &self.people[number];
         let off_m = self.site.distance_to_door(person.first_position, door);
@@ -561,14 +561,15 @@ impl Tracker {
         off_m < MAX_BEFORE_LEAVES_M && walks_away && is_alone
     }
 
-    /// Confirms a new person, or finds the person who was away or hidden and is this person.
+    /// Confirms a new person. If the new person is one who was away or hidden, continues the track of that person
+    /// instead.
     fn confirm(&mut self, number: usize, at_ns: u64) {
         let new = &self.people[number];
         let (first_position, first_seen_ns) = (new.first_position, new.first_seen_ns);
         let off = |door: usize| distance_to_segment(first_position, self.site.doors[door].between);
         let is_inside = self.site.room_at(first_position).is_some_and(|room| self.watched[room]);
         let before_door_m = if is_inside { MAX_INSIDE_DOOR_M } else { MAX_BEFORE_DOOR_M };
-        // Candidates are all people who are away. Each candidate has the door through which they would have come.
+        // Candidates are all people who are away, each with the door through which the person would have come.
         let arrival = |(old, person): (usize, &Person)| {
             let TrackPhase::Away { door: entry, .. } = person.phase else { return None };
             let exit = self.site.nearest_door(first_position, |door| {

@@ -29,7 +29,7 @@ pub(super) struct Results<'a, A: Payload + ?Sized, B: Payload + ?Sized> {
     pub(super) is_json: bool,
     /// Fields that all headers share.
     pub(super) header: Header,
-    /// `None` until [`publish`](Self::publish) has created them.
+    /// Published topics; `None` until [`publish`](Self::publish) has created the topics.
     pub(super) topics: Option<Topics<A, B>>,
     /// Number of samples of the subscribed topics that were published, but that this run did not receive.
     pub(super) missed: u64,
@@ -62,7 +62,8 @@ impl<'a, A: Payload + ?Sized, B: Payload + ?Sized> Results<'a, A, B> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NoHub`](scanhub_schema::Kind) if none runs, and the errors of [`PublishSession::open_named`].
+    /// Returns [`Kind::NoHub`](scanhub_schema::Kind) if neither a hub nor a listener runs, and the errors of
+    /// [`PublishSession::open_named`].
     pub(super) fn publish(&mut self, limits: TopicLimits, locations: &[Domain]) -> Result<(), Failure> {
         let sensor = PublishSession::open_named(
             &find(locations)?,

@@ -43,7 +43,7 @@ pub struct TiltArgs {
     /// Origin of the beams while the mount is level [default: the point of --axis-at]
     #[arg(long, value_name = "X,Y,Z", value_parser = numbers::<3>, allow_hyphen_values = true)]
     sensor_at: Option<[f64; 3]>,
-    /// Angle of the mount at which the scanner measures level
+    /// Angle of the mount at which the scanner is level
     #[arg(long, default_value_t = 0.0, value_name = "RADIANS", value_parser = number, allow_hyphen_values = true)]
     level: f64,
     /// Direction of the scanner while the mount is level, counterclockwise from ahead
@@ -107,8 +107,8 @@ fn cuboid(text: &str) -> Result<[[f64; 2]; 3], String> {
 
 impl TiltArgs {
     /// Subscribes to the scans of the sensor and the angles of its mount, and writes the obstacles of each sweep to
-    /// stdout. Without `--json`, reports about the angles and notices go to stderr. Ends at the limits, by a signal, or
-    /// when the reader closes stdout.
+    /// stdout. Without `--json`, reports about the angles and notices go to stderr. Ends at a limit of the arguments,
+    /// by a signal, or when the reader closes stdout.
     ///
     /// # Errors
     ///
@@ -117,7 +117,7 @@ impl TiltArgs {
     /// - [`Kind::Timeout`] if neither a scan nor an angle arrives in time.
     /// - [`Kind::Interrupted`] if a signal stops a bounded run or a check before its end.
     /// - [`Kind::Check`] if a check has failed.
-    /// - The errors of [`PublishSession::open_named`](scanhub_client::PublishSession::open_named) if it publishes.
+    /// - The errors of [`PublishSession::open_named`](scanhub_client::PublishSession::open_named) if the run publishes.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let names = [(&self.sensor, Topic::Scan), (&self.angles, Topic::Tilt)]
@@ -163,7 +163,8 @@ impl TiltArgs {
 
 /// Name in the lines of a run that does not publish.
 const DEFAULT_NAME: &str = "tilted";
-/// Minimum duration of a problem with the angles that is reported, in ns. A shorter problem is only counted.
+/// Minimum duration of a problem with the angles that is reported, in ns. A shorter problem appears only in the
+/// counters.
 const MIN_PROBLEM_NS: u64 = 300_000_000;
 
 struct TiltRun<'a> {
@@ -174,7 +175,7 @@ struct TiltRun<'a> {
     /// Delay of the angles' stamps in the last report, in ns.
     late_ns: i64,
     check: Option<MountCheck>,
-    /// Number of beams of the first scan; `None` until it has arrived.
+    /// Number of beams of the first scan; `None` until this scan has arrived.
     beams: Option<usize>,
     writer: SweepWriter<'a>,
 }
@@ -200,7 +201,8 @@ impl TiltRun<'_> {
         Ok(())
     }
 
-    /// Creates the topics once the number of beams is known. This number determines the maximum length of samples.
+    /// Creates the topics if the run publishes and the number of beams is known. This number determines the maximum
+    /// length of samples.
     fn publish(&mut self) -> Result<(), ExitReason> {
         let results = &mut self.writer.results;
         if let (Some(_), Some(beams), None) = (&self.args.name, self.beams, &results.topics) {
@@ -257,7 +259,7 @@ impl TiltRun<'_> {
     }
 }
 
-/// Filter for problems with the angles that drops short ones.
+/// Filter that drops short problems with the angles.
 #[derive(Default)]
 struct ProblemFilter {
     reported: Option<DropReason>,
@@ -266,8 +268,8 @@ struct ProblemFilter {
 }
 
 impl ProblemFilter {
-    /// Updates the filter with the problem `now` of a scan with the stamp `stamp_ns`. Returns a problem, or the end of
-    /// a problem, if it must be reported now.
+    /// Updates the filter with the problem `now` of a scan with the stamp `stamp_ns`. Returns `None` if nothing must be
+    /// reported now. `Some(Some(..))` reports a problem, and `Some(None)` the end of a problem.
     fn changed(&mut self, stamp_ns: u64, now: Option<DropReason>) -> Option<Option<DropReason>> {
         if now != self.now || self.since_ns == 0 {
             (self.now, self.since_ns) = (now, stamp_ns);
@@ -457,7 +459,7 @@ impl TiltJson<'_> {
     }
 }
 
-/// Returns a time in ms with one decimal.
+/// Converts ns to ms, rounded to one decimal.
 fn late_ms(late_ns: i64) -> f64 {
     (late_ns as f64 / 1e5).round() / 10.0
 }
@@ -471,7 +473,7 @@ fn lateness(late_ns: i64) -> String {
     format!("{:.1} ms {}", late_ms(late_ns).abs(), if late_ns < 0 { "early" } else { "late" })
 }
 
-/// Number of complete sweeps in a check.
+/// Number of complete sweeps that a check needs.
 const CHECKED_SWEEPS: u32 = 6;
 /// Maximum error of the floor's height, in meters.
 const MAX_HEIGHT_ERROR_M: f64 = 0.02;

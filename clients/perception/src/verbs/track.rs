@@ -52,8 +52,8 @@ Examples:
 
 impl TrackArgs {
     /// Subscribes to the scans and foregrounds of the site's sensors, and writes tracks and events to stdout, or only
-    /// the counts of some doors. Without `--json`, notices go to stderr. Ends at the limits, by a signal, or when the
-    /// reader closes stdout.
+    /// the counts of some doors. Without `--json`, notices go to stderr. Ends at a limit of the arguments, by a signal,
+    /// or when the reader closes stdout.
     ///
     /// # Errors
     ///
@@ -63,7 +63,7 @@ impl TrackArgs {
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
     /// - [`Kind::Timeout`] if no scan arrives in time.
     /// - [`Kind::Interrupted`] if a signal stops a bounded run before its end.
-    /// - The errors of [`PublishSession::open_named`](scanhub_client::PublishSession::open_named) if it publishes.
+    /// - The errors of [`PublishSession::open_named`](scanhub_client::PublishSession::open_named) if the run publishes.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (locations, stop) = (context.domain.locations()?, context.signals.stop()?);
         let site = Site::read(&self.site)?;
@@ -157,7 +157,7 @@ impl TrackRun<'_> {
         Ok(())
     }
 
-    /// Reports late scans, and creates the topics once a domain exists.
+    /// Reports late scans, and creates the topics if the run publishes and has subscribed to a topic.
     fn tick(&mut self, now: Instant) -> Result<(), ExitReason> {
         for (sensor, count) in self.late.due(now, self.tracker.late()) {
             self.writer.report_late(sensor, count, self.args.delay)?;
@@ -412,7 +412,7 @@ fn milliseconds<S: Serializer>(value: &Duration, serializer: S) -> Result<S::Ok,
 /// Minimum time between two reports of late scans. The first report is sent at once.
 const LATE_REPORT_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Decides when late scans are reported again, so that reports are rare.
+/// Limits how often late scans are reported.
 struct LateReports {
     /// Number of reported late scans of each sensor.
     reported: Vec<u64>,
@@ -425,8 +425,8 @@ impl LateReports {
         LateReports { reported: vec![0; sensors], next: None }
     }
 
-    /// If a report is due, returns each sensor with late scans: its index, and the number of its late scans since the
-    /// last report. `late` has the numbers since the start.
+    /// If a report is due, returns the index of each sensor with late scans, and the number of its late scans since the
+    /// last report. `late` has the number of late scans of every sensor since the start.
     fn due(&mut self, now: Instant, late: &[u64]) -> Vec<(usize, u64)> {
         if late == self.reported || self.next.is_some_and(|next| now < next) {
             return Vec::new();
@@ -435,7 +435,7 @@ impl LateReports {
         self.unreported(late)
     }
 
-    /// Returns the late scans since the last report, even if no report is due. Used at the end of a run.
+    /// Returns the same values as [`due`](Self::due), even if no report is due. Used at the end of a run.
     fn unreported(&mut self, late: &[u64]) -> Vec<(usize, u64)> {
         let since = late.iter().zip(&self.reported).map(|(late, reported)| late - reported).enumerate();
         let since = since.filter(|&(_, count)| count > 0).collect();

@@ -91,7 +91,7 @@ fn point_positions_match_the_reference() {
             }
             tilting.take_scan(*stamp, scan, &mut check);
         }
-        // The last sweep is not complete.
+        // The last sweep has no end, so its points are missing.
         assert!(made > 4 * 13_000 && made <= expected.len(), "seed {seed}: {made} of {}", expected.len());
         assert_eq!((tilting.counts().points_dropped, tilting.problem()), ([0; 4], None), "seed {seed}");
     }

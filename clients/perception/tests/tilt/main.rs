@@ -43,9 +43,9 @@ fn obstacles_are_found_and_become_background() {
     assert!(score.recall() > 0.95 && score.precision() > 0.97, "{score:?}");
 }
 
-/// Runs a fault from 7 to 10 s in a room without new objects. Returns the number of dropped beams for each reason, and
-/// the number of unreliable sweeps. Asserts that there are no false obstacles, that no returned point is wrong, and
-/// that the run recovers.
+/// Simulates the fault `kind` from second 7 to second 10, in a room without new objects. Returns the number of dropped
+/// beams for each reason, and the number of unreliable sweeps. Asserts that there are no false obstacles, that no point
+/// of a reliable sweep is wrong, and that sweeps are complete and reliable again after the fault.
 fn run_with_fault(kind: FaultKind) -> ([u64; DropReason::COUNT], u64) {
     let room = "[[thing]]\nline = [[-2500, -1000], [2500, -1000], [2500, 4000], [-2500, 4000], [-2500, -1000]]\n\
                 [[thing]]\nbox = [600, 400]\nheight_mm = 350\npose = [-900, 2200, 35]\n";
@@ -110,7 +110,7 @@ fn drifting_encoder_makes_sweeps_unreliable() {
 #[test]
 fn late_angles_are_awaited_for_a_limited_time() {
     let ([silent, others @ ..], unreliable) = run_with_fault(FaultKind::Delay(0.2));
-    // When the delay ends, the last late angles arrive after angles that are in time.
+    // When the delay ends, the last late angles arrive after angles that are in time, so they are dropped.
     assert!(silent < 4_000 && others == [0; 3] && unreliable == 0, "{silent} {others:?} {unreliable}");
     let ([silent, ..], _) = run_with_fault(FaultKind::Delay(1.0));
     assert!(silent > 20_000, "{silent}");

@@ -5,14 +5,15 @@ use crate::hall::{DOOR_KINDS, DoorKind, HALL_SITE, SCANNERS, Scene, Walker, even
 use scanhub_perception::track::geometry::Point;
 use scanhub_perception::track::{Event, Kind};
 
-/// Positions of the scanner: in the middle of the wall, at the side of the wall, and nearer to the door.
+/// Positions of the scanner: in the middle of the wall opposite the door, at the side of this wall, and nearer to the
+/// door.
 const DOOR_POSITIONS: [Point; 3] = [[0.0, 0.0], [0.0, -2.5], [2.5, -2.5]];
 
 fn describe(events: &[(f64, Event)]) -> String {
     events.iter().map(|(at_s, event)| format!("{at_s:.2} {} {:?}\n", event.id, event.kind)).collect()
 }
 
-/// Returns the passages in `events`, each with its time and whether it led into the hall.
+/// Returns the passages in `events`, each with its time in seconds, and whether the person went into the hall.
 fn reported_passages(events: &[(f64, Event)]) -> Vec<(f64, bool)> {
     let door = |(at_s, event): &(f64, Event)| match event.kind {
         Kind::Door { to, .. } => Some((*at_s, to == Some(0))),
@@ -21,9 +22,9 @@ fn reported_passages(events: &[(f64, Event)]) -> Vec<(f64, bool)> {
     events.iter().filter_map(door).collect()
 }
 
-/// Returns the number of passages of `walkers` without a report, plus the number of reports without a passage. A person
-/// who stands in the opening is counted when they leave it. The report may therefore be earlier or later than the
-/// passage, by at most `stand_s`.
+/// Returns the number of passages of `walkers` without a report, and the number of reports without a passage. A person
+/// who stands in the opening is counted when they leave it. The report may therefore be up to `stand_s` + 1 s earlier
+/// than the passage, or up to `stand_s` + 2.5 s later.
 fn count_errors(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (usize, usize) {
     let mut reports = reported_passages(events);
     let mut missed = 0;
@@ -40,7 +41,8 @@ fn count_errors(walkers: &[Walker], events: &[(f64, Event)], stand_s: f64) -> (u
     (missed, reports.len())
 }
 
-/// Simulated time of each scanner in each position, in minutes. The sum over all scanners and positions is an hour.
+/// Simulated time for each scanner in each position, in minutes. The sum over all four scanners and three positions is
+/// an hour.
 const EMPTY_MINUTES: u64 = 5;
 
 fn check_no_events(leaves: DoorKind) {
@@ -93,13 +95,14 @@ fn leaves_swinging_into_the_lobby_cause_no_events() {
 
 /// Number of seeds for each scanner.
 const SEED_COUNT: u64 = 20;
-/// Maximum share of wrongly counted passages at one degree and ten scans per second. With these settings, a leg at the
-/// door is a single beam.
+/// Maximum share of wrongly counted passages for the scanner with one degree between beams and ten scans per second.
+/// For this scanner, a leg at the door is a single beam. The other scanners must count every passage correctly.
 const MAX_ERROR_SHARE: f64 = 0.05;
 
-/// Runs the walkers of each seed with all leaves and scanners. The first value of `opens` is the distance at which the
-/// door opens for people, in meters. The second value is the time for which the door stays open, in seconds. People
-/// stand in the opening for up to `stand_s` seconds.
+/// Checks the counted passages for each scanner and seed. `of_seed` returns the walkers of a seed; the seed also
+/// selects the kind of leaves. The first value of `opens` is the distance at which the door opens for people, in
+/// meters. The second value is the time for which the door stays open, in seconds. People stand in the opening for up
+/// to `stand_s` seconds.
 fn check_counts(
     of_seed: impl Fn(&mut fastrand::Rng) -> Vec<Walker>,
     seconds: u64,

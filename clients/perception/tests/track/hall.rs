@@ -1,5 +1,5 @@
 //! A simulated hall with a scanner at one end and a door at the other: leaves that slide or swing, people who walk and
-//! stand, and mixed ranges where a beam meets two surfaces. It uses virtual time and seeds.
+//! stand, and mixed ranges where a beam meets two surfaces. The simulation uses virtual time and seeds.
 #![allow(dead_code)] // Each test file uses only a part of it.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
@@ -10,7 +10,8 @@ use scanhub_preprocess::background::{BackgroundModel, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Foreground, Pose, Scan, ScanHead};
 
-/// A hall of 8 m by 6 m, and a lobby of 8 m by 4 m behind it. The opening in the wall between them is 1.8 m wide.
+/// Site file with a hall of 8 m by 6 m, and a lobby of 8 m by 4 m behind the hall. The opening in the wall between hall
+/// and lobby is 1.8 m wide.
 pub(crate) const HALL_SITE: &str = r#"
 [[sensor]]
 name = "front"
@@ -36,12 +37,12 @@ const HALL_WALLS: [[Point; 2]; 7] = [
     [[6.0, 4.0], [10.0, 4.0]],
     [[10.0, -4.0], [10.0, 4.0]],
 ];
-/// Width of a leaf, which is half of the opening. A sliding leaf moves by the same distance.
+/// Width of a leaf, which is half of the opening, and distance by which a sliding leaf moves.
 const LEAF_WIDTH_M: f64 = 0.9;
 const SLIDE_DISTANCE_M: f64 = 0.85;
 /// Time in which a leaf opens or closes.
 const MOVE_TIME_S: f64 = 1.5;
-/// Interval at which a door opens that moves by itself.
+/// Interval at which a door that moves by itself opens.
 const MOVE_INTERVAL_S: f64 = 20.0;
 /// Angle that a beam covers; standard deviation of a range; and share of beams on an edge that have a mixed range.
 const BEAM_RAD: f64 = 0.5 * PI / 180.0;
@@ -76,7 +77,7 @@ pub(crate) const SCANNERS: [Scanner; 4] = [
 ];
 
 impl DoorKind {
-    /// Returns the leaves of a door that is open by `share`, from 0 to 1.
+    /// Returns the two leaves of a door. `share` is 0 if the door is closed, and 1 if it is completely open.
     fn at(self, share: f64) -> [[Point; 2]; 2] {
         let (sin, cos) = (share * FRAC_PI_2).sin_cos();
         [1.0, -1.0].map(|side| match self {
@@ -142,8 +143,8 @@ impl Walker {
         }))
     }
 
-    /// Returns the times at which the person goes through the door. The flag of each is true if the person goes into
-    /// the hall.
+    /// Returns the times at which the person goes through the door, each with a flag that is true if the person goes
+    /// into the hall.
     pub(crate) fn passages(&self) -> Vec<(f64, bool)> {
         let mut passages = Vec::new();
         let mut before: Option<Point> = None;

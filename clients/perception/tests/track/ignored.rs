@@ -1,4 +1,5 @@
-//! Tests of ignored areas: no person is detected in them, and a person who walks through one keeps their ID.
+//! Tests of ignored areas: no person is detected in an ignored area, and a person who walks through an ignored area
+//! keeps their ID.
 
 use crate::hall::{DoorKind, HALL_SITE, SCANNERS, Scene, Walker, run};
 use scanhub_perception::track::Kind;
@@ -16,13 +17,13 @@ fn fountain_walker() -> Walker {
     Walker { from_s: 25.0, path, speed: 0.8, phase: 0.0 }
 }
 
-/// Returns a person who walks across the hall through the fountain, and stands in it for `stands_s` seconds.
+/// Returns a person who walks across the hall through the fountain, and stands in the fountain for `stands_s` seconds.
 fn visitor(stands_s: f64) -> Walker {
     let path = vec![([3.0, 3.5], 0.0), ([3.0, 0.0], stands_s), ([3.0, -3.5], 5.0), ([3.2, -3.5], 0.0)];
     Walker { from_s: 26.0, path, speed: 1.1, phase: 0.3 }
 }
 
-/// Returns the IDs that appear in a hall with these people, and the IDs that leave.
+/// Runs the hall of `site` with `walkers`. Returns the IDs that appear, and the IDs that leave.
 fn appeared_and_left(site: &str, walkers: &[Walker]) -> (Vec<u64>, Vec<u64>) {
     let scene = Scene {
         site,

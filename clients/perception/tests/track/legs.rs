@@ -1,6 +1,7 @@
 //! Test with recordings of real people, whose legs were labeled by hand: tracks must cover the labels. The recordings
-//! are not a part of the project. Without them, the test is skipped with a message. One scanner in one place made all
-//! recordings. The background is therefore learned from the recordings that are not scored, as if a hub had run before.
+//! are not a part of the project. Without them, the test is skipped with a message. All recordings come from one
+//! scanner that did not move. The background for each recording is therefore learned from the other recordings, as if a
+//! hub had run before.
 
 #[path = "../../../../tests/testkit/skip.rs"]
 mod skip;
@@ -22,8 +23,8 @@ const BEAM_COUNT: usize = 768;
 const SCANS_PER_WALK: u32 = 75;
 /// Maximum distance between a label and a track that covers it, in meters.
 const SEGMENT_MATCH_M: f64 = 0.35;
-/// Minimum share of the labels that are covered: with a background at the start, and without one. The values were
-/// measured and rounded down.
+/// Minimum share of the labels that must be covered: if the hub starts with a background, and if it starts without a
+/// background. The values were measured and rounded down.
 const MIN_SHARE_WITH_BACKGROUND: f64 = 0.94;
 const MIN_SHARE_WITHOUT_BACKGROUND: f64 = 0.75;
 
@@ -43,7 +44,7 @@ struct RecordedScan {
     legs: Vec<Point>,
 }
 
-/// Returns the walks in the folder `people` in the order of time; `None` if there are none.
+/// Returns the recorded walks in the folder `people` in the order of time; `None` if the folder does not exist.
 fn read_walks() -> Option<Vec<Vec<RecordedScan>>> {
     let default_folder = || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data"));
     let people = std::env::var_os("SCANHUB_DATA").map_or_else(default_folder, PathBuf::from).join("people");
@@ -59,8 +60,8 @@ fn read_walks() -> Option<Vec<Vec<RecordedScan>>> {
     Some((1..=3).map(read).collect())
 }
 
-/// Parses a scan. Ranges are in meters. Null is a beam without a return; most of these beams look ahead, where the room
-/// is open.
+/// Parses a scan. Ranges are in meters. Null stands for a beam without a return; most of these beams point ahead, where
+/// the room is open.
 fn read_scan(text: &str) -> Option<RecordedScan> {
     let line: Value = serde_json::from_str(text).ok()?;
     let step = line["step"].as_f64()?;

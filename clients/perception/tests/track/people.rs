@@ -1,6 +1,6 @@
 //! Tests of the tracker in the simulated house. The tracks must not depend on the order in which scans arrive. The
-//! tests also cover late scans, clock jumps, IDs that are never reused, a sensor that is interrupted, and a person who
-//! sits down.
+//! tests also cover late scans, clock jumps, IDs that must never be reused, a sensor that is interrupted, and a person
+//! who sits down.
 
 use std::collections::BTreeSet;
 
@@ -37,8 +37,8 @@ fn simulate(count: usize, seconds: u64) -> Vec<SentScan> {
     simulate_house(IDEAL, (count, 0.0), 3, seconds, |_| {})
 }
 
-/// Returns the scans of a `house`. `sits` is the share of their rests that people spend on a chair. `each` receives the
-/// crowd every 10 ms.
+/// Returns the scans of a `house` in which `count` people walk. `sits` is the share of people's rests that they spend
+/// on a chair. `each` receives the crowd every 10 ms of virtual time.
 fn simulate_house(
     house: House,
     (count, sits): (usize, f64),
@@ -93,7 +93,7 @@ fn order_of_arrival_does_not_change_the_tracks() {
     let (in_order, people) = track(sent.iter());
     assert!(in_order.iter().any(|sample| sample.tracks.len() >= 3));
     assert_eq!((people.counts().scans, people.counts().late), (2_400, 0));
-    // Reverse each group of seven scans. This is 60 ms, which is less than the delay.
+    // Reverse each group of seven scans. A group spans 60 ms, which is less than the delay.
     let turned: Vec<&SentScan> = sent.chunks(7).flat_map(|some| some.iter().rev()).collect();
     let (turned, people) = track(turned.into_iter());
     assert_eq!(people.counts().late, 0);
