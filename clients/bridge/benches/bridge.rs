@@ -1,16 +1,17 @@
 //! Benchmark of a bridge: its costs and its losses. Routers are bridges that listen. The parts are:
-//! - `hop`: the time of a scan from shared memory to a plain Zenoh client behind a router, compared with a plain
-//! - `hop`: the time of a scan from shared memory to a plain Zenoh client behind a router, compared with a plain
-//!   publisher
-//! - `killed`: a router that is killed repeatedly
-//! - `stalls`: the same link, on which nothing moves for 2 s of every 20 s
-//! - `loss`: all topics of two sensors for minutes
-//! - `plain`: the same behind a router with Zenoh's own configuration, to a plain Zenoh subscriber
+//! - `hop`: the time of a scan from shared memory to a plain Zenoh client behind a router, compared with the time from
+//!   a plain Zenoh publisher
+//! - `killed`: losses and recovery while a router is killed repeatedly
+//! - `slow`: the age of scans and the losses on a link of 0.5 Mbit/s and 100 ms each way
+//! - `stalls`: the same as `slow`, but the link forwards nothing for 2 s of every 20 s
+//! - `loss`: losses and CPU time with all topics of two sensors through a router, for MINUTES
+//! - `plain`: the losses of a plain Zenoh subscriber behind a router with Zenoh's own configuration, for MINUTES
 //!
 //! The bench does not measure a real network.
 //!
-//! `cargo bench -p scanhub-bridge --bench bridge [-- MINUTES] [hop|killed|slow|stalls|loss|plain ..]` (default: 10,
-//! all), after `cargo build --release`.
+//! To run it after `cargo build --release`:
+//! `cargo bench -p scanhub-bridge --bench bridge [-- MINUTES] [hop|killed|slow|stalls|loss|plain ..]`. By default,
+//! MINUTES is 10, and all parts run.
 
 mod environment;
 
@@ -73,9 +74,9 @@ fn main() {
     }
 }
 
-/// Number of runs.
+/// Number of runs of [`latency`], which reports the median.
 const RUN_COUNT: usize = 5;
-/// Length of a run.
+/// Length of a run of [`latency`].
 const RUN_TIME: Duration = Duration::from_secs(10);
 
 /// Measures the time of a scan from shared memory through a router to a plain client, compared with the same bytes from
@@ -163,7 +164,7 @@ fn latency(environment: &BenchEnvironment) -> Vec<TableRow> {
 
 /// Number of times that the router is killed.
 const KILLS: usize = 20;
-/// Time for which the router does not run.
+/// Time for which the router does not run after it was killed.
 const ROUTER_DOWNTIME: Duration = Duration::from_millis(700);
 
 /// Measures how soon scans arrive again after a router was killed and restarted, and checks that both ends count the
@@ -376,7 +377,7 @@ fn slow_link(environment: &BenchEnvironment, stalls: Option<StallPattern>) -> Ve
         for source in &mut sources {
             while let Some(sample) = source.receive(&mut memory).expect("a sample") {
                 let header = sample.header().filter(|header| header.flags & Flags::REMOTE != 0);
-                // Samples that waited before the first poll are older.
+                // Skip the samples that waited before the first poll, because they are older than later samples.
                 if let Some(header) = header.filter(|_| !is_first) {
                     ages.push(clock::wall_ns().saturating_sub(header.wall_ns));
                 }
@@ -402,7 +403,8 @@ fn slow_link(environment: &BenchEnvironment, stalls: Option<StallPattern>) -> Ve
                 "0.5 Mbit/s, 100 ms each way{suffix}, all topics of two sensors: age of a scan, median, p95 and p99"
             ),
             format!("{p50:.0} ms, {p95:.0} ms, {p99:.0} ms, {} scans", ages.len()),
-            // With stalls, the samples in transit when a stall begins are more than 1 % of all, and 2 s late.
+            // With stalls, more than 1 % of all samples are in transit when a stall begins. These samples are 2 s late,
+            // so p99 has no target.
             stalls.is_none().then_some(("p99 at most 600 ms", p99 <= 600.0)),
         ),
         row(
@@ -425,13 +427,13 @@ fn has_class(line: &Value, name: &str) -> bool {
 
 /// Buffer size of the relay's sockets at each end, in bytes.
 const SOCKET_BUFFER_LEN: usize = 4096;
-/// Maximum number of bytes that the relay forwards at once: a packet of a network, which is smaller than one of the
-/// loopback.
+/// Maximum number of bytes that the relay forwards at once. The payload of a packet in a network has this size. Packets
+/// on the loopback are larger.
 const PACKET_LEN: usize = 1448;
 
-/// Starts a relay to `to`, and returns the address to connect to. It forwards `bytes_a_second` in each direction, each
-/// byte after `delay`, and has no more bytes in transit than that needs. During `stalls`, it forwards nothing. (Kernels
-/// with netem and tbf do the same to a network namespace.)
+/// Starts a relay to `to`, and returns the address to connect to. The relay forwards at most `bytes_a_second` in each
+/// direction, each byte after `delay`. It has only those bytes in transit that this rate and this delay require. During
+/// `stalls`, the relay forwards nothing. (A kernel with netem and tbf can do the same in a network namespace.)
 fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<StallPattern>) -> SocketAddr {
     let listener = socket();
     listener.bind(&SocketAddr::from(([127, 0, 0, 1], 0)).into()).expect("a port");
@@ -512,7 +514,7 @@ fn relay_bytes(
         let wait = next.saturating_duration_since(now).max(Duration::from_millis(1));
         from.set_read_timeout(Some(wait)).expect("a time");
         match from.read(&mut packet) {
-            // Bytes in transit still arrive.
+            // Forward the bytes that are still in transit.
             Ok(0) => {
                 for (at, bytes) in in_transit {
                     thread::sleep(at.saturating_duration_since(Instant::now()));
@@ -545,7 +547,7 @@ struct CounterTotals {
 }
 
 impl CounterTotals {
-    /// Returns a table row that states whether both ends report the same.
+    /// Returns a table row that states whether both ends report the same counts.
     fn agreement_row(&self) -> TableRow {
         let first = self.wrong.first().map_or(String::new(), |first| format!(", the first {first}"));
         let value = format!("{}{first}", self.wrong.len());
@@ -563,7 +565,7 @@ fn compare(sender: &[Value], receiver: &[Value]) -> CounterTotals {
         let [sent, replaced, missed, bytes] =
             ["sent", "replaced", "missed", "bytes"].map(|key| number(row, key));
         let [received, lost, announced] = ["received", "lost", "replaced"].map(|key| number(&other, key));
-        // Announcements do not count themselves, and the last one is not announced.
+        // The counters in an announcement do not include this announcement, and no announcement reports the last one.
         let is_announce = name.ends_with("/announce");
         if sent != received + lost || !is_announce && replaced != announced {
             totals.wrong.push(format!("{name}: {row} and {other}"));

@@ -1,6 +1,6 @@
-//! Benchmark of scans in a ROS 2 graph. It measures the time from shared memory until a plain Zenoh subscriber has
-//! decoded the scan, compared with the same bytes from a plain Zenoh publisher in the same run. It also counts the
-//! scans that arrive, and the CPU time of the bridge.
+//! Benchmark of scans in a ROS 2 graph. The bench measures the time from shared memory until a plain Zenoh subscriber
+//! has decoded the scan. It compares this time with the time for the same bytes from a plain Zenoh publisher in the
+//! same run. It also counts the scans that arrive, and measures the CPU time of the bridge.
 //!
 //! `cargo bench -p scanhub-bridge --bench ros2 [-- SECONDS]` (default 20), after `cargo build --release`.
 

@@ -41,7 +41,8 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// arrives within this time. A larger difference therefore means that a clock is wrong. A listener with a key has the
 /// same limit.
 const MAX_CLOCK_DIFFERENCE_NS: u64 = 5_000_000_000;
-/// Maximum number of sensors that are queried. It is limited because any connected program can announce sensors.
+/// Maximum number of sensors that are queried. The number is limited because any connected program can announce
+/// sensors.
 const MAX_SENSORS: usize = 256;
 
 /// Connects with `options`, and writes one line for each finding to `out`, as JSON if `options.json` is set.
@@ -99,7 +100,7 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
             Ok::<_, Infallible>(())
         };
         let Ok(()) = connection.events(event);
-        // A router has refused the client. Another router may still accept it, but would reply soon.
+        // A router has refused the client. Another router may still accept the client, but would reply soon.
         if Diagnosis::of(&reasons.join("; ")).is_some_and(|known| known != UNREACHED) {
             end_at = end_at.min(Instant::now() + REFUSAL_TIMEOUT);
         }

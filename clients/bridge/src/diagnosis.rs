@@ -1,5 +1,5 @@
 //! Causes and remedies for Zenoh's messages about failed connections. The texts are those of Zenoh 1.10. The version of
-//! Zenoh is pinned.
+//! Zenoh is pinned, so the texts stay valid.
 
 /// A cause and its remedy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,8 +22,8 @@ impl Diagnosis {
     }
 }
 
-/// Default cause if the connecting side reports no other cause: no program replies at the address, or the program does
-/// not use Zenoh's protocol.
+/// Default cause, used if a message of the side that connects indicates no other cause: no program replies at the
+/// address, or the program does not use Zenoh's protocol.
 pub(crate) const UNREACHED: Diagnosis = Diagnosis {
     finding: "no router is reached",
     remedy: "start a router there (`scanhub bridge --listen ..` or zenohd), and check the firewall",

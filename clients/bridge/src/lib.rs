@@ -70,7 +70,8 @@ pub struct PublishOptions {
     pub topics: Vec<Topic>,
     /// `NAME=HUB`: name of a hub. The name replaces the 16 hex digits of the hub.
     pub names: Vec<String>,
-    /// Hubs from which topics are received, by 16 hex digits or by a name in `names`. If the list is empty, all hubs.
+    /// Hubs from which topics are received, by 16 hex digits or by a name in `names`. If the list is empty, topics of
+    /// all hubs are received.
     pub hubs: Vec<String>,
     /// Limits of the published topics, such as the number of subscribers.
     pub limits: TopicLimits,

@@ -18,7 +18,7 @@ use scanhub_verbs::output::ExitReason;
 
 use crate::session::{Connection, ZenohSession};
 
-/// Queue of messages to send. A newer message of a topic replaces an older one when there is no room.
+/// Queue of messages to send. A newer message of a topic replaces an older one if the queue has no room for both.
 pub(crate) trait Queue: SampleSink {
     /// Returns whether a message waits.
     fn is_waiting(&self) -> bool;
@@ -52,10 +52,10 @@ pub(crate) trait Sender {
     /// as sent until it is [settled](Queue::settle).
     fn take(&mut self, queue: &mut Self::Queue, now: WallTimestamp, message: &mut Vec<u8>) -> Option<usize>;
 
-    /// Sends `message`. Returns whether the links had room for it.
+    /// Sends `message`. Returns whether the links had room for the message.
     fn send(&mut self, topic: usize, message: &[u8]) -> Result<bool, Failure>;
 
-    /// Adds the last messages of a run, after all others have been sent. Returns whether it added any.
+    /// Adds the last messages of a run, after all others have been sent. Returns whether any message was added.
     fn finish(&mut self, queue: &mut Self::Queue) -> bool;
 }
 
@@ -144,7 +144,7 @@ impl<Q: Queue> SampleSink for SharedQueue<Q> {
 }
 
 /// Waits for the end of a thread that [sends](send) the messages of `queue`. If the thread still waits for room on a
-/// link after [`FLUSH_TIME`], it is left running until the process exits, and its message counts as not sent.
+/// link after [`FLUSH_TIME`], it runs on until the process exits, and its message counts as not sent.
 ///
 /// # Errors
 ///

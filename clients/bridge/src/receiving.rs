@@ -35,14 +35,14 @@ struct InboxSender {
 /// Counters of input that was rejected before it was checked.
 #[derive(Default)]
 struct Counts {
-    /// Inputs that are longer than a sample can be, or have no payload.
+    /// Inputs whose payload is longer than a sample can be, inputs without a payload, and inputs whose key is too long.
     long: AtomicU64,
     /// Inputs that arrived while the queue was full.
     overrun: AtomicU64,
 }
 
-/// Maximum number of inputs in the queue. This is 32 MB if all samples have the maximum length, or the samples of many
-/// sensors in one second.
+/// Maximum number of inputs in the queue. A full queue needs 32 MB if all samples have the maximum length. It has room
+/// for the samples that many sensors send in one second.
 const QUEUE_CAPACITY: usize = 512;
 /// Maximum length of a sample that is not divided into parts, in bytes.
 const MAX_SAMPLE_LEN: usize = HEADER_LEN + u16::MAX as usize + MAC_LEN;
@@ -111,7 +111,8 @@ pub(crate) fn run(
 impl InboxSender {
     /// Subscribes to announcements, samples of `topics`, and the tokens of sensors.
     fn listen(&self, session: &ZenohSession, topics: &[Topic]) -> Result<Vec<Subscriber>, Failure> {
-        // Use one key expression for all topics. A user whose rights cover this expression then needs no other rights.
+        // If all topics are received, use one key expression for all. A user whose rights cover this expression then
+        // needs no other rights.
         let patterns = match topics.len() == Topic::ALL.len() {
             true => vec!["*"],
             false => std::iter::once(ANNOUNCE).chain(topics.iter().map(|topic| topic.name())).collect(),
@@ -158,7 +159,7 @@ struct ZenohReceiver<'a> {
     queried_topics: Vec<Option<Topic>>,
     query_queue: QueryQueue,
     counts: Arc<Counts>,
-    /// Inputs whose key is not one of scanhub's.
+    /// Number of inputs whose key does not belong to scanhub.
     foreign: u64,
     /// Function that queries an address.
     query: Box<QueryFn<'a>>,
@@ -221,12 +222,13 @@ impl ZenohReceiver<'_> {
             self.foreign += 1;
             return Ok(());
         };
-        // Zenoh does not report the sender. Its access control decides who may send.
+        // Zenoh does not report the sender. Zenoh's access control decides who may send.
         let origin = Origin { sender: 0, address: None, name: Some(name), arrival: now() };
         self.remote_receiver.handle_datagram(payload, origin)
     }
 
-    /// Queries new sensors for their last samples, because the next samples may not arrive for a long time.
+    /// Queries new sensors for their last samples, because the next samples of some topics may not arrive for a long
+    /// time.
     fn query_next(&mut self) -> Result<(), ExitReason> {
         while let Some((hub, sensor)) = self.query_queue.next(Instant::now()) {
             let queried = self
@@ -267,7 +269,7 @@ fn topics_to_query(topics: &[Topic]) -> Vec<Option<Topic>> {
 struct QueryQueue {
     /// Hub and name of each sensor, the oldest first.
     waiting: VecDeque<(u64, Box<str>)>,
-    /// Number of sensors queried since `second`.
+    /// Number of sensors queried since `second`, the start of the current second.
     queried: usize,
     second: Instant,
     /// Number of sensors that were not queried, because the queue was full or the query failed. The bridge still
@@ -277,8 +279,8 @@ struct QueryQueue {
 
 /// Maximum number of sensors that are queried in a second.
 const MAX_QUERIES_PER_SECOND: usize = 64;
-/// Maximum number of sensors that wait for a query. The bridge queries this number in 16 s. The names need at most 96
-/// kB.
+/// Maximum number of sensors that wait for a query. The bridge queries this number of sensors in 16 s. Their names need
+/// at most 96 kB.
 const MAX_WAITING_SENSORS: usize = 1024;
 const SECOND: Duration = Duration::from_secs(1);
 

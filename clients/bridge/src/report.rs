@@ -16,7 +16,7 @@ use crate::session::LinkEvent;
 /// Writer of a bridge's reports.
 pub(crate) struct Report<'a> {
     json: bool,
-    /// Causes reported since the last connection. The remedy of each is printed only once.
+    /// Causes reported since the last connection. The remedy of each cause is printed only once.
     reported: Vec<Diagnosis>,
     out: Output<'a>,
     notes: Output<'a>,
@@ -81,7 +81,8 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{message}"))
     }
 
-    /// Reports an event of a link. When a cause occurs for the first time, also prints the remedy.
+    /// Reports an event of a link. When a cause occurs for the first time since the last connection, also prints the
+    /// remedy.
     pub(crate) fn link(&mut self, event: &LinkEvent) -> Result<(), ExitReason> {
         let LinkEvent::Failing(words) = event else {
             let is_up = *event == LinkEvent::Up;

@@ -233,7 +233,7 @@ impl RosPublisher {
         Ok(RosPublisher { publisher, gid: node.gid(of), sequence: 0, last, _history, _tokens })
     }
 
-    /// Sends `message`. Returns whether the links had room for it.
+    /// Sends `message`. Returns whether the links had room for the message.
     fn send(&mut self, session: &ZenohSession, message: &[u8]) -> bool {
         self.sequence += 1;
         let attachment = rmw_zenoh::attachment(self.sequence, now().wall_ns as i64, self.gid);

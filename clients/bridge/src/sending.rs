@@ -36,8 +36,8 @@ pub(crate) struct Datagrams {
     in_flight: Option<(u8, Option<Topic>, usize)>,
 }
 
-/// Word in the name of the file that stores the bridge's identity. A gateway has the name of its network interface
-/// there.
+/// Word in the name of the file that stores the bridge's identity. The file of a gateway has the name of the gateway's
+/// network interface instead.
 const INTERFACE: &str = "bridge";
 
 impl BridgeSender {
@@ -235,7 +235,7 @@ impl Sender for DatagramSender<'_> {
             let key = Address { hub, sensor, topic: of }.to_string();
             let live = format!("{PREFIX}/{hub:016x}/{sensor}/{LIVE}");
             self.topics[topic].publisher = Some(self.session.publisher(&key)?);
-            // Announcements are sent even without a hub, but tokens are not.
+            // Announcements are sent even without a hub, but tokens exist only while the hub is available.
             if !self.tokens.is_empty() {
                 self.announce(live)?;
             }

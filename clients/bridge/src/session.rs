@@ -27,7 +27,7 @@ pub(crate) struct Connection {
     log: Log,
     /// Whether the session listens. A session that listens opens at once or fails.
     listens: bool,
-    /// Set once the bridge has reported that it is ready. No sample is received or sent earlier.
+    /// Set once the bridge has reported that it is ready. Before that, no sample is received or sent.
     has_begun: AtomicBool,
     was_linked: Mutex<Option<bool>>,
 }
@@ -41,7 +41,7 @@ struct State {
 /// An event of the links.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum LinkEvent {
-    /// The session has a link, after it had none.
+    /// The session has a link, after it had no link.
     Up,
     /// The session has no more links.
     Down,
@@ -57,12 +57,13 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 impl Connection {
-    /// Starts to open a session with this configuration, and retries until it succeeds.
+    /// Starts a thread that opens a session with this configuration. The thread retries until the session is open. A
+    /// session that listens is tried only once.
     pub(crate) fn open(config: CheckedConfig) -> Result<Connection, Failure> {
         let log = Log::install();
         let (state, listens) = (Arc::new(State::default()), config.listens());
         let shared = state.clone();
-        // No call can end an attempt to open a session, so the thread runs until the process exits.
+        // Zenoh has no call that ends an attempt to open a session, so the thread may run until the process exits.
         let opening = thread::Builder::new().name("opening".into()).spawn(move || {
             loop {
                 match zenoh::open(config.zenoh()).wait() {
@@ -130,8 +131,8 @@ impl Connection {
         self.state.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Passes each link event since the last call to `report`. A final failure is not among them;
-    /// [`failure`](Connection::failure) returns it.
+    /// Passes each link event that has occurred since the previous call of this function to `report`. The failure of a
+    /// session that can never open is not a link event; [`failure`](Connection::failure) returns this failure.
     pub(crate) fn events<E>(&self, mut report: impl FnMut(LinkEvent) -> Result<(), E>) -> Result<(), E> {
         if self.listens && !self.is_open() {
             return Ok(());
@@ -152,8 +153,9 @@ impl Connection {
         self.log.count()
     }
 
-    /// Closes the session. A stalled link may delay this for ten seconds. Therefore, after [`CLOSE_TIMEOUT`], the
-    /// session stays open until the process exits. The peers detect that too.
+    /// Closes the session. A stalled link may delay the close for ten seconds, so this function waits for at most
+    /// [`CLOSE_TIMEOUT`]. A session that is not closed by then stays open until the process exits. The peers detect the
+    /// exit too.
     pub(crate) fn close(&self) {
         let Some(session) = self.state.session.get().map(|opened| opened.session.clone()) else { return };
         let closing = thread::Builder::new().name("closing".into()).spawn(move || {
@@ -248,10 +250,12 @@ impl ZenohSession {
 
     /// Sends `payload`, and waits until the links have room for it. Returns false if the session was closed.
     ///
-    /// The wait ends when the link breaks, or after 5 s (one client), 10 s (a router, from a client) or 1 s (several
-    /// links), unless Zenoh's configuration file has other values. The payload is then lost on that link.
+    /// The wait ends when the link breaks. It also ends after 5 s if only one client is connected, after 10 s if this
+    /// session is the client of a router, and after 1 s if there are several links. Zenoh's configuration file may have
+    /// other values. After the wait, the payload is lost on the link that had no room.
     pub(crate) fn put(&self, to: &Publisher, payload: &[u8], attachment: Option<&[u8]>) -> bool {
-        // A router would forward `Block`. Then one slow subscriber of the router would delay all other subscribers.
+        // A router would apply `Block` to its own links too. Then one slow subscriber of the router would delay all
+        // other subscribers.
         let congestion_control = match self.links().is_lone_client {
             true => CongestionControl::Block,
             false => CongestionControl::Drop,
@@ -268,7 +272,7 @@ impl ZenohSession {
     }
 
     /// Subscribes to `keys`, and passes key and payload of each sample from other sessions to `receive`. The payload is
-    /// `None` if it has more than `max_len` bytes.
+    /// `None` if it has more than `max_len` bytes, or if the sample only deletes its key.
     pub(crate) fn subscribe(
         &self,
         keys: &str,
@@ -296,8 +300,8 @@ impl ZenohSession {
         subscriber.map(|_subscriber| Subscriber { _subscriber }).map_err(|error| failed(keys, &error))
     }
 
-    /// Replies to queries that intersect `keys`. `answer` returns the replies. The argument of `answer` is a function
-    /// that checks whether a key matches the query. A query may have wildcards.
+    /// Replies to queries whose key expression intersects `keys`. `answer` returns the replies. The argument of
+    /// `answer` is a function that checks whether a key matches the query. A query may have wildcards.
     pub(crate) fn answer(
         &self,
         keys: &str,

@@ -1,5 +1,6 @@
 """Examines the bridge like a ROS 2 node, but without ROS: with zenoh-ros2-sdk (graph and subscribers) and rosbags
-(types, hashes, CDR) from PyPI. Compares scans with those that subscribers of the hub received. Prints one JSON object.
+(types, hashes, CDR) from PyPI. Compares scans with the scans that subscribers of the hub received. Prints one JSON
+object.
 
 Usage: ros2.py PORT DOMAIN_ID SECONDS ECHO... Each ECHO is a file to which `scanhub echo SENSOR/scan --json` writes
 during the test."""
@@ -25,12 +26,12 @@ store = get_typestore(Stores.ROS2_JAZZY)
 
 
 def text(name):
-    """Returns the definition of a type with all types that it contains, from rosbags."""
+    """Returns rosbags' definition of a type, with the definitions of all types that it contains."""
     return store.generate_msgdef(name, ros_version=2)[0]
 
 
 def sdk_hash(name):
-    """Returns the hash of a type, which zenoh-ros2-sdk computes from the definition."""
+    """Returns the hash that zenoh-ros2-sdk computes from the definition of a type."""
     first, *others = text(name).split("=" * 80 + "\nMSG: ")
     contained = {}
     for other in others:
@@ -78,7 +79,8 @@ def stamp_ns(header):
 
 
 def apart(message, scan):
-    """Returns the largest difference of angles, and whether every range is the float nearest to the measured one."""
+    """Returns the largest difference between angles of `message` and `scan`, in radians, and whether every range of
+    `message` is the float nearest to the range in `scan`."""
     first, step = math.radians(scan["first_angle_deg"]), math.radians(scan["step_deg"])
     turned = step < 0
     if turned:
@@ -128,8 +130,9 @@ def main():
     for path, name in zip(echoes, scans):
         known = list(published(path).values())
         messages = received[name]
-        # A message has the stamp of its first beam, and an echo that of the telegram's start. Their difference is the
-        # same for every scan of a sensor. It is taken from the first message with the ranges of a scan.
+        # A message has the stamp of its first beam, and a line of an echo has the stamp of the telegram's start. The
+        # difference between the two stamps is the same for every scan of a sensor. It is computed from the first
+        # message whose ranges equal the ranges of a scan.
         lag = next((scan["wall_ns"] - stamp_ns(m.header) for m in messages for scan in known if apart(m, scan)[1]), 0)
         wanted = {scan["wall_ns"] - lag: scan for scan in known}
         pairs = [(message, wanted.get(stamp_ns(message.header))) for message in messages]

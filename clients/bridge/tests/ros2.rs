@@ -46,7 +46,7 @@ impl TestDirectory {
         self.0.path().join(name).display().to_string()
     }
 
-    /// Starts a program in the domain. It ends with the test.
+    /// Starts a program in the domain. The program ends with the test.
     fn start(&self, program: &Path, arguments: &[&str], out: Stdio) -> RunningProgram {
         let mut command = Command::new(program);
         command.args(arguments).args(["--domain", "ros2", "--root", &self.path("root")]);
@@ -146,7 +146,7 @@ fn check_graph(report: &Value) {
     }
 }
 
-/// Checks that the decoded scans are the measured ones, and that nearly all of them arrived. With best effort, a busy
+/// Checks that the decoded scans equal the measured scans, and that nearly all scans arrived. With best effort, a busy
 /// machine drops late scans.
 fn check_scans(report: &Value, sensor: &str) {
     let scans = &report["scans"][format!("/robot1/{sensor}/scan")];

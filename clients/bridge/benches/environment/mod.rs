@@ -17,7 +17,7 @@ use scanhub_client::{Domain, Topic};
 use tempfile::TempDir;
 use zenoh::{Config, Wait};
 
-/// A directory for the programs of a bench. It is removed when dropped.
+/// A directory for the programs of a bench. Dropping this value removes the directory.
 pub(crate) struct BenchEnvironment {
     directory: TempDir,
     scanhub: PathBuf,
@@ -85,7 +85,7 @@ impl Machine<'_> {
         RunningProgram { child, stdout_path }
     }
 
-    /// Subscribes to topics in the shared memory of this machine, and waits until all of them exist.
+    /// Subscribes to topics in the shared memory of this machine, and waits until all these topics exist.
     pub(crate) fn subscribe<const N: usize>(&self, topics: [(&str, Topic); N]) -> (Session, [Source; N]) {
         let mut memory = Session::new(vec![Domain::at("bench", &self.root).expect("a name")]);
         let mut sources = topics.map(|(sensor, topic)| Source::new(sensor, topic));
@@ -193,7 +193,7 @@ fn open(mode: &str, endpoints: &str, at: SocketAddr) -> zenoh::Session {
 /// Durations in nanoseconds, which several threads collect.
 pub(crate) type SendTimes = Arc<Mutex<Vec<u64>>>;
 
-/// Returns the value in microseconds below which the given share of all values lies.
+/// Returns the value, in microseconds, below which the share `share` of all `values` lies.
 pub(crate) fn percentile(values: &mut [u64], share: f64) -> f64 {
     values.sort_unstable();
     let place = ((values.len() as f64 - 1.0) * share).max(0.0) as usize;

@@ -1,5 +1,5 @@
 //! ROS 2 topics that a bridge publishes for one hub. Each sample becomes a message. The messages of a topic wait in a
-//! queue. The length of the queue is the depth in the topic's quality of service. Time is an argument.
+//! queue. The maximum length of the queue is the depth in the topic's quality of service. Time is an argument.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU64;
@@ -37,7 +37,8 @@ pub(super) struct PublishedTopic {
     pub(super) name: String,
     pub(super) of: Type,
     pub(super) qos: Qos,
-    /// Number of messages that were sent, number that newer messages replaced, and number that could not be sent.
+    /// Number of messages that were sent, number of messages that newer messages replaced, and number of messages that
+    /// could not be sent.
     pub(super) sent: u64,
     pub(super) replaced: u64,
     pub(super) failed: u64,
@@ -114,7 +115,7 @@ const ABSENT_AFTER_NS: u64 = 500_000_000;
 const REPORT_INTERVAL_NS: u64 = 1_000_000_000;
 
 impl Graph {
-    /// Creates the graph of a hub. With `reports_hub`, it publishes once a second whether the hub runs.
+    /// Creates the graph of a hub. If `reports_hub` is true, the graph publishes once a second whether the hub runs.
     pub(super) fn new(names: RosNames, reports_hub: bool) -> Graph {
         let mut graph = Graph {
             names,
@@ -288,7 +289,8 @@ impl Graph {
         }
     }
 
-    /// Settles the last message from [`take_next`](Graph::take_next). If `is_sent` is false, it counts as failed.
+    /// Settles the last message from [`take_next`](Graph::take_next). If `is_sent` is false, the message counts as
+    /// failed.
     pub(super) fn settle(&mut self, is_sent: bool) {
         if let Some(topic) = self.in_flight.take().filter(|_| !is_sent) {
             let topic = &mut self.topics[topic];
@@ -352,7 +354,7 @@ impl Graph {
         self.sensors[sensor].scans = scans;
     }
 
-    /// Queues a message with all points of a sweep when its last sample has arrived.
+    /// Queues a message with all points of a sweep when the last sample of the sweep has arrived.
     fn cloud(&mut self, sensor: usize, header: &Header, cloud: &Cloud, now: WallTimestamp) {
         let known = &mut self.sensors[sensor];
         let (slot, mut sweep) = (known.slots.cloud, std::mem::take(&mut known.sweep));
@@ -534,8 +536,8 @@ mod tests {
         assert_eq!(ranges(take_messages(&mut graph)), [3, 4, 5, 6, 7]);
         graph.settle(false);
         assert_eq!(counts(&graph), (4, 2, 1));
-        // Two of the scans from 60 to 140 ms after the start are old at 190 ms. The newest one is never dropped for its
-        // age.
+        // Two of the scans from 60 to 140 ms after the start are old at 190 ms. The newest scan is never dropped
+        // because of its age.
         take(&mut graph, 0);
         let first = graph.take_next(at(190_000_000)).map(|handed| handed.message.to_vec()).unwrap();
         assert_eq!(read(&scanhub_ros::LASER_SCAN, &first).unwrap().number("ranges.0"), Some(5.0));

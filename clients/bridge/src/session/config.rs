@@ -1,5 +1,5 @@
 //! Zenoh's configuration. It consists of the user's configuration file, the given addresses, and limits for settings
-//! that the file does not contain. A session listens or scouts only if the options or the file enable that.
+//! that the file does not contain. Listening and scouting are off unless the options or the file enable them.
 
 use std::path::Path;
 
@@ -34,8 +34,8 @@ const LIMITS: &[(&str, &str)] = &[
     ("transport/unicast/max_sessions", "64"),
     ("transport/link/tx/batch_size", "8192"),
     ("transport/link/tx/queue/size/data", "1"),
-    // Without batching, a sample is sent at once, as with Zenoh's `express`. But `express` would also apply to routers
-    // on the path. They have room for two batches, and drop the third.
+    // Without batching, a sample is sent at once, as with Zenoh's `express`. But `express` would also apply on the
+    // routers of the path, which have room for only two batches, and drop the third batch.
     ("transport/link/tx/queue/batching/enabled", "false"),
     ("transport/link/rx/max_message_size", "1048576"),
     ("transport/link/tcp/so_sndbuf", "8192"),
@@ -46,15 +46,17 @@ const LIMITS: &[(&str, &str)] = &[
 /// client, and the second for a router or peer. After a drop, Zenoh drops later messages too, until there is room. The
 /// second key is the additional time for a message in fragments.
 ///
-/// A client has one link. It waits for 10 s, because a link without data stays open for 10 s. Messages of a client are
-/// therefore dropped only if the link breaks. A longer wait would delay the detection of a dead link, because the
-/// waiting thread holds a lock of Zenoh. A router may have many links, and a stalled link must not delay the others.
+/// A client has one link. It waits for 10 s, because Zenoh closes a link on which no data arrives after 10 s. Messages
+/// of a client are therefore dropped only if the link breaks. A longer wait would delay the detection of a dead link,
+/// because the waiting thread holds a lock of Zenoh. A router may have many links, and a stalled link must not delay
+/// the others.
 const WAIT_SETTINGS: [(&str, [&str; 2]); 2] = [
     ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["10000000", "1000000"]),
     ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", ["0", "2000000"]),
 ];
 
-/// Files that Zenoh opens only when it connects.
+/// Keys of the configuration that name files, each with the content that the file must have. Zenoh opens these files
+/// only when it connects.
 const FILES: &[(&str, Content)] = &[
     ("transport/link/tls/root_ca_certificate", Content::Trusted),
     ("transport/link/tls/listen_certificate", Content::Own),
@@ -221,7 +223,7 @@ fn check_own(text: &[u8], now_s: i64) -> Result<(), UnusableFile> {
 }
 
 /// Checks that at least one certificate in `text` is valid at the time `now_s`, in seconds since 1970. This machine
-/// trusts these certificates. Others in the list may have expired.
+/// trusts these certificates. Other certificates in `text` may have expired.
 fn check_trusted(text: &[u8], now_s: i64) -> Result<(), UnusableFile> {
     let certificates = certificates(text)?;
     let is_good = certificates[1..].iter().any(|block| check_validity(block, now_s).is_ok());
@@ -278,7 +280,7 @@ fn blocks(text: &[u8]) -> Result<Vec<Pem>, UnusableFile> {
 mod tests {
     use super::*;
 
-    /// Any time: other tests check the validity of certificates.
+    /// Arbitrary time, because other tests check the validity of certificates.
     const NOW_S: i64 = 0;
 
     fn options(connect: &[&str], listen: &[&str], config: Option<&Path>) -> BridgeOptions {

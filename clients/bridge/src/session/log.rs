@@ -1,5 +1,5 @@
 //! Collects Zenoh's log lines about failed connections. Only these lines contain the reason of a failure. The newest
-//! lines wait until they are reported, each once. All other log lines are ignored.
+//! lines wait until they are reported. A repeated line is reported only once. All other log lines of Zenoh are ignored.
 
 use std::collections::VecDeque;
 use std::fmt::{Debug, Write};
@@ -34,14 +34,15 @@ const CUT_MARKERS: [(&str, usize); 3] =
 /// Suffix that Zenoh adds to addresses because of the settings in `config.rs`.
 const OUR_LIMIT: &str = "#so_sndbuf=8192";
 
-/// Messages that Zenoh logs only at debug level: source, and start of the text. They have the reason why a lost
-/// connection cannot be restored, or why an incoming connection was refused.
+/// Messages that Zenoh logs only at debug level: source, and start of the text. These messages contain the reason why a
+/// lost connection cannot be restored, or why an incoming connection was refused.
 const QUIET_MESSAGES: [(&str, &str); 3] = [
     ("zenoh::net::runtime::orchestrator", "Unable to connect"),
     ("zenoh_link_tls::unicast", "Can not accept"),
     ("zenoh_transport::unicast::establishment::accept", ""),
 ];
-/// Start of Zenoh's line about a link that Zenoh closes because the link has no room. This connection was not refused.
+/// Start of Zenoh's line about a link that Zenoh closes because the link has no room. This line does not count as a
+/// refused connection.
 const CLOSED_MESSAGE: &str = "Unable to push";
 /// Start of a message about a connection that was accepted.
 const ACCEPTED_MESSAGE: &str = "New transport";
@@ -54,12 +55,12 @@ impl Log {
         log
     }
 
-    /// Returns the lines that were not reported yet, and removes them.
+    /// Returns the lines that were not reported yet, and marks them as reported.
     pub(super) fn take(&self) -> Vec<String> {
         self.lines().waiting.drain(..).collect()
     }
 
-    /// Returns the number of lines so far, including repeated ones.
+    /// Returns the number of lines about failed and refused connections so far, including repeated lines.
     pub(super) fn count(&self) -> u64 {
         self.lines().count
     }

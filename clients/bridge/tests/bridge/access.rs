@@ -61,8 +61,8 @@ fn await_finding(program: &mut Program, finding: &str) {
     assert!(line["remedy"].is_string() && line["message"].is_string(), "{line}");
 }
 
-/// Runs `doctor` and `bridge --check` with this address and configuration. Checks that both fail with the same finding,
-/// and returns it.
+/// Runs `doctor` and `bridge --check` with this address and configuration. Checks that both programs fail with the same
+/// finding, and returns this finding.
 fn check_finding(env: &TestEnv, at: &str, config: &str) -> String {
     let doctor = env.run(&["doctor", "--json", "--bridge", at, "--bridge-config", config]);
     assert_eq!(doctor.exit_code, Some(5), "{doctor}");
@@ -87,14 +87,15 @@ fn only_certificates_of_the_authority_can_connect() {
     await_ready(&mut here);
     await_ready(&mut robot);
     assert_eq!(here.end(INT).exit_code, Some(0));
-    // The first peer does not trust the robot's authority. The robot does not trust the second peer's authority.
+    // The peer with the first configuration does not trust the robot's authority. The robot does not trust the
+    // authority of the peer with the second configuration.
     for (file, ca) in [("a.json5", "stranger"), ("b.json5", "ca")] {
         let config = of(file, ca, "thief");
         let mut intruder = bridge_without_peer(&other, &["--connect", &at, "--publish", "--config", &config]);
         await_finding(&mut intruder, "the certificates do not match");
         assert_eq!(intruder.end(INT).of_class("bridge_published").len(), 0);
     }
-    // The robot only sends. It reports the finding about a refused peer, and counts the peer.
+    // The robot only sends. It reports the finding about a refused peer, and counts the refused connection.
     let line = robot.await_line("the refusal", |line| {
         line["class"] == "bridge_link"
             && line["finding"] == "a client was refused: the certificates do not match"

@@ -85,8 +85,8 @@ fn invalid_datagrams_do_not_block_a_valid_sender() {
     for _ in 0..20_000 {
         put(&session, &format!("{SENSOR_KEY}/zones"), &broken);
     }
-    // The honest sender continues. It sends an announcement again, because it had sent for less than a second and its
-    // entry was evicted.
+    // The honest sender continues. It sends its announcement again, because its entry was evicted: it had sent samples
+    // for less than a second.
     wait_until("samples of an honest sender arrive", || {
         put(&session, &format!("{SENSOR_KEY}/announce"), &sender.announcement(&topics));
         put(&session, &format!("{SENSOR_KEY}/zones"), &zones(&mut sender, Verdict::Stop));

@@ -118,7 +118,7 @@ fn plain_zenoh_client_gets_samples_and_query_replies() {
         "rear/background",
         "rear/status",
     ]);
-    // A router has room for only two samples that are sent as `express`.
+    // Scans are not sent as `express`, because a router has room for only two `express` samples.
     let samples = client.declare_subscriber("scanhub/*/*/scan").wait().expect("a subscriber");
     for _ in 0..5 {
         assert!(!samples.recv().expect("a scan").express());
@@ -192,7 +192,7 @@ impl TestEnv {
 }
 
 /// Runs a copy of `scanhub` as `scanhub bridge`. The copy is alone in its directory, or next to a script with the name
-/// `scanhub-bridge`. Returns the line that it prints.
+/// `scanhub-bridge`. Returns the line that the copy prints.
 fn error_of_lone_program(env: &TestEnv, bridge_script: Option<&str>) -> String {
     let program = env.command(&["bridge", "--connect=tcp/127.0.0.1:1"]).get_program().to_owned();
     let alone = env.path("scanhub");

@@ -65,7 +65,7 @@ fn open_peer(at: &str) -> Session {
     ] {
         config.insert_json5(key, value).expect("a key of Zenoh");
     }
-    // A bridge reports that it is ready before it listens.
+    // Retry, because the router may not accept connections yet.
     let mut session = None;
     wait_until("the router accepts connections", || {
         session = zenoh::open(config.clone()).wait().ok();

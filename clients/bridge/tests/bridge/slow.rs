@@ -70,8 +70,8 @@ fn slow_link_delivers_the_newest_samples() {
     });
 }
 
-/// Number of queued zones that newer zones must replace before the stalled link continues. It corresponds to more than
-/// 1 s.
+/// Number of queued samples of topic `zones` that newer samples must replace before the stalled link continues. The
+/// stall then lasts more than 1 s.
 const MIN_REPLACED: u64 = 60;
 
 /// Stops the receiving program until newer samples have replaced many others. Either the robot's bridge or the
