@@ -7,7 +7,7 @@
 #
 # DESTDIR=DIR installs below DIR, for packages.
 set -eu
-# Debian's users do not have ldconfig in PATH.
+# On Debian, PATH of a normal user does not contain ldconfig.
 PATH=$PATH:/usr/sbin:/sbin
 
 here=$(cd "$(dirname "$0")" && pwd)
@@ -33,7 +33,7 @@ version=$(sed -n 's/^version = "\(.*\)"/\1/p' "$here/../../Cargo.toml" | head -n
 
 put() { # source, destination, mode
     mkdir -p "$(dirname "$root/$2")"
-    # First under another name, because a program may have the old file open.
+    # Copy under another name and then rename, because a program may have the old file open.
     cp "$1" "$root/$2.new"
     chmod "$3" "$root/$2.new"
     mv "$root/$2.new" "$root/$2"

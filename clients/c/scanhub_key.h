@@ -1,7 +1,8 @@
 /*
- * The MACs of datagrams for programs in C: functions that check that a sender with the key sent a datagram, and that
- * it is not a replay. It opens no sockets and no files. C99, no heap, no library: it contains SHA-256. docs/datagram.md
- * explains which datagrams a listener with a key accepts.
+ * Functions for programs in C that check the MACs of datagrams. They check that a sender with the key sent a datagram,
+ * and that the datagram is not a replay. They open no sockets and no files. The code is C99, without heap and without a
+ * library, because this header contains SHA-256. docs/datagram.md explains which datagrams a listener with a key
+ * accepts.
  *
  *     static struct scanhub_guard guard;
  *     struct scanhub_key key;
@@ -108,8 +109,8 @@ static inline int scanhub_key_digit(uint8_t c)
     return c >= '0' && c <= '9' ? c - '0' : c >= 'a' && c <= 'f' ? c - 'a' + 10 : c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
 }
 
-/* Converts the content of a key file: 32 bytes, or 64 hex digits, with or without an end of line. Returns 1, or 0 if it
- * is not a key. Check first that no other user can read the file. */
+/* Converts the content of a key file, which is 32 bytes, or 64 hex digits with or without an end of line. Returns 1, or
+ * 0 if the content is not a key. Before the call, check that no other user can read the file. */
 static inline int scanhub_key_of(struct scanhub_key *key, const void *file, size_t len)
 {
     const uint8_t *bytes = (const uint8_t *)file;
@@ -141,7 +142,7 @@ static inline int scanhub_key_of(struct scanhub_key *key, const void *file, size
 }
 
 /* Returns whether the last 16 bytes of a datagram are its MAC for this key. scanhub_read must have accepted the
- * datagram, and it must have a MAC. The comparison takes constant time. */
+ * datagram, and the datagram must have a MAC. The comparison takes constant time. */
 static inline int scanhub_is_of(const struct scanhub_key *key, const void *bytes, size_t len)
 {
     static const uint8_t no_crc[4] = {0, 0, 0, 0};
@@ -161,8 +162,8 @@ static inline int scanhub_is_of(const struct scanhub_key *key, const void *bytes
     return differs == 0;
 }
 
-/* Checks a datagram like scanhub_read, and that it was sent with `key`. It does not detect replays: call
- * scanhub_guard_take. */
+/* Checks a datagram like scanhub_read, and also checks that its sender has `key`. This function does not detect
+ * replays: also call scanhub_guard_take. */
 static inline enum scanhub_result scanhub_read_with(const struct scanhub_key *key, const void *bytes, size_t len,
                                                     struct scanhub_datagram *out)
 {
@@ -174,9 +175,10 @@ static inline enum scanhub_result scanhub_read_with(const struct scanhub_key *ke
     return scanhub_is_of(key, bytes, len) ? SCANHUB_OK : SCANHUB_BAD_MAC;
 }
 
-/* Maximum numbers of gateways, and of topics of all their sensors. */
+/* Maximum number of gateways. */
 #define SCANHUB_HUBS 16
-/* Maximum number of topics of all their sensors, with announcements: enough for 16 sensors that have all topics. */
+/* Maximum number of topics of the sensors of all gateways, including announcements: enough for 16 sensors that have all
+ * topics. */
 #define SCANHUB_STREAMS (16 * SCANHUB_TOPICS)
 
 /* A gateway, and the greatest epoch that was received from it. */
@@ -185,8 +187,8 @@ struct scanhub_run {
     uint32_t epoch;
 };
 
-/* Sequence numbers of a sensor's topic. `highest` is valid if `any` is 1. `seen` has a bit for each of the 1024 numbers
- * up to `highest`. Numbers below `first` are refused. */
+/* Sequence numbers of a sensor's topic. `highest` is the highest number that was received, and is valid if `any` is 1.
+ * `seen` has a bit for each of the 1024 numbers up to `highest`. Numbers below `first` are refused. */
 struct scanhub_stream {
     uint64_t hub;
     uint8_t sensor, topic, any;
@@ -194,8 +196,8 @@ struct scanhub_stream {
     uint8_t seen[128];
 };
 
-/* State of a reader with the key. Start with all bytes 0. To refuse older runs of gateways after a restart of your
- * program, too, save `runs`, and start with them. 40 kB. */
+/* State of a reader with the key, 40 kB. Start with all bytes 0. To refuse older runs of gateways even after a restart
+ * of your program, save `runs` and `run_count`, and start with the saved values. */
 struct scanhub_guard {
     struct scanhub_run runs[SCANHUB_HUBS];
     uint8_t run_count;
@@ -231,7 +233,8 @@ static inline struct scanhub_stream *scanhub_guard_begin(struct scanhub_guard *g
     return stream;
 }
 
-/* Returns whether a sequence number is new, stale or a duplicate; if `is_taken`, it counts as received from now on. */
+/* Returns whether a sequence number is new, stale or a duplicate. With `is_taken`, a new number is stored as
+ * received. */
 static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *stream, uint32_t number, int is_taken)
 {
     uint8_t bit = (uint8_t)(1u << number % 8), *byte = stream->seen + number / 8 % 128;
@@ -242,7 +245,7 @@ static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *str
     if (is_behind && *byte & bit)
         return SCANHUB_DUPLICATE;
     if (!is_behind && is_taken) {
-        /* The numbers in between did not arrive. */
+        /* The numbers between the previous highest one and this one have not arrived, so clear their bits. */
         uint32_t leave = stream->any && number - stream->highest < 1024 ? number - stream->highest : 1024;
         for (i = 0; i < leave; i++)
             stream->seen[(number - i) / 8 % 128] &= (uint8_t) ~(1u << (number - i) % 8);
@@ -257,8 +260,8 @@ static inline enum scanhub_result scanhub_stream_take(struct scanhub_stream *str
 }
 
 /* Checks that a datagram is new and not replayed, after scanhub_read_with has accepted it. `wall_ns` is the current
- * time in ns since 1970. A part is checked but not stored: when the sample is complete, call this again for it, with
- * `parts` 1. */
+ * time in ns since 1970. A part is checked, but its number is not stored: when the sample is complete, call this
+ * function again for the complete sample, with `parts` 1. */
 static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard, const struct scanhub_datagram *datagram,
                                                      uint64_t wall_ns)
 {
@@ -290,7 +293,7 @@ static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard
     if (is_next) {
         if (run == guard->runs + SCANHUB_HUBS)
             return SCANHUB_CAPACITY;
-        /* The gateway's older runs are refused from now on. */
+        /* A new run of the gateway has begun, so drop the streams of its older runs, which are refused from now on. */
         for (i = kept = 0; i < guard->stream_count; i++)
             if (guard->streams[i].hub != hub)
                 guard->streams[kept++] = guard->streams[i];

@@ -1,5 +1,5 @@
 # Version of the package. Before 1.0, a version is compatible with the versions that have the same first two numbers.
-# install.sh fills in the version; in the sources, Cargo.toml has it.
+# install.sh writes the version into the next line. In the sources, the version is read from Cargo.toml.
 set(PACKAGE_VERSION "@VERSION@")
 if(NOT PACKAGE_VERSION MATCHES "^[0-9]")
     file(STRINGS "${CMAKE_CURRENT_LIST_DIR}/../../../Cargo.toml" _scanhub_version

@@ -1,6 +1,6 @@
 # Package for find_package(scanhub 0.1 CONFIG): the targets scanhub::scanhub (shared library) and
-# scanhub::scanhub_static. It works below any prefix into which install.sh put it, even if the prefix was moved. It also
-# works in the sources.
+# scanhub::scanhub_static. The package works below any prefix into which install.sh installed it, even if the prefix was
+# moved. It also works in the sources.
 #
 #     cmake -B build -DCMAKE_PREFIX_PATH=PREFIX
 #     cmake -B build -Dscanhub_DIR=SCANHUB/clients/c/cmake
@@ -17,7 +17,7 @@ if(EXISTS "${CMAKE_CURRENT_LIST_DIR}/../include/scanhub/attach.h")
     endif()
     set(_scanhub_shared "${_scanhub_library_dir}/libscanhub.so")
     if(EXISTS "${_scanhub_shared}")
-        # The loader searches for the name that the library gives itself. Cargo makes no file of this name.
+        # The loader searches for the library by its soname. Cargo makes no file of this name.
         set(_scanhub_link "${CMAKE_BINARY_DIR}/scanhub/libscanhub.so.0")
         file(MAKE_DIRECTORY "${CMAKE_BINARY_DIR}/scanhub")
         execute_process(COMMAND "${CMAKE_COMMAND}" -E create_symlink "${_scanhub_shared}" "${_scanhub_link}")

@@ -1,5 +1,5 @@
-/* Publishes the angles of a simulated mount, which swings by half a radian in two seconds: mount [NAME]. Needs POSIX
- * clocks. */
+/* Publishes the angles of a simulated mount: mount [NAME]. The mount swings by half a radian and back in two seconds.
+ * The program needs POSIX clocks. */
 #define _POSIX_C_SOURCE 200112L
 #include <scanhub/attach.h>
 #include <stdio.h>

@@ -21,7 +21,7 @@ int main(int argc, char **argv)
         unsigned at = 0;
         for (unsigned i = 0; i < scanhub_count(&sample); i++) {
             const double range_m = scanhub_range_m(&sample, i);
-            /* No comparison with NAN is true. */
+            /* If there is no reading, the range is NAN, and this comparison is false. */
             if (range_m < nearest_m) {
                 nearest_m = range_m;
                 at = i;

@@ -27,7 +27,7 @@ try {
     for (;;) {
         if (poll(fds, 2, -1) < 0 && errno != EINTR)
             return 1;
-        // Take all samples, because the descriptor is readable until then.
+        // Take all samples, because the descriptor stays readable until all are taken.
         while (scanhub::Sample sample = robot.take()) {
             const scanhub_robot &now = sample.as<scanhub_robot>();
             if (now.verdict != last)

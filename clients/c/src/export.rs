@@ -1,4 +1,4 @@
-//! Functions of the header, each of which calls one function of this crate. A panic does not leave a function, and each
+//! Functions of the C header. Each of them calls one function of this crate. No panic leaves these functions, and each
 //! error stores its message for `scanhub_error`.
 #![allow(unsafe_code)] // For the unmangled names. No block in this file is unsafe.
 
@@ -87,7 +87,7 @@ pub extern "C" fn scanhub_wait(handle: *mut Opaque, timeout_ms: c_int) -> c_int 
     answer(|| with(handle, |handle: &mut Handle| handle.wait(timeout)).map(c_int::from))
 }
 
-/// Lends the next sample. Returns 1 if a sample was waiting, and 0 otherwise.
+/// Lends the next sample. Returns 1 if a sample had arrived, and 0 otherwise.
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_take(handle: *mut Opaque, taken: *mut BorrowedSample) -> c_int {
     answer(|| {
@@ -103,14 +103,14 @@ pub extern "C" fn scanhub_take(handle: *mut Opaque, taken: *mut BorrowedSample) 
     })
 }
 
-/// Takes a sample back. Returns 0.
+/// Releases a sample that was lent, and empties it. Returns 0.
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_release(taken: *mut BorrowedSample) -> c_int {
     answer(|| {
         let taken = sample(taken)?;
         let BorrowedSample { of, number, .. } = *taken;
-        // A sample that was released or never filled needs no release. After an error, the thread that took the sample
-        // still has it.
+        // A sample without a handle was released or never filled, and needs no release. After an error, the sample
+        // stays lent to the thread that took it.
         if !of.is_null() {
             with(of, |handle: &mut Handle| handle.release(number))?;
         }
@@ -119,7 +119,7 @@ pub extern "C" fn scanhub_release(taken: *mut BorrowedSample) -> c_int {
     })
 }
 
-/// Ends the subscription and all of its loans. Returns 0.
+/// Ends the subscription, and releases all samples that it has lent. Returns 0.
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_close(handle: *mut Opaque) -> c_int {
     answer(|| if handle.is_null() { Ok(0) } else { remove::<Handle>(handle).map(|()| 0) })
@@ -177,7 +177,7 @@ pub extern "C" fn scanhub_silent_for(handle: *mut Opaque, silent_ns: *mut u64) -
     })
 }
 
-/// Returns the reason why no sample arrives, and sets its text.
+/// Returns the reason why no sample arrives, and sets `text` to the text of the reason.
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_why_silent(handle: *mut Opaque, text: *mut *const c_char) -> c_int {
     answer(|| {

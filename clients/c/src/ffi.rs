@@ -19,17 +19,17 @@ pub struct BorrowedSample {
     pub header: *const Header,
     /// Payload, in the memory of the topic.
     pub payload: *const c_void,
-    /// Bytes of the payload.
+    /// Number of used bytes of the payload.
     pub length: usize,
     /// Number of samples of this topic that were sent before this one and not received.
     pub missed: u64,
     /// 1 if the hub has restarted since the last sample.
     pub restarted: c_int,
-    /// 1 for zones that are unknown after a silence.
+    /// 1 for zones whose verdict is unknown because of a silence.
     pub stale: c_int,
     /// Handle that lent the sample.
     pub of: *mut Opaque,
-    /// Number of the loan in that handle.
+    /// Number that identifies the loan in that handle.
     pub number: u64,
 }
 
@@ -49,7 +49,7 @@ impl BorrowedSample {
     }
 }
 
-/// Returns the text at `address`. `None` for NULL.
+/// Returns the text at `address`, or `None` for NULL.
 pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallError> {
     if address.is_null() {
         return Ok(None);
@@ -61,7 +61,7 @@ pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallEr
     text.to_str().map(Some).map_err(|_| not_text)
 }
 
-/// Returns the memory for an output argument. Its old content may be anything.
+/// Returns the memory for an output argument. The memory may have any content before the call.
 pub(crate) fn output<'a, T>(address: *mut T) -> Result<&'a mut MaybeUninit<T>, CallError> {
     check(address)?;
     // SAFETY: the address is not NULL and is aligned, and the header requires memory for one T that only the library
@@ -77,13 +77,13 @@ pub(crate) fn sample<'a>(address: *mut BorrowedSample) -> Result<&'a mut Borrowe
     unsafe { address.as_mut() }.ok_or(NULL_ARGUMENT)
 }
 
-/// Returns the memory for an optional output argument. `None` for NULL.
+/// Returns the memory for an optional output argument, or `None` for NULL.
 pub(crate) fn optional_output<'a, T>(address: *mut T) -> Result<Option<&'a mut MaybeUninit<T>>, CallError> {
     if address.is_null() { Ok(None) } else { output(address).map(Some) }
 }
 
-/// Writes `names` to the `size` bytes at `address`, separated by blanks and followed by a 0. If not all of them fit, it
-/// writes the first ones. Returns the length of the complete text without its 0.
+/// Writes `names` to the `size` bytes at `address`, separated by blanks and followed by a 0. If not all names fit,
+/// writes as many of the first ones as fit. Returns the length of the complete text without its 0.
 pub(crate) fn write_names(names: &[String], address: *mut c_char, size: usize) -> Result<c_int, CallError> {
     let text = names.join(" ");
     if size > 0 {
@@ -117,16 +117,16 @@ const NULL_ARGUMENT: CallError = CallError::Argument("an argument is NULL", "giv
 
 /// Error of a call from C: a negative number for the program, and a message with a remedy for its user.
 pub(crate) enum CallError {
-    /// Invalid argument, with the remedy.
+    /// Invalid argument: the message, and the remedy.
     Argument(&'static str, &'static str),
     /// Error of the client library.
     Client(Error),
-    /// Panic, whose message is on stderr.
+    /// Panic in this library. The message of the panic is on stderr.
     Bug,
 }
 
 impl CallError {
-    /// Returns the number in the header, `SCANHUB_REFUSED_..`.
+    /// Returns the number of the error in the header, `SCANHUB_REFUSED_..`.
     fn number(&self) -> c_int {
         match self {
             CallError::Argument(..) => -1,
@@ -139,7 +139,7 @@ impl CallError {
         }
     }
 
-    /// Stores the message for [`last_message`], and returns the number.
+    /// Stores the message for [`last_message`], and returns the number of the error.
     pub(crate) fn keep(&self) -> c_int {
         let message = match self {
             CallError::Argument(what, hint) => format!("{what}\n  {hint}"),
@@ -160,7 +160,8 @@ impl From<Error> for CallError {
     }
 }
 
-/// Returns the message of the last error of this thread, valid until its next one. Empty if there was none.
+/// Returns the message of this thread's last error, or an empty text if there was no error. The message is valid until
+/// the next error of this thread.
 pub(crate) fn last_message() -> *const c_char {
     LAST.try_with(|last| last.borrow().as_ptr()).unwrap_or(c"".as_ptr())
 }

@@ -2,9 +2,9 @@
 //! subscription to any topic, with the samples that are lent to the program, or a mount whose angles the program
 //! publishes.
 //!
-//! A handle is a number that looks like an address. The table looks up each number that C passes, and never
-//! dereferences it. A child after `fork` has a copy of the table and never uses it, because the samples and the slots
-//! at the hub belong to the parent.
+//! A handle is a number that looks like an address. Each number that C passes is searched in the table, and is never
+//! dereferenced. A child after `fork` has a copy of the table and never uses this copy, because the samples and the
+//! slots at the hub belong to the parent.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -32,14 +32,16 @@ pub(crate) struct Handle {
     found: Option<Held>,
     next: u64,
     source: Source,
-    /// Text of the last reason for a silence, which the program may still read.
+    /// Text of the last reason for a silence. The program may read the text until the next call.
     silence: CString,
 }
 
-/// Maximum number of samples that are lent at a time. It is the number that a subscriber can borrow from the hub.
+/// Maximum number of samples that a handle lends at a time. It is the number of samples that a subscriber can borrow
+/// from the hub.
 const MAX_LOANS: usize = limits::MAX_BORROWED_SAMPLES;
 
-/// Selects the subscriber type of a topic. Zones expire, other samples do not.
+/// Selects the subscriber type of a topic. Zones have their own type, because they expire, in contrast to other
+/// samples.
 macro_rules! kind {
     (Zones $payload:tt) => {
         ZonesUpdate
@@ -198,8 +200,8 @@ impl Handle {
         Ok(Handle::of(Source::open(domain, sensor, topic, wait)?))
     }
 
-    /// Subscribes to the robot of `sensors` (if empty, of all sensors) in `domain`, as [`open`](Self::open) does, with
-    /// or without `early` warnings.
+    /// Subscribes to the verdict over the zones of `sensors` in `domain`, with or without `early` warnings. An empty
+    /// list means all sensors. Without `domain`, the environment names the domain, as for [`open`](Self::open).
     pub(crate) fn open_robot(
         domain: Option<&str>,
         sensors: &[&str],
@@ -233,14 +235,15 @@ impl Handle {
         }
     }
 
-    /// Lends the next sample until it is given back. Returns `None` if no sample has arrived.
+    /// Lends the next sample until [`release`](Self::release). Returns `None` if no sample has arrived.
     pub(crate) fn take(&mut self) -> Result<Option<BorrowedSample>, CallError> {
         let slot = self.loans.iter_mut().find(|slot| slot.is_none());
         let Some(slot) = slot else {
             return Err(CallError::Argument("four samples are lent already", "scanhub_release one of them"));
         };
         let held = match self.found.take() {
-            // A verdict has no stamp, and the caller may have waited, so it must be current.
+            // The verdict may have changed since `wait` found it, and it has no stamp that would show its age. So lend
+            // the current verdict instead.
             Some(Held::Robot(found)) => match &mut self.source {
                 Source::Robot(robot) => Held::Robot(OwnedVerdict::new(robot.subscriber_mut().now()?)),
                 _ => Held::Robot(found),
@@ -257,7 +260,7 @@ impl Handle {
         Ok(Some(BorrowedSample { number: *number, ..held.lend() }))
     }
 
-    /// Takes back the sample that was lent under `number`.
+    /// Releases the sample that was lent under `number`.
     pub(crate) fn release(&mut self, number: u64) -> Result<(), CallError> {
         let is_loan =
             |slot: &&mut Option<(u64, Held)>| slot.as_ref().is_some_and(|(loan, _)| *loan == number);
@@ -321,7 +324,7 @@ struct SensorVerdict {
     nearest_mm: u32,
 }
 
-/// Verdict of a robot, with the memory to which it points. C may read both while the verdict is lent.
+/// Verdict of a robot, with the memory to which the verdict points. C may read both while the verdict is lent.
 struct OwnedVerdict {
     verdict: Verdict,
     _sensors: Box<[SensorVerdict]>,
@@ -355,7 +358,7 @@ impl OwnedVerdict {
         OwnedVerdict { verdict, _sensors: sensors, _names: names }
     }
 
-    /// Returns the struct that is lent. The memory to which it points lives as long as `self`.
+    /// Returns the struct that is lent. The memory to which the struct points exists as long as `self`.
     fn verdict(&self) -> &Verdict {
         &self.verdict
     }
@@ -373,7 +376,7 @@ impl Mount {
         Ok(Mount(Publication::in_domain(&publish_domain(domain)?, name)?))
     }
 
-    /// Publishes the angle as of `stamp_ns` of CLOCK_MONOTONIC; 0 means now.
+    /// Publishes the angle of the mount at `stamp_ns` of CLOCK_MONOTONIC; 0 means now.
     pub(crate) fn send(&mut self, stamp_ns: u64, tilt: Tilt) -> Result<(), CallError> {
         let fill = |sample: &mut Tilt| *sample = tilt;
         Ok(if stamp_ns == 0 { self.0.send(fill) } else { self.0.send_at(stamp_ns, fill) }?)
@@ -394,8 +397,8 @@ thread_local! {
 struct Entry {
     number: usize,
     process: u32,
-    /// Boxed, because the samples that an object lends must not move when the table grows. `None` only while the entry
-    /// is dropped.
+    /// The object, in a box of its own, because the samples that it lends must not move when the table grows. `None`
+    /// only while the entry is dropped.
     object: Option<Box<dyn Any>>,
 }
 
@@ -409,14 +412,14 @@ impl Drop for Entry {
     fn drop(&mut self) {
         let object = self.object.take();
         if self.process != process::id() {
-            // Keep the address, so that a leak checker reports no leak.
+            // In a child, the object is not dropped. Keep its address, so that a leak checker reports no leak.
             let mut kept = INHERITED.lock().unwrap_or_else(PoisonError::into_inner);
             kept.extend(object.map(|object| Box::into_raw(object).expose_provenance()));
         }
     }
 }
 
-/// Addresses of the objects that a child has copied from its parent.
+/// Addresses of the objects that a child inherited from its parent and does not drop.
 static INHERITED: Mutex<Vec<usize>> = Mutex::new(Vec::new());
 
 /// Next number of a handle. A process uses no number twice.
@@ -430,7 +433,7 @@ pub(crate) fn insert<T: Any>(object: T) -> Result<*mut Opaque, CallError> {
     kept.map(|()| ptr::without_provenance_mut(number)).map_err(|_| UNKNOWN_HANDLE)
 }
 
-/// Calls `use_it` with the object of `handle`, if it has this type.
+/// Calls `use_it` with the object of `handle`, if the object has type `T`.
 pub(crate) fn with<T: Any, R>(
     handle: *mut Opaque,
     use_it: impl FnOnce(&mut T) -> Result<R, CallError>,
@@ -443,7 +446,7 @@ pub(crate) fn with<T: Any, R>(
     found.unwrap_or(Err(UNKNOWN_HANDLE))
 }
 
-/// Drops the object of `handle` with everything that it holds, if it has this type.
+/// Drops the object of `handle` with everything that the object holds, if the object has type `T`.
 pub(crate) fn remove<T: Any>(handle: *mut Opaque) -> Result<(), CallError> {
     let removed = TABLE.try_with(|table| {
         let mut table = table.borrow_mut();

@@ -1,5 +1,5 @@
-//! Client library for programs in C and C++. It implements `include/scanhub/attach.h` with `scanhub_client`. A handle
-//! is a number, not an address, so the library detects a handle that was closed or belongs to another thread.
+//! Client library for programs in C and C++. The library implements `include/scanhub/attach.h` with `scanhub_client`. A
+//! handle is a number, not an address, so the library detects a handle that was closed or belongs to another thread.
 
 mod export;
 mod ffi;
