@@ -1,6 +1,6 @@
 #!/bin/sh
-# Builds the wheel of the Python package into target/python/wheels, and installs it in target/venv, or for the Python that
-# SCANHUB_PYTHON names. Needs Cargo, and the network for maturin and numpy.
+# Builds the wheel of the Python package into target/python/wheels. Installs the wheel in target/venv, or for the Python
+# interpreter that SCANHUB_PYTHON names. Needs Cargo, and the network to download maturin and numpy.
 set -eu
 
 cd "$(dirname "$0")/../.."
@@ -17,5 +17,5 @@ rm -rf "$wheels"
 "$python" -m maturin build --release --locked --manifest-path clients/python/Cargo.toml \
     --target-dir target/python --out "$wheels" --interpreter "$python"
 pip install --quiet --no-index --no-deps --force-reinstall --find-links "$wheels" scanhub-client
-# A test installs both in an empty environment, without the network.
+# Download the wheel of numpy, too, because a test installs both wheels in an empty environment without the network.
 pip download --quiet --no-deps --dest "$wheels" numpy

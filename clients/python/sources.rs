@@ -1,5 +1,5 @@
-//! Hash of the sources of the native module. The build script compiles it in, and the tests compare it with the hash of
-//! the current sources.
+//! Hash of the sources of the native module. The build script compiles the hash into the module, and the tests compare
+//! it with the hash of the current sources.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 /// Directories below a package that do not change the module.
 const SKIPPED_DIRECTORIES: [&str; 4] = ["tests", "benches", "examples", "target"];
 
-/// Extensions of the files that change the module. Other files are documents, or written by Python, maturin or an
-/// editor.
+/// Extensions of the files that change the module. Files with other extensions are documents, or are written by Python,
+/// maturin or an editor.
 const EXTENSIONS: [&str; 7] = ["rs", "toml", "txt", "py", "pyi", "typed", "lock"];
 
 /// Returns the hash of the sources in `packages`, relative to the directory `root` of the workspace.
@@ -23,7 +23,7 @@ pub(crate) fn hash(root: &Path, packages: &BTreeSet<String>) -> io::Result<Strin
     Ok(format!("{:016x}", hasher.finish()))
 }
 
-/// Returns the directory of the module's package and those of its dependencies in the workspace, relative to `root`.
+/// Returns the directories, relative to `root`, of the module's package and of its dependencies in the workspace.
 pub(crate) fn packages(root: &Path) -> io::Result<BTreeSet<String>> {
     let workspace = fs::read_to_string(root.join("Cargo.toml"))?;
     let directory_of = |dependency: &str| {

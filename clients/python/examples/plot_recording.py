@@ -29,7 +29,7 @@ def points_m(ranges_m: NDArray[np.float64], angles: NDArray[np.float64]) -> tupl
 def scan_and_background(
     file: str, sensor: str | None, config: str | None, at_s: float
 ) -> tuple[scanhub.Scan | None, scanhub.Background | None]:
-    """Returns the scan at `at_s` seconds after the first one, or the last one before, and the background at that time."""
+    """Returns the last scan up to `at_s` seconds after the first one, and the background at that time."""
     scan, background, begin_ns = None, None, None
     with scanhub.read(file, topics=["scan", "background"], sensor=sensor, config=config) as recording:
         # Without --sensor, the first sensor of the recording is used.
@@ -70,7 +70,7 @@ def main() -> None:
         print("the background is not learned yet: --config FILE with a smaller background.scans learns it earlier")
     else:
         ahead, left = points_m(background.ranges_m, background.angles)
-        # An infinite range means that the background is out of range.
+        # An infinite range means that the background is beyond the maximum range, so omit it from the picture.
         is_near = np.isfinite(ahead)
         axes.plot(left[is_near], ahead[is_near], "-", color="silver", linewidth=4, label="background")
     ahead, left = points_m(scan.ranges_m, scan.angles)

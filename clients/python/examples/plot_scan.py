@@ -53,7 +53,7 @@ def main() -> None:
         if options.output:
             figure.savefig(options.output, dpi=120)
             break
-        # Drawing takes longer than a scan: scans that arrive meanwhile are counted as missed.
+        # Drawing takes longer than a scan. Scans that arrive in this time are counted as missed.
         plt.pause(0.001)
         if not plt.fignum_exists(figure.number):
             break

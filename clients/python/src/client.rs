@@ -1,8 +1,8 @@
 //! Interface to the client library: subscriptions to several topics or to the verdict of a robot, and the samples that
 //! a program keeps.
 //!
-//! A program may use a subscription, and drop its samples, in any thread. Both are `Send` but not `Sync`, so a mutex
-//! protects each.
+//! A program may use a subscription, and drop samples, in any thread. Subscriptions and samples are `Send` but not
+//! `Sync`, so each of them is in a mutex.
 #![allow(unsafe_code)]
 
 use std::collections::VecDeque;
@@ -27,14 +27,14 @@ use crate::sample::{Memory, Sample};
 
 type ClientError = scanhub_client::Error;
 
-/// Maximum duration of one wait. Afterwards, the caller handles signals.
+/// Maximum duration of one wait in the client library. Between two waits, the caller handles signals.
 const MAX_WAIT: Duration = Duration::from_millis(100);
 
-/// Time after which the program gets a warning about topics without a first sample, if there is a reason for the
-/// silence.
+/// Time from the start of a subscription until the program gets a warning about topics without a first sample, if there
+/// is a reason for the silence.
 const WARN_AFTER: Duration = Duration::from_secs(2);
 
-/// Interval of the checks for the reason, after the first one has found none.
+/// Interval at which the check for a reason is repeated, after the first check has found none.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Topic of a sensor.
@@ -44,7 +44,7 @@ pub(crate) struct Name {
     pub(crate) topic: Topic,
 }
 
-/// Domain as the program names it.
+/// Domain and root directory as the program names them.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct DomainOptions {
     pub(crate) domain: Option<String>,
@@ -73,8 +73,8 @@ impl DomainOptions {
     }
 }
 
-/// Cell with a value that one thread at a time uses. A child after `fork` neither uses nor drops the value, because it
-/// belongs to the parent.
+/// Cell with a value that one thread at a time uses. A child after `fork` neither uses nor drops the value, because the
+/// value belongs to the parent.
 pub(crate) struct ForkSafeCell<T> {
     value: Mutex<Option<T>>,
     process: u32,
@@ -104,8 +104,8 @@ impl<T> ForkSafeCell<T> {
         self.process == process::id()
     }
 
-    /// Waits until other threads have finished with the value, and calls `apply` with it. Returns `None` if the value
-    /// was taken or belongs to the parent.
+    /// Waits until other threads have finished with the value, and calls `apply` with the value. Returns `None` if the
+    /// value was taken or belongs to the parent.
     pub(crate) fn with<R>(&self, apply: impl FnOnce(&mut T) -> R) -> Option<R> {
         // Do not lock in a child, because a thread of the parent may have held the lock at the fork.
         if self.is_own() { self.lock().as_mut().map(apply) } else { None }
@@ -129,7 +129,7 @@ impl<T> Drop for ForkSafeCell<T> {
     }
 }
 
-/// Reservation of a [`ForkSafeCell`] value.
+/// Reservation of the value in a [`ForkSafeCell`], until it is dropped.
 pub(crate) struct Reservation<'a>(&'a AtomicBool);
 
 impl Drop for Reservation<'_> {
@@ -143,13 +143,14 @@ pub(crate) trait PollableSource: Sized + Send {
     /// Received item.
     type Item;
 
-    /// Returns the next item that has arrived. `None` while notices must be taken first.
+    /// Returns the next item that has arrived. Returns `None` if no item has arrived, or if notices must be taken
+    /// first.
     fn try_next(&mut self) -> Result<Option<Self::Item>, Error>;
 
     /// Sleeps until an item may have arrived, for at most `longest` and at most 0.1 s.
     fn wait(&mut self, longest: Duration) -> Result<(), Error>;
 
-    /// Changes the method of waiting to events, and returns the descriptor to poll.
+    /// Changes the method of waiting to events, if no method was chosen yet, and returns the descriptor to poll.
     fn descriptor(&mut self) -> Result<i32, Error>;
 
     /// Leaves the domain permanently.
@@ -161,8 +162,8 @@ pub(crate) trait PollableSource: Sized + Send {
     /// Returns whether a hub or listener publishes in the domain, as of the last check.
     fn hub_is_running(&self) -> bool;
 
-    /// Returns the time since the last sample, or since the start if there was none. Includes the time that the machine
-    /// was suspended.
+    /// Returns the time since the last sample, or since the start if there was no sample. The result includes time
+    /// during which the machine was suspended.
     fn silent_for(&self) -> Duration;
 
     /// Returns the oldest notice about the hub that was not returned yet.
@@ -170,20 +171,21 @@ pub(crate) trait PollableSource: Sized + Send {
         None
     }
 
-    /// Returns the time of the next check for a warning. `None` after the warning, and if there is nothing to warn
-    /// about.
+    /// Returns the time of the next check for a warning. It is `None` after the warning, and if there is nothing to
+    /// warn about.
     fn warn_at(&mut self) -> &mut Option<Instant>;
 
-    /// Returns the distinct reasons why nothing was received since the start. Empty if nothing is wrong. A subscription
-    /// to several topics checks those without a first sample.
+    /// Returns the distinct reasons why nothing was received since the start. The list is empty if nothing is wrong. A
+    /// subscription to several topics checks the topics without a first sample.
     fn why_silent(&mut self) -> Vec<Silence>;
 
-    /// Returns the time until [`warning`](Self::warning) must be called, if it may return a reason.
+    /// Returns the time until [`warning`](Self::warning) must be called, or `None` if no check for a warning is
+    /// scheduled.
     fn warning_due(&mut self) -> Option<Duration> {
         self.warn_at().map(|at| at.saturating_duration_since(Instant::now()))
     }
 
-    /// Returns the reason why nothing was received, once, after [`WARN_AFTER`].
+    /// Returns the reason why nothing was received, as a warning. Returns it only once, and only after [`WARN_AFTER`].
     fn warning(&mut self) -> Option<Error> {
         self.warn_at().take_if(|at| *at <= Instant::now())?;
         let reason = Error::of_silence(&self.why_silent());
@@ -193,7 +195,7 @@ pub(crate) trait PollableSource: Sized + Send {
         reason
     }
 
-    /// Returns the error after a silence of `timeout` seconds.
+    /// Returns the error for a silence of `timeout` seconds.
     fn silence(&mut self, timeout: f64) -> Error {
         Error::new("Silent", format!("no verdict in {timeout} s"), "")
     }
@@ -203,15 +205,15 @@ pub(crate) trait PollableSource: Sized + Send {
 pub(crate) struct Topics {
     session: Session,
     sources: Vec<TopicState>,
-    /// Index of the source that is polled next. Sources take turns, so that no topic waits for the samples of another
-    /// one.
+    /// Index of the source that is polled next. The sources are polled in turn, so that a topic with many samples does
+    /// not delay the samples of other topics.
     next_source: usize,
     wait: Option<Wait>,
     /// Descriptor to poll, if the subscription waits by event.
     descriptor: Option<Arc<OwnedFd>>,
     notices: VecDeque<&'static str>,
-    /// Time of the next check for a warning; `None` before the first check, after the warning, and when all topics have
-    /// had a sample.
+    /// Time of the next check for a warning; `None` before the method of waiting is set, after the warning, and when
+    /// all topics have had a sample.
     warn_at: Option<Instant>,
     has_left: bool,
 }
@@ -248,7 +250,7 @@ impl Topics {
             if !self.notices.is_empty() {
                 return Ok(None);
             }
-            // Receive samples before the check for the hub, because the check takes longer.
+            // Receive samples before the check for the hub, because the check takes longer than receiving a sample.
             if let Some(received) = self.receive(true)? {
                 return Ok(Some(received));
             }
@@ -308,7 +310,7 @@ impl Topics {
         Ok(None)
     }
 
-    /// Sets the method of waiting, at the first check.
+    /// Sets the method of waiting, and starts the time until a warning.
     fn begin(&mut self, wait: Wait) {
         (self.wait, self.warn_at) = (Some(wait), Some(Instant::now() + WARN_AFTER));
     }
@@ -320,12 +322,13 @@ impl Topics {
     /// Returns the distinct reasons for the silence of the sources for which `is_checked` returns true.
     fn reasons(&mut self, is_checked: impl Fn(&TopicState) -> bool) -> Vec<Silence> {
         let mut reasons = Vec::new();
-        // Check first, because the sources check for the hub too, but queue no notices. They return the same errors.
+        // Check for the hub first, because the sources also check for it, but queue no notices. An error is ignored
+        // here, because the sources return the same error.
         let _ = self.check_hub();
         for followed in self.sources.iter_mut().filter(|followed| is_checked(followed)) {
             match followed.source.why_silent(&mut self.session) {
                 Silence::Waiting => {}
-                // This reason applies to all sources.
+                // This reason applies to all sources, so the others need no check.
                 reason @ (Silence::NoHub { .. } | Silence::OtherUser { .. }) => return vec![reason],
                 reason if reasons.contains(&reason) => {}
                 reason => reasons.push(reason),
@@ -420,7 +423,7 @@ impl PollableSource for Topics {
     fn why_silent(&mut self) -> Vec<Silence> {
         let mut reasons = self.reasons(|followed| followed.is_first);
         if self.sources.iter().any(|followed| !followed.is_first) {
-            // If the hub has run before, `on_notice` reports its end.
+            // A topic has had a sample, so a hub has run. Its end is reported by `on_notice`, not by a warning.
             reasons.retain(|reason| !matches!(reason, Silence::NoHub { .. } | Silence::OtherUser { .. }));
         }
         reasons
@@ -446,7 +449,8 @@ impl PollableSource for Topics {
     }
 }
 
-/// Payload of a sample in shared memory. The sample is released when this is dropped, except in a child after `fork`.
+/// Payload of a sample in shared memory. The sample is released when this object is dropped, except in a child after
+/// `fork`.
 pub(crate) struct SharedPayload {
     /// Address of the payload.
     address: usize,
@@ -462,7 +466,8 @@ impl SharedPayload {
         &self.words()[..self.len]
     }
 
-    /// Returns the used bytes, and those that fill the last word of a payload of variable length.
+    /// Returns the used bytes of the payload, and for a payload of variable length also the bytes that fill its last
+    /// word.
     pub(crate) fn words(&self) -> &[u8] {
         let len = if self.is_slice { self.len.next_multiple_of(8) } else { self.len };
         // SAFETY: `_sample` is kept until `self` is dropped. Until then, its payload in shared memory does not move,
@@ -476,9 +481,9 @@ pub(crate) struct Verdicts {
     sensors: Vec<String>,
     domain_options: DomainOptions,
     early: bool,
-    /// Subscriber that waits without a descriptor; `None` after it has left.
+    /// Subscriber that waits without a descriptor; `None` if it was replaced by `pollable`, or has left.
     robot: Option<RobotSubscriber>,
-    /// Subscriber that replaces `robot` if the program polls.
+    /// Subscriber that replaces `robot` if the program polls a descriptor.
     pollable: Option<PollableSubscriber<Robot>>,
     wait: Option<Wait>,
     /// Time of the next check for a warning; `None` after the warning, and after a verdict other than unknown.
@@ -557,7 +562,7 @@ impl PollableSource for Verdicts {
 
     fn descriptor(&mut self) -> Result<i32, Error> {
         if self.wait.is_none() {
-            // Nothing was received yet, so the new subscriber misses nothing.
+            // Nothing was received yet, so the new subscriber misses no verdict.
             if self.robot.is_some() {
                 let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
                 self.pollable = Some(builder(&sensors, &self.domain_options, self.early).open_pollable()?);
@@ -620,7 +625,7 @@ impl Mount {
         Ok(Mount(Publication::in_domain(&domain_options.publish_domain()?, name)?))
     }
 
-    /// Publishes the angle as of `stamp_ns` of CLOCK_MONOTONIC. `None` means now.
+    /// Publishes the angle of the mount at `stamp_ns` of CLOCK_MONOTONIC. `None` means now.
     pub(crate) fn send(&mut self, stamp_ns: Option<u64>, tilt: Tilt) -> Result<(), Error> {
         let fill = |sample: &mut Tilt| *sample = tilt;
         Ok(match stamp_ns {
@@ -668,7 +673,7 @@ impl From<ClientError> for Error {
 }
 
 impl Error {
-    /// Returns the error for a silence with these reasons. `None` without a reason.
+    /// Returns the error for a silence with these reasons, or `None` if there is no reason.
     fn of_silence(reasons: &[Silence]) -> Option<Error> {
         let class = match reasons.first()? {
             Silence::NoHub { .. } | Silence::OtherUser { .. } => "NoHub",

@@ -24,7 +24,8 @@ impl Error {
         Error { message: format!("{what}: {}", self.message), ..self }
     }
 
-    /// Issues the warning `SilenceWarning`. Returns it as an error if the program treats warnings as errors.
+    /// Issues this error as the warning `SilenceWarning`. Returns an exception if the program treats warnings as
+    /// errors.
     pub(crate) fn warn(&self, py: Python<'_>) -> PyResult<()> {
         let text = format!("nothing yet: {}\n  {}", self.message, self.remedy);
         let category = PyModule::import(py, "scanhub.errors")?.getattr("SilenceWarning")?;

@@ -29,7 +29,7 @@ use sample::Sample;
 
 #[pymodule]
 fn _scanhub(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    // Import it now, because an import with the first array would delay the first sample.
+    // Import numpy now, because an import when the first array is created would delay the first sample.
     module.py().import("numpy")?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("__commit__", env!("SCANHUB_COMMIT"))?;
@@ -69,7 +69,8 @@ fn topic_names(
     Ok(py.detach(|| client::topics(&DomainOptions { domain, root }))?)
 }
 
-/// Sends a request to the hub, and returns the background model in its reply, if it has one.
+/// Sends a request to the hub, and returns the background model in the hub's reply, or `None` if the reply has no
+/// model.
 #[pyfunction]
 #[pyo3(name = "_request")]
 fn request(
@@ -98,8 +99,8 @@ fn request(
     model.map(|model| topics::wrap(py, model)).transpose()
 }
 
-/// Returns the result of `work`, which runs in another thread, because only the main thread handles signals, and it
-/// must not wait for long. The thread continues after a signal that raises an exception.
+/// Runs `work` in another thread, and returns its result. Only the main thread handles signals, so the main thread must
+/// not wait for long. If a signal raises an exception, the other thread continues.
 fn interruptible<T: Send + 'static>(
     py: Python<'_>,
     work: impl FnOnce() -> T + Send + 'static,
@@ -119,7 +120,7 @@ fn interruptible<T: Send + 'static>(
     }
 }
 
-/// Interval at which signals are handled while the package works.
+/// Interval at which signals are handled while this module works for a long time.
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Published angles of a mount.

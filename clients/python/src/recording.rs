@@ -16,7 +16,7 @@ use crate::error::{Error, value};
 use crate::sample::{Memory, Sample, array, shaped};
 use crate::{SIGNAL_INTERVAL, interruptible, topics};
 
-/// Samples of a recording. Iterate over it.
+/// Recording whose samples are computed. Iterate over the object to get the samples.
 #[pyclass(frozen, module = "scanhub")]
 pub(crate) struct Recording {
     reader: ForkSafeCell<RecordingReader>,
@@ -55,7 +55,7 @@ impl Recording {
         let family = family.transpose()?;
         let (path, read) = (file.clone(), topics.clone());
         let opened = interruptible(py, move || {
-            // The same default as `scanhub replay`.
+            // The default configuration files are the same as for `scanhub replay`.
             let named = || std::env::var_os("SCANHUB_CONFIG").filter(|file| !file.is_empty());
             let mut files = if system_config { Sources::system() } else { Vec::new() };
             files.extend(config.or_else(|| named().map(PathBuf::from)));
@@ -70,7 +70,7 @@ impl Recording {
         Ok(Recording { reader: ForkSafeCell::new(reader), file, topics, sensors, problems })
     }
 
-    /// Names of the sensors that are read.
+    /// Names of the sensors whose samples are read.
     #[getter]
     fn sensors<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
         PyTuple::new(py, &self.sensors)
@@ -89,7 +89,7 @@ impl Recording {
     fn __next__(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
         let _reserved = self.reader.reserve()?;
         let mut next = None;
-        // The iteration of a closed recording ends.
+        // If the recording is closed, `next` stays empty and the iteration ends.
         let _is_open = self.read(py, |sample| {
             next = Some(sample);
             false
@@ -144,8 +144,8 @@ impl Recording {
 }
 
 impl Recording {
-    /// Passes samples to `take` until it returns false, or to the end. Handles signals in between. Returns false if the
-    /// recording is closed. Fails once if the file has become shorter.
+    /// Passes samples to `take` until `take` returns false, or until the end of the recording. Handles signals in
+    /// between. Returns false if the recording is closed. At the end, fails once if the file has become shorter.
     fn read(&self, py: Python<'_>, mut take: impl FnMut(ReadSample) -> bool + Send) -> PyResult<bool> {
         let mut read_slice = |reader: &mut RecordingReader| {
             let until = Instant::now() + SIGNAL_INTERVAL;
@@ -189,7 +189,8 @@ fn sample_of(sample: ReadSample) -> Sample {
     Sample { name: Name { sensor, topic }, header, missed: 0, restarted: false, stale: false, memory }
 }
 
-/// Returns the error for a recording that cannot be read. Its message and remedy name arguments of Python.
+/// Returns the error for a recording that cannot be read. The message and the remedy name arguments of Python instead
+/// of options of the program.
 fn refusal(failure: Failure) -> Error {
     let (message, hint) = (in_python(&failure.message), in_python(&failure.hint));
     match failure.kind {
@@ -198,7 +199,7 @@ fn refusal(failure: Failure) -> Error {
     }
 }
 
-/// Returns `text` with arguments of `scanhub.read` in place of options of the program.
+/// Replaces options of the program in `text` by arguments of `scanhub.read`.
 fn in_python(text: &str) -> String {
     let text = text
         .replace("play one of them: --sensor NAME", "read one of them: sensor=\"NAME\"")
@@ -220,7 +221,7 @@ fn in_python(text: &str) -> String {
     python
 }
 
-/// Scans as rows of arrays. Rows are as long as the longest one, and filled up with NaN.
+/// Scans as rows of arrays. All rows are as long as the longest scan, and shorter scans are filled with NaN.
 #[derive(Default)]
 struct Scans {
     stamps: Vec<i64>,
@@ -235,7 +236,7 @@ struct Scans {
 enum Angles {
     #[default]
     Unknown,
-    /// One row for all scans, which have these values of `first_angle` and `step`.
+    /// One row for all scans. The two numbers are `first_angle` and `step`, which are the same in all scans.
     Same(f64, f64, Vec<f64>),
     PerScan(Rows),
 }
@@ -281,7 +282,7 @@ impl Scans {
     }
 }
 
-/// Table whose rows are as long as the longest one.
+/// Table whose rows have the same length. Shorter rows are filled with NaN.
 #[derive(Default)]
 struct Rows {
     values: Vec<f64>,

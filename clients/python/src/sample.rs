@@ -46,8 +46,8 @@ impl Memory {
     }
 }
 
-/// Implements the properties of a class, and then its methods. Each property is an expression that uses the object, the
-/// sample and its payload.
+/// Implements the properties of a class, and then the methods after the `+`. Each property is an expression that uses
+/// the object, the sample and the payload of the sample.
 #[macro_export]
 macro_rules! getters {
     (
@@ -73,12 +73,12 @@ macro_rules! getters {
     };
 }
 
-/// A sample of any topic. Its payload stays in shared memory until the sample and all of its arrays are dropped.
+/// A sample of any topic. The payload stays in shared memory until the sample and all of its arrays are dropped.
 #[pyclass(subclass, frozen, module = "scanhub")]
 #[derive(Clone)]
 pub(crate) struct Sample {
     pub(crate) name: Name,
-    /// Header of the sample. In a silence of zones, that of the last sample.
+    /// Header of the sample. For zones that are unknown because of a silence, it is the header of the last sample.
     pub(crate) header: Header,
     pub(crate) missed: u64,
     pub(crate) restarted: bool,
@@ -97,7 +97,7 @@ getters! {
     missed: u64 = sample.missed;
     /// Whether another run of the hub sent the previous sample, so that the numbers started again.
     restarted: bool = sample.restarted;
-    /// Number of the telegram, per sensor and run of the hub, from 0. A status has that of the last telegram.
+    /// Number of the telegram, per sensor and run of the hub, from 0. A status has the number of the last telegram.
     seq: u64 = header.seq;
     /// Number of the sample in its topic, from 0. A gap means missed samples.
     topic_seq: u64 = header.topic_seq;
@@ -117,12 +117,12 @@ getters! {
     flags: PyResult<Bound<'py, PyFrozenSet>> = PyFrozenSet::new(slf.py(), Flags::names(header.flags));
     /// Nominal period of the scans in microseconds; None if unknown.
     period_us: Option<u32> = Some(header.period_us).filter(|period_us| *period_us != 0);
-    /// Time from the telegram's last byte until the sample was sent, in steps of 256 ns; None if unknown or more than 4
-    /// s.
+    /// Time from the telegram's last byte until the sample was sent, in steps of 256 ns; None if the time is unknown or
+    /// more than 4 s.
     hub_time_ns: Option<u64> = header.hub_time_ns();
 
     + {
-        /// Returns the same sample with a payload of its own, which can be kept and pickled.
+        /// Returns a copy of the sample with its own payload. The copy can be kept and pickled.
         fn copy(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
             let memory = Arc::new(Memory::copy_of(self.memory.bytes()));
             topics::wrap(py, Sample { memory, ..self.clone() })
@@ -165,7 +165,7 @@ impl Sample {
     }
 }
 
-/// Creates the sample that was pickled.
+/// Creates a sample again from the values that were pickled.
 #[pyfunction]
 #[pyo3(name = "_restore")]
 pub(crate) fn restore(
@@ -236,7 +236,7 @@ impl Array {
     }
 }
 
-/// Returns a view of `elements`, which are in the payload of `sample`. It cannot be written.
+/// Returns a view of `elements`, which are in the payload of `sample`. The view is read-only.
 pub(crate) fn view<'py, T: Element>(
     py: Python<'py>,
     sample: &Sample,
@@ -245,7 +245,8 @@ pub(crate) fn view<'py, T: Element>(
     strided(py, sample, elements, T::KIND, vec![elements.len()], None)
 }
 
-/// Returns a view of a part of `elements`, which are in the payload of `sample`. It starts at `elements`.
+/// Returns a read-only view of parts of `elements`, which are in the payload of `sample`. The view starts at the first
+/// byte of `elements`.
 pub(crate) fn strided<'py, T>(
     py: Python<'py>,
     sample: &Sample,

@@ -11,7 +11,7 @@ use crate::client::{DomainOptions, ForkSafeCell, PollableSource, Topics, Verdict
 use crate::error::{Error, value};
 use crate::{parse, topics};
 
-/// Returns the next item, and waits if none has arrived. `None` if the subscription is closed.
+/// Returns the next item, and waits if no item has arrived. Returns `None` if the subscription is closed.
 fn next<F: PollableSource>(
     py: Python<'_>,
     this: &Arc<ForkSafeCell<F>>,
@@ -43,9 +43,9 @@ fn poll<F: PollableSource>(
     this: &Arc<ForkSafeCell<F>>,
     notice: Option<&Py<PyAny>>,
 ) -> PyResult<Option<F::Item>> {
-    // The callback may close the subscription.
+    // Check each time, because the callback may close the subscription.
     while is_open(this) {
-        // Warn first, because a topic can be silent while another one always has samples.
+        // Warn before receiving, because a topic can be silent while another topic always has samples.
         warn(py, this)?;
         let item = this.with(F::try_next).transpose()?.flatten();
         if item.is_some() || !notify(py, this, notice)? {
@@ -116,11 +116,12 @@ macro_rules! subscriber {
             /// Whether a hub or listener publishes in the domain, as of the last check.
             #[getter]
             fn hub_is_running(&self, py: Python<'_>) -> bool {
-                // A waiting thread can hold the lock for a tenth of a second.
+                // Release the interpreter, because a waiting thread can hold the lock for a tenth of a second.
                 py.detach(|| self.source.with(|source| source.hub_is_running())).unwrap_or_default()
             }
 
-            /// Seconds since the last sample; if there was none, since the start. Time in suspend counts.
+            /// Returns the number of seconds since the last sample, or since the start if there was no sample. The
+            /// number includes time during which the machine was suspended.
             fn silent_for(&self, py: Python<'_>) -> Result<f64, Error> {
                 let silent_for = |source: &mut _| (!PollableSource::has_left(source)).then(|| PollableSource::silent_for(source));
                 let silent_for = py.detach(|| self.source.with(silent_for)).flatten();
@@ -160,7 +161,7 @@ macro_rules! subscriber {
     };
 }
 
-/// Subscription to topics. Iterate over it, with `for` or with `async for`.
+/// Subscription to topics. Iterate over its samples, with `for` or with `async for`.
 #[pyclass(subclass, frozen, module = "scanhub._scanhub")]
 pub(crate) struct Subscriber {
     source: Arc<ForkSafeCell<Topics>>,
@@ -194,7 +195,7 @@ subscriber! {
     }
 }
 
-/// Subscription to the verdict of a robot. Iterate over it, with `for` or with `async for`.
+/// Subscription to the verdict of a robot. Iterate over its verdicts, with `for` or with `async for`.
 #[pyclass(subclass, frozen, module = "scanhub._scanhub")]
 pub(crate) struct RobotSubscriber {
     source: Arc<ForkSafeCell<Verdicts>>,

@@ -1,5 +1,5 @@
-//! Classes of the samples, one for each topic. Scalars are read from shared memory, and arrays are views of it. Lists
-//! and tables are copies, whose elements are the named tuples of `scanhub.values`.
+//! Classes of the samples, one for each topic. Scalars are read from shared memory. Arrays are views of shared memory,
+//! except those that are marked as computed. Lists are copies, whose elements are the named tuples of `scanhub.values`.
 
 use bytemuck::cast_slice;
 use pyo3::prelude::*;
@@ -20,7 +20,7 @@ macro_rules! classes {
             pub(crate) struct $class;
         )*
 
-        /// Creates the sample's object, of the class of its topic.
+        /// Creates the Python object of a sample. Its class is that of the sample's topic.
         pub(crate) fn wrap(py: Python<'_>, sample: Sample) -> PyResult<Py<PyAny>> {
             match sample.name.topic {
                 $(Topic::$topic => Ok(Py::new(py, (PyClassInitializer::from(sample).add_subclass($class)))?.into_any()),)*
@@ -97,9 +97,9 @@ impl From<u32> for Millimeters {
 
 getters! {
     Telegram(slf, sample: slf.as_super().get(), frame) = Frame::of(sample.header.family, sample.memory.bytes());
-    /// Family of the scanner, such as `lms`; None if this version does not know it.
+    /// Family of the scanner, such as `lms`; None if this version does not support the family.
     family: Option<&'static str> = sample.header.family().map(Family::name);
-    /// The bytes: a view.
+    /// The bytes of the telegram or packets: a view.
     data: Object<'py> = view(slf.py(), sample, sample.memory.bytes());
     /// Number of packets; None for an LMS.
     packets: Option<usize> = Some(frame?.packets()?.packets);
@@ -113,7 +113,7 @@ getters! {
 
 getters! {
     Scan(slf, sample: slf.as_super().get(), scan) = client::Scan::of_words(cast_slice(sample.memory.words()));
-    /// Family of the scanner, such as `lms`; None if this version does not know it.
+    /// Family of the scanner, such as `lms`; None if this version does not support the family.
     family: Option<&'static str> = Family::of_number(scan.family).map(Family::name);
     /// Number of beams.
     count: usize = scan.beams();
@@ -127,7 +127,7 @@ getters! {
     spacing: f32 = scan.spacing;
     /// Time from one beam to the next in ns.
     beam_time_ns: u32 = scan.beam_time_ns;
-    /// Bits of an intensity; 0 if there are none.
+    /// Bits of an intensity; 0 if the scan has no intensities.
     intensity_bits: u8 = scan.intensity_bits;
     /// Number of points that were dropped because another point has the same beam.
     collisions: u16 = scan.collisions;
@@ -161,7 +161,8 @@ getters! {
         };
         (scan.intensity_bits != 0).then(intensities).transpose()
     };
-    /// Bytes next to the ranges, intensities or field bits: a view. None if the scanner does not send them.
+    /// One more byte for each range, with intensities or field bits: a view. None if the scanner does not send such
+    /// bytes.
     upper: OptionalObject<'py> = {
         let has_upper = scan.contents & client::ArrayFlags::UPPER != 0;
         has_upper.then(|| view(slf.py(), sample, scan.upper())).transpose()
@@ -227,25 +228,25 @@ getters! {
     Motion(slf, sample: slf.as_super().get(), motion) = fixed::<client::Motion>(sample);
     /// Method by which the step was found: `first`, `refused`, `beams`, `points`, `lines` or `both`.
     method: &'static str = motion.method().name();
-    /// Step from the previous scan; None if there is none.
+    /// Step from the previous scan; None if there is no step.
     step: OptionalObject<'py> = {
         let fields = (motion.dx_m, motion.dy_m, motion.dyaw_rad);
         motion.has_step().then(|| value(slf.py(), "Step", fields)).transpose()
     };
-    /// Covariance of the step, 3 x 3; None if there is none.
+    /// Covariance of the step, 3 x 3; None if there is no step.
     covariance: OptionalObject<'py> = motion.has_step().then(|| matrix(slf.py(), &motion.covariance)).transpose();
     /// Share of the readings that are on surfaces of the previous scan; None if there is no step.
     overlap: Option<f32> = Some(motion.overlap).filter(|_| motion.has_step());
-    /// Sum of all steps; None if it is unknown.
+    /// Sum of all steps; None if the sum is unknown.
     place: OptionalObject<'py> = {
         let fields = (motion.x_m, motion.y_m, motion.yaw_rad);
         motion.has_pose().then(|| value(slf.py(), "Place", fields)).transpose()
     };
-    /// Covariance of `place`, 3 x 3; None if it is unknown.
+    /// Covariance of `place`, 3 x 3; None if the covariance is unknown.
     pose_covariance: OptionalObject<'py> = motion.sum_covariance().map(|covariance| matrix(slf.py(), covariance)).transpose();
     /// Whether `place` is known, and contains no degenerate step.
     valid: bool = motion.has_valid_pose();
-    /// Whether the surroundings leave a direction open, as a corridor does.
+    /// Whether the surroundings do not show how far the robot moved in some direction, as in a corridor.
     degenerate: bool = motion.is_degenerate();
     /// Number of refused steps since the start.
     refused_steps: u16 = motion.refused_steps;
@@ -273,9 +274,9 @@ getters! {
     stale: bool = sample.stale;
     /// `clear`, `slow`, `stop` or `unknown`. Treat `unknown` as `stop`.
     verdict: &'static str = Verdict::name(zones.verdict());
-    /// Beam of the point nearest to the robot's center; None if there is none.
+    /// Beam of the point nearest to the robot's center; None if no beam has a reading.
     nearest_beam: Option<u16> = Some(zones.nearest()?.0);
-    /// Distance of this point from the center in mm; None if there is none.
+    /// Distance of this point from the center in mm; None if no beam has a reading.
     nearest_mm: Option<u32> = Some(zones.nearest()?.1);
     /// The zones, the largest first.
     zones: List<'py> = values(slf.py(), zones.zones().iter(), |zone| {
@@ -283,7 +284,7 @@ getters! {
         });
     /// Number of beams without a reading that cross the largest zone.
     invalid_beams: u16 = zones.invalid_beams;
-    /// Whether there were fewer scans than a violation requires.
+    /// Whether there were fewer scans than a violation requires, so that no zone can be violated yet.
     provisional: bool = zones.flags & client::Zones::PROVISIONAL != 0;
 }
 
@@ -429,17 +430,17 @@ getters! {
 
 getters! {
     Event(slf, sample: slf.as_super().get(), event) = fixed::<client::Event>(sample);
-    /// `appeared`, `left` or `door`; None if this version does not know it.
+    /// Kind of the event: `appeared`, `left` or `door`; None if this version does not support the kind.
     kind: Option<&'static str> = event.kind().map(|kind| kind.name());
     /// ID of the track.
     id: u64 = event.id;
     /// Room of the person after the event; None outside of all rooms.
     room: Option<&'a str> = event.room_name();
-    /// Door of an event of kind `door`.
+    /// Name of the door; None for other events.
     door: Option<&'a str> = Some(event.door()?.0);
-    /// Room on this side of the door, or `outside`.
+    /// Room from which the person came, or `outside`; None for other events.
     from_room: Option<&'a str> = Some(event.door()?.1);
-    /// Room on the other side of the door, or `outside`.
+    /// Room to which the person went, or `outside`; None for other events.
     to_room: Option<&'a str> = Some(event.door()?.2);
 }
 
@@ -451,7 +452,7 @@ getters! {
     rate_rad_s: Option<f64> = tilt.rate_rad_s();
 }
 
-/// Bytes of a point.
+/// Number of bytes of a point in the payload.
 const POINT_LEN: usize = size_of::<client::CloudPoint>();
 
 getters! {

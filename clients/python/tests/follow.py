@@ -1,5 +1,5 @@
-"""Subscribes to topics, and prints each sample as `scanhub echo --json` does, and notices. Arguments are domain, root and
-topics. Ctrl-C ends the program, which prints that."""
+"""Subscribes to topics, and prints each sample as `scanhub echo --json` does, and notices. Arguments are domain, root
+and topics. Ctrl-C ends the program, which then prints a last line."""
 
 import json
 import math
@@ -173,7 +173,8 @@ def status(sample: scanhub.Status) -> dict:
 
 
 def say(line: dict) -> None:
-    """Writes with one system call that Ctrl-C does not interrupt, so that a full pipe gets no partial line."""
+    """Writes a line with one system call that Ctrl-C does not interrupt, so that no partial line is written into a full
+    pipe."""
     written = (json.dumps(line) + "\n").encode()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     assert os.write(sys.stdout.fileno(), written) == len(written)

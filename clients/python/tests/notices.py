@@ -1,5 +1,6 @@
 """Subscribes with a callback that fails when the hub ends. Arguments are domain and root. `front` publishes its status,
-and its hub ends after this program has printed a line. The program reads a line before and after that."""
+and its hub ends after this program has printed a line. The program waits for a line of stdin before it prints, and for
+another one after the hub has ended."""
 
 import select
 import sys
@@ -22,7 +23,7 @@ while not select.select([sys.stdin], [], [], 0.05)[0]:
 sys.stdin.readline()
 print('{"class": "waits"}', flush=True)
 sys.stdin.readline()
-# After this time, the subscription checks again whether its hub runs.
+# Wait until the subscription checks again whether its hub runs.
 time.sleep(1.2)
 try:
     next(statuses)

@@ -1,5 +1,5 @@
-"""Tests of programs that publish under their own names, start and end. Arguments are domain and root of a domain that no
-other program uses."""
+"""Tests of programs that publish under their own names, start and end. Arguments are domain and root of a domain that
+no other program uses."""
 
 import contextlib
 import os
@@ -43,7 +43,7 @@ def a_child_does_not_keep_the_name_of_one_that_is_killed() -> None:
         mount = publish()
         if os.fork() == 0:
             os.write(ready_write, b"!")
-            # Until the test ends it.
+            # Wait until the test ends this process.
             os.read(lives, 1)
             os._exit(0)
         signal.pause()

@@ -1,6 +1,6 @@
 """Publishes the angles of a mount. Arguments are domain, root and the name of the mount. Each line of stdin is a
-sample: angle, rate and stamp, 0 for now. It prints a line when it publishes and after each sample, and exits at the end
-of stdin."""
+sample: angle, rate and stamp, which is 0 for now. The program prints a line when it starts to publish and after each
+sample, and exits at the end of stdin."""
 
 import math
 import os
@@ -29,7 +29,7 @@ try:
         child = os.fork()
         if child == 0:
             refused(scanhub.Failure, lambda: mount.send(0.0))
-            # Exits as any program does. The publication belongs to the parent.
+            # The child exits as any program does. The publication belongs to the parent, so it must not end.
             sys.exit()
         assert os.waitpid(child, 0)[1] == 0
         print('{"class": "open"}', flush=True)

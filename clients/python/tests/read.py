@@ -43,7 +43,7 @@ def samples_are_those_of_a_subscription() -> None:
     assert {(of.sensor, of.topic) for of in samples} == {(a, b) for a in ("front", "rear") for b in ("scan", "zones")}
     scans = [of for of in samples if of.topic == "scan"]
     assert isinstance(scans[0], scanhub.Scan) and scans[0].flags == {"replayed"} and not scans[0].restarted
-    # In the order in which they were measured, by the clock of the recording.
+    # The scans are in the order in which they were measured, with stamps on the clock of the recording.
     ends = [of.stamp_last_ns for of in scans]
     assert ends == sorted(ends) and 1_000_000_000 < ends[0] < 1_100_000_000, ends[:3]
     assert all(of.wall_ns - of.stamp_ns == 1_700_000_000 * 10**9 for of in scans)
@@ -123,7 +123,7 @@ def remedies_are_what_python_takes() -> None:
     assert 'no scans; set=["link.front.mode=VALUE"]' in warning and not list(recording), warning
     recording, caught = warned(file=no_mode, set=["link.front.mode=1"], system_config=False)
     assert not caught and recording.to_numpy().ranges.shape == (9, 181)
-    # The name of a remote sensor, and that of its link.
+    # The recording names remote sensors, whose links have other names.
     remote = os.path.join(place, "remote.mcap")
     names = scanhub.read(remote).sensors
     assert names == ("robot1-front", "robot1-rear")

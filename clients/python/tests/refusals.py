@@ -66,7 +66,8 @@ def somebody_elses_domain() -> None:
 
 
 def hub_without_topics(pid: "int | None" = None) -> int:
-    """Holds the lock of a hub that has created all of its topics, by default of this process."""
+    """Takes the lock of a hub, as a hub that has created all of its topics. The lock names the process `pid`, or this
+    process."""
     os.makedirs(place, mode=0o700, exist_ok=True)
     lock = os.open(f"{place}/hub.lock", os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
     fcntl.fcntl(lock, fcntl.F_OFD_SETLK, struct.pack("hhqqi0q", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0))
@@ -115,7 +116,7 @@ def a_silent_topic_beside_others() -> None:
         begin = time.monotonic()
         tilts = scanhub.subscribe(*topics, domain=domain, root=root, timeout=20)
         assert tilts._poll() is None
-        # A sample has always arrived before the next call.
+        # Each sample has arrived before the next call, so the calls never find the queue empty.
         while not caught or time.monotonic() - begin < 4:
             while not mount.subscribers:
                 assert tilts._poll() is None
@@ -155,7 +156,7 @@ def no_notice_after_a_close() -> None:
         while not notices:
             assert tilts._poll() is None
         os.close(lock)
-        # The next check finds the end of one hub and the start of another.
+        # The next check of the subscription finds both the end of one hub and the start of another.
         lock = hub_without_topics(os.getppid())
         while len(notices) < 2:
             assert tilts._poll() is None
@@ -234,13 +235,13 @@ def finds_resource_shortages() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     mount = publish("other")
     subscription = scanhub.subscribe("other/tilt", domain=domain, root=root, timeout=1)
-    # One more port needs more than these.
+    # Another subscription or publication needs more descriptors than these.
     resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 6, before[1]))
     refused = [refusal(scanhub.Short, lambda: next(subscription)), refusal(scanhub.Short, publish)]
     resource.setrlimit(resource.RLIMIT_NOFILE, before)
     for failure in refused:
         assert "ulimit -n" in failure.remedy, failure
-    # A refused program has released the name.
+    # A refused publication has released the name.
     publish().close()
     follower = scanhub.subscribe("other/tilt", domain=domain, root=root, timeout=1)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))

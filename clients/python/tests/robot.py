@@ -1,6 +1,7 @@
-"""Subscribes to the verdict of a robot, and prints each verdict as a line of JSON. Arguments are domain, root and sensors,
-and optionally `--early` before them. One in ten verdicts is also requested with `now`, which never waits. Ctrl-C ends the program,
-which prints that. With `--asked` in place of sensors, prints the result of `now` for each line of stdin."""
+"""Subscribes to the verdict of a robot, and prints each verdict as a line of JSON. Arguments are domain, root and
+sensors, and optionally `--early` before them. Every tenth verdict is also requested with `now`, which never waits.
+Ctrl-C ends the program, which then prints a last line. With `--asked` in place of sensors, prints the result of `now`
+for each line of stdin."""
 
 import json
 import os
@@ -12,7 +13,7 @@ import scanhub
 
 
 def say(line: dict) -> None:
-    """Writes with one system call, so that Ctrl-C leaves no partial line."""
+    """Writes a line with one system call, so that Ctrl-C leaves no partial line."""
     written = (json.dumps(line) + "\n").encode()
     assert os.write(sys.stdout.fileno(), written) == len(written)
 

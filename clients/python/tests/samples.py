@@ -1,4 +1,4 @@
-"""Checks samples that are made from golden bytes of `schema`. The argument is the directory of these bytes."""
+"""Checks samples that are made from the golden files of `schema`. The argument is the directory of these files."""
 
 import sys
 from pathlib import Path
@@ -15,7 +15,7 @@ def golden(name: str) -> bytes:
 
 
 def sample(topic: str, name: str, cut: "int | None" = None):
-    """Returns a sample with golden header and payload, restored as a pickled sample is."""
+    """Returns a sample with the header and the payload of golden files, restored like a pickled sample."""
     state = (5, True, False)
     return scanhub._scanhub._restore("front", topic, golden("header"), golden(name)[:cut], state)
 
@@ -36,7 +36,8 @@ def payloads_say_what_they_are() -> None:
     assert (of.ranges[0], of.ranges[400], of.ranges.shape) == (0x1234, 0x1FFF, (401,))
     assert of.codes == [(400, "no_return")] and np.isnan(of.ranges_m[400]) and of.ranges_m[0] == 46.6
     assert np.isclose(of.angles[400], np.deg2rad(50), atol=1e-12) and of.exact_angles is None
-    # The first beam three turns before the last, whose stamp is 3.
+    # The beams come from four revolutions. Beam 400 belongs to the first revolution, and beam 3 to the last one. The
+    # stamp is 3.
     assert (of.times_ns[400], of.times_ns[3]) == (3 - 3 * 13_320_000, 3 - 397 * 9250)
 
     of = sample("scan", "scan_turn")

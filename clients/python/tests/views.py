@@ -19,7 +19,8 @@ import scanhub
 
 
 def mappings() -> list:
-    """The parts of shared memory that this process has mapped: first and last address, permissions, file."""
+    """Returns first address, last address, permissions and file of each shared-memory segment that this process has
+    mapped."""
     found = []
     with open("/proc/self/maps", encoding="utf-8") as lines:
         for line in lines:
@@ -73,7 +74,7 @@ def a_view_keeps_its_sample(scans: scanhub.Subscriber) -> None:
     kept, before = scan.ranges[100:200], scan.ranges[100:200].copy()
     seq = scan.topic_seq
     del scan
-    # Far more than the hub has slots for, if slots were not reused: the sample's own slot is not among them.
+    # Receive far more samples than the hub has slots. The hub reuses slots, but not the slot of the kept sample.
     for scan in scans:
         assert scan.ranges.ctypes.data + 200 != kept.ctypes.data
         if scan.topic_seq > seq + 60:
@@ -107,8 +108,8 @@ def other_threads_run_meanwhile(scans: scanhub.Subscriber) -> None:
         while time.monotonic() - begin < 0.5:
             next(scans)
         used = time.process_time() - used
-        # The other thread would hardly run if a wait held the lock of the interpreter. A thread that sleeps uses no CPU
-        # time. On a busy machine, neither may hold for a while.
+        # If a wait held the lock of the interpreter, the other thread would hardly run. If the wait did not sleep, it
+        # would use CPU time. On a busy machine, one of the conditions may be false for a while.
         if turns[0] > 50 and used < 0.4:
             break
         assert time.monotonic() < give_up_at, (turns, used)
@@ -122,7 +123,7 @@ def a_child_takes_nothing_from_its_parent(scans: scanhub.Subscriber) -> None:
     child = os.fork()
     if child == 0:
         del scan, kept, scans
-        # Exits as a program does. multiprocessing would skip the interpreter's shutdown.
+        # The child exits as a program does. A child of multiprocessing would skip the shutdown of the interpreter.
         sys.exit(0)
     assert os.waitpid(child, 0)[1] == 0
     for _ in range(20):
@@ -176,7 +177,7 @@ def a_sample_is_dropped_while_another_thread_waits(_: scanhub.Subscriber) -> Non
         received: list[float] = []
         thread = threading.Thread(target=lambda: received.append(next(tilts).angle_rad))
         thread.start()
-        # The call reserves the subscription as `next` does, and holds the lock of the interpreter.
+        # This call reserves the subscription like `next`, but holds the lock of the interpreter.
         until(lambda: "another thread" in refuses(scanhub.Failure, tilts._descriptor))
         kept.clear()
         mount.send(4.0)
@@ -192,7 +193,7 @@ def two_threads_at_a_time_are_refused(scans: scanhub.Subscriber) -> None:
         waits.set()
         may_continue.wait()
 
-    # `next` calls `notice`, because it finds the hub, and then waits.
+    # `next` finds the hub, so it calls `notice` and then waits.
     nothing = subscribe("nobody/scan", timeout=0.1, on_notice=notice)
     thread = threading.Thread(target=lambda: refused.append(refuses(scanhub.Silent, lambda: next(nothing))))
     thread.start()
@@ -201,7 +202,7 @@ def two_threads_at_a_time_are_refused(scans: scanhub.Subscriber) -> None:
     may_continue.set()
     thread.join()
     assert "another thread" in text and "nobody" in refused[0], (text, refused)
-    # Threads may use the object one after the other.
+    # Several threads may use the same object one after the other.
     next(scans)
     thread = threading.Thread(target=lambda: refused.append(next(scans).sensor))
     thread.start()
@@ -262,7 +263,7 @@ def a_close_ends_the_wait_of_a_task(_: scanhub.Subscriber) -> None:
             ]
             for wait in waits:
                 with contextlib.suppress(asyncio.TimeoutError):
-                    while True:  # A robot has a first verdict at once.
+                    while True:  # A robot returns its first verdict at once.
                         await asyncio.wait_for(wait.__anext__(), 0.3)
                 task = asyncio.ensure_future(wait.__anext__())
                 await asyncio.sleep(0.1)

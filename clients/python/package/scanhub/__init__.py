@@ -5,10 +5,11 @@
     for scan in scanhub.subscribe("front/scan"):
         print(scan.seq, scan.ranges_m[180])
 
-`scan.ranges_m` has meters, NaN without a reading. `scan.ranges` is a read-only numpy view of the hub's memory, in
-device units and with codes. A subscription waits for a hub that does not run yet, and continues after its restart.
-`scanhub.robot()` returns the verdicts of all sensors, `scanhub.publish("mount/tilt")` publishes the angles of a mount,
-and `scanhub.read("walk.mcap")` reads a recording. docs/python.md describes the rest.
+`scan.ranges_m` has the ranges in meters, NaN for a beam without a reading. `scan.ranges` is a read-only numpy view of
+the hub's memory, in device units and with codes. A subscription waits for a hub that does not run yet, and continues
+after a restart of the hub. `scanhub.robot()` returns the verdicts of all sensors, `scanhub.publish("mount/tilt")`
+publishes the angles of a mount, and `scanhub.read("walk.mcap")` reads a recording. docs/python.md describes the
+package.
 """
 
 from __future__ import annotations
@@ -139,8 +140,8 @@ __all__ = [
 ]
 
 def _release_names() -> None:
-    """Closes the locks of names that the parent process publishes. Otherwise, the names would stay taken while the
-    child runs, even if the parent is killed."""
+    """Closes the locks of names under which the parent process publishes. If the child kept these locks open, the names
+    would stay taken while the child runs, even if the parent is killed."""
     for descriptor in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):
             _, name = os.path.split(os.readlink(f"/proc/self/fd/{descriptor}"))
@@ -155,7 +156,8 @@ Shown = Background
 
 
 async def _next(subscriber: _scanhub.Subscriber | _scanhub.RobotSubscriber) -> Any:
-    """Waits for the next item. A canceled task loses no item, because an item is received just before the return."""
+    """Waits for the next item. A canceled task loses no item, because there is no await between receiving an item and
+    returning it."""
     loop = asyncio.get_running_loop()
     if subscriber in _waiting:
         raise Failure("another task waits for this object", "make one for each task")
@@ -167,7 +169,8 @@ async def _next(subscriber: _scanhub.Subscriber | _scanhub.RobotSubscriber) -> A
             return item
         if until is not None and loop.time() >= until:
             raise subscriber._silence()
-        # Without a hub, the descriptor may never become readable, but the warning has a deadline.
+        # Without a hub, the descriptor may never become readable. So the wait also ends when the warning about a
+        # silence after the start is due.
         due = subscriber._warning_due
         ends = [end for end in (until, None if due is None else loop.time() + due) if end is not None]
         await _readable(subscriber, loop, descriptor, min(ends, default=None))
@@ -177,7 +180,8 @@ async def _next(subscriber: _scanhub.Subscriber | _scanhub.RobotSubscriber) -> A
 _Subscriber = Union[_scanhub.Subscriber, _scanhub.RobotSubscriber]
 _Waiting = Tuple[asyncio.AbstractEventLoop, int, Callable[[], None]]
 _waiting: weakref.WeakKeyDictionary[_Subscriber, _Waiting] = weakref.WeakKeyDictionary()
-"""For each object for which a task waits: the loop, the descriptor in it, and the function that ends the wait."""
+"""For each object for which a task waits: the loop of the task, the descriptor that this loop polls, and the function
+that ends the wait."""
 
 
 async def _readable(
@@ -201,7 +205,7 @@ async def _readable(
 
 
 def _end_wait(subscriber: _Subscriber) -> None:
-    """Ends the wait of the task for `subscriber`. Runs in the thread of its loop."""
+    """Ends the wait of the task for `subscriber`. Must run in the thread of the task's loop."""
     waiting = _waiting.pop(subscriber, None)
     if waiting is not None:
         loop, descriptor, wake = waiting
@@ -210,8 +214,8 @@ def _end_wait(subscriber: _Subscriber) -> None:
 
 
 def _close(subscriber: _Subscriber, close: Callable[[], None]) -> None:
-    """Calls `close` after the descriptor of `subscriber` is removed from its loop. That happens in the thread of the
-    loop: if another thread closes the object, `close` is called later."""
+    """Calls `close` after the descriptor of `subscriber` is removed from the loop of the waiting task. Only the thread
+    of the loop may remove it: if another thread closes the object, that thread of the loop calls `close` later."""
     waiting = _waiting.get(subscriber)
     if waiting is not None:
         try:
@@ -226,7 +230,7 @@ def _close(subscriber: _Subscriber, close: Callable[[], None]) -> None:
 
 
 class Subscriber(_scanhub.Subscriber):
-    """Iterates over the samples of its topics, with `for` or with `async for`. Made by `scanhub.subscribe`. The
+    """Subscription to topics, made by `scanhub.subscribe`. Iterate over its samples with `for` or with `async for`. The
     iteration ends only if the subscription is closed."""
 
     def __aiter__(self) -> Subscriber:
@@ -247,8 +251,8 @@ class Subscriber(_scanhub.Subscriber):
 
 
 class RobotSubscriber(_scanhub.RobotSubscriber):
-    """Iterates over the verdicts of the robot, with `for` or with `async for`. Made by `scanhub.robot`. The iteration
-    ends only if it is closed."""
+    """Subscription to the verdict of a robot, made by `scanhub.robot`. Iterate over the verdicts with `for` or with
+    `async for`. The iteration ends only if the subscription is closed."""
 
     def __aiter__(self) -> RobotSubscriber:
         return self
@@ -275,11 +279,13 @@ def subscribe(
     timeout: float | None = None,
     on_notice: Callable[[str], object] | None = None,
 ) -> Subscriber:
-    """Subscribes to `topics`, each `SENSOR/TOPIC` as in `front/scan`, in `domain` (None: the value of SCANHUB_DOMAIN,
-    or `scanhub`) below the directory `root` (None: all locations in which a hub may be).
+    """Subscribes to `topics`, each in the form `SENSOR/TOPIC`, such as `front/scan`. The hub's domain is `domain`
+    (None: the value of SCANHUB_DOMAIN, or `scanhub`), below the directory `root` (None: all locations in which a hub
+    may be).
 
     Iterate over the result. With `timeout`, a silence of this number of seconds raises NoHub or Silent. `on_notice` is
-    called with `hub_gone` and `hub_back`. Raises NoTopic or Impossible if a name is invalid.
+    called with `hub_gone` when the hub ends, and with `hub_back` when a hub runs again. Raises NoTopic or Impossible if
+    a name is invalid.
     """
     return Subscriber(topics, domain, root, timeout, on_notice)
 
@@ -287,9 +293,9 @@ def subscribe(
 def robot(
     *sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None, early: bool = False
 ) -> RobotSubscriber:
-    """Subscribes to the verdict over the zones of `sensors`. Without names, it uses all sensors of the hub; in a domain
-    without a hub, the remote sensors that are published there. With `early`, the verdict becomes worse before a scan is
-    complete, and better again if the warning is withdrawn.
+    """Subscribes to the verdict over the zones of `sensors`. Without names, it is the verdict over all sensors of the
+    hub, or, in a domain without a hub, over all remote sensors that are published there. With `early`, an early warning
+    makes the verdict worse before a scan is complete, and a withdrawn warning makes it better again.
 
     Iterate over the result, or call `now()` in a loop of your own. The verdict becomes `unknown` if no recent data
     arrives. Raises Impossible if a name is invalid.
@@ -300,11 +306,11 @@ def robot(
 def publish(
     topic: str, *, domain: str | None = None, root: str | os.PathLike[str] | None = None
 ) -> Publication:
-    """Publishes the angles of a mount as `topic`, `NAME/tilt` as in `mount/tilt`. No hub is needed. The name has no
-    dot.
+    """Publishes the angles of a mount as `topic`, which has the form `NAME/tilt`, such as `mount/tilt`. NAME must not
+    contain a dot. No hub is needed.
 
-    Raises Taken if another process publishes as NAME, a program or the hub; Impossible if the name or the topic is
-    invalid; Denied, Short, Mismatch or Failure.
+    Raises Taken if another process (a program or the hub) publishes under NAME, and Impossible if the name or the topic
+    is invalid. May also raise Denied, Short, Mismatch or Failure.
     """
     return Publication(topic, domain, root)
 
@@ -320,13 +326,13 @@ def read(
     system_config: bool = True,
 ) -> Recording:
     """Reads `topics` of a recording: an MCAP file, a CARMEN log or a stream of telegrams. No hub is needed. The samples
-    equal those of `scanhub replay --rate max`, with the settings in the file `config` and those in `set`, as in
-    `set=["link.front.mode=1"]`. With `system_config=False`, the files in /etc/scanhub are not read.
+    are the same as those of `scanhub replay --rate max`, with the settings in the file `config` and the settings in
+    `set`, such as `set=["link.front.mode=1"]`. With `system_config=False`, the files in /etc/scanhub are not read.
 
     Iterate over the result, or call its `to_numpy()`. `sensor` selects one of several sensors, or names the sensor of a
     recording without names. `family` is the family of the scanner that sent a stream (None: recognized by the bytes).
-    Warns with RecordingWarning if something is missing in the file. Raises Unreadable, NoTopic, or Impossible for a
-    wrong configuration. The iteration raises Unreadable at its end if the file became shorter in the meantime.
+    Warns with RecordingWarning if data is missing in the file. Raises Unreadable, NoTopic, or, for a wrong
+    configuration, Impossible. If the file became shorter in the meantime, the iteration raises Unreadable at its end.
     """
     names = (topics,) if isinstance(topics, str) else tuple(topics)
     settings = (set,) if isinstance(set, str) else tuple(set)
@@ -337,20 +343,21 @@ def read(
 
 
 def topics(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[TopicName]:
-    """Returns the topics of the running hub, sorted. Raises NoHub after half a second."""
+    """Returns the topics of the running hub, sorted. Raises NoHub if no hub was found within half a second."""
     return sorted(TopicName(*name) for name in _scanhub._topics(domain, root))
 
 
 def sensors(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[str]:
-    """Returns the sensors of the running hub, sorted. Raises NoHub after half a second."""
+    """Returns the sensors of the running hub, sorted. Raises NoHub if no hub was found within half a second."""
     return sorted({topic.sensor for topic in topics(domain=domain, root=root)})
 
 
 def background(
     sensor: str, order: str = "show", *, domain: str | None = None, root: str | os.PathLike[str] | None = None
 ) -> Background:
-    """Returns the background model of `sensor`, after `order` was carried out: `show`, `reset` (learn again), `freeze`
-    or `thaw`. Raises Refused if the hub refuses it, NoTopic if there is no such sensor, NoHub, Silent or Short."""
+    """Sends `order` to the hub, which is `show`, `reset` (learn again), `freeze` or `thaw`, and then returns the
+    background model of `sensor`. Raises Refused if the hub refuses the order, and NoTopic if the hub does not have the
+    sensor. May also raise NoHub, Silent or Short."""
     _check_order(order, ("show", "reset", "freeze", "thaw"))
     if order != "show":
         _scanhub._request(sensor, order, domain, root)
@@ -363,7 +370,8 @@ def background(
 def control(
     sensor: str, order: str, *, domain: str | None = None, root: str | os.PathLike[str] | None = None
 ) -> None:
-    """Lets the hub `pause` a sensor, `resume` it, or restart its session (`resync`). Raises as `background` does."""
+    """Sends `order` to the hub: `pause` or `resume` the sensor, or restart the session of its link (`resync`). Raises
+    the same errors as `background`."""
     _check_order(order, ("pause", "resume", "resync"))
     _scanhub._request(sensor, order, domain, root)
 

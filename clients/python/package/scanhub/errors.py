@@ -1,4 +1,4 @@
-"""Errors. Each has a message, and a remedy for the user."""
+"""Errors and warnings of the package. Each error has a message, and a remedy for the user."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class Failure(Exception):
 
 
 class SilenceWarning(UserWarning):
-    """Nothing was received for two seconds after the start. The text names the reason: there is no hub, a sensor or
-    topic is missing, or a scanner is paused or absent."""
+    """Nothing was received for two seconds after the start of a subscription. The text names the reason: there is no
+    hub, a sensor or topic is missing, or a scanner is paused or absent."""
 
 
 class RecordingWarning(UserWarning):
-    """A recording is damaged, or does not contain what is needed to read its values. The text names the missing
-    part."""
+    """A recording is damaged, or does not contain information that is needed to read its values. The text names what is
+    missing."""
 
 
 class Unreadable(Failure, OSError):
@@ -30,7 +30,7 @@ class Unreadable(Failure, OSError):
 
 
 class NoHub(Failure):
-    """No hub runs in the domain, or it ended before it replied."""
+    """No hub runs in the domain, or the hub ended before it replied."""
 
 
 class NoTopic(Failure):
@@ -54,11 +54,11 @@ class Short(Failure):
 
 
 class Held(Failure):
-    """The program keeps more samples of a topic than a subscriber may have at a time."""
+    """The program keeps more samples of a topic than a subscriber may hold at a time."""
 
 
 class Taken(Failure):
-    """Another process publishes under the name: a program, or the hub whose sensor it is."""
+    """Another process publishes under the name: a program, or a hub that has a sensor of this name."""
 
 
 class Impossible(Failure, ValueError):

@@ -1,4 +1,5 @@
-"""Values that samples contain, and names of topics: named tuples, each with the units in the names of its fields."""
+"""Values that samples contain, and names of topics. They are named tuples, and the names of the fields contain the
+units."""
 
 from __future__ import annotations
 
@@ -21,9 +22,10 @@ class TopicName(NamedTuple):
 
 
 class Scans(NamedTuple):
-    """Scans of a sensor, a row for each. `ranges` are meters, NaN without a reading, and after the last beam of a scan that has
-    fewer beams than another. `stamps` are ns, by the clock of `Scan.stamp_ns`. `angles` are radians: a value for each beam if they
-    are the same in all scans, otherwise a row for each scan, like `ranges`."""
+    """Scans of a sensor. `ranges` has a row for each scan, in meters. A range is NaN for a beam without a reading, and
+    after the last beam of a scan that has fewer beams than the longest scan. `stamps` are in ns, on the clock of
+    `Scan.stamp_ns`. `angles` are in radians. If the angles are the same in all scans, there is one value for each beam,
+    and otherwise a row for each scan."""
 
     ranges: NDArray[np.float64]
     stamps: NDArray[np.int64]
@@ -31,8 +33,8 @@ class Scans(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """A reflector: its position, where an angle of 0 is ahead of the sensor; the highest and the sum of its intensities; its
-    beams. If `edge` is set, a part of it may be outside of the scan."""
+    """A reflector. An angle of 0 is ahead of the sensor. `peak` is the highest intensity of its beams, and `weight` the
+    sum of the intensities. If `edge` is set, a part of the reflector may be outside of the scan."""
 
     angle_deg: float
     range_mm: float
@@ -44,8 +46,9 @@ class Mark(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A straight surface with its ends: x ahead of the robot's center, y to the left. The normal form is x cos alpha + y sin
-    alpha = r, with standard deviations. `points` is the number of readings from the first to the last beam."""
+    """A straight surface and the positions of its ends: x ahead of the robot's center, y to the left. The normal form
+    of the line is x cos alpha + y sin alpha = r; `r` and `alpha` have standard deviations. `points` is the number of
+    readings from the first to the last beam."""
 
     x1_m: float
     y1_m: float
@@ -61,7 +64,7 @@ class Line(NamedTuple):
 
 
 class Corner(NamedTuple):
-    """Intersection of two lines, with their indexes."""
+    """Intersection of two lines, with the indexes of these lines."""
 
     x_m: float
     y_m: float
@@ -70,7 +73,8 @@ class Corner(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Motion from one scan to the next, in the robot's frame at the first of them: ahead, to the left, counterclockwise."""
+    """Motion from one scan to the next, in the robot's frame at the first of these scans: ahead, to the left,
+    counterclockwise."""
 
     dx_m: float
     dy_m: float
@@ -78,7 +82,8 @@ class Step(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Pose of the robot since the start: ahead, to the left, counterclockwise. It drifts."""
+    """Pose of the robot relative to its pose at the start: ahead, to the left, counterclockwise. The pose drifts,
+    because it is the sum of all steps."""
 
     x_m: float
     y_m: float
@@ -86,7 +91,7 @@ class Place(NamedTuple):
 
 
 class Zone(NamedTuple):
-    """A circle around the robot's center, and the number of beams that end inside."""
+    """A circle around the robot's center, and the number of beams that end inside this circle."""
 
     radius_mm: int
     violated: bool
@@ -94,8 +99,8 @@ class Zone(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Neighboring foreground beams; x ahead of the robot's center, y to the left. It has `support` if it has several beams, or
-    if the foreground of the previous scan was near it."""
+    """Neighboring foreground beams; x ahead of the robot's center, y to the left. `support` is set if the segment has
+    several beams, or if the foreground of the previous scan was near the segment."""
 
     first: int
     last: int
@@ -116,9 +121,10 @@ class Pose(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A person over time. `state` is `tentative`, `confirmed`, `hidden` or `between_rooms`. Position and speed are in the map of
-    the site. `cov` is the covariance of the position: xx, xy and yy in m2. `room` is None outside of all rooms. `sensors` see
-    the person. `score` is the probability that it is a person, 0 to 1."""
+    """A person over time. `state` is `tentative`, `confirmed`, `hidden` or `between_rooms`. Position and velocity are
+    in the map of the site. `cov` is the covariance of the position: xx, xy and yy in m2. `room` is None outside of all
+    rooms. `sensors` has the names of the sensors that see the person. `score` is the probability that the track is a
+    person, from 0 to 1."""
 
     id: int
     state: str
@@ -144,9 +150,10 @@ class Site(NamedTuple):
 
 
 class Obstacle(NamedTuple):
-    """An object that the hub's program `tilt` found in one sweep. `x_m`, `y_m` and `z_m` are the mean of its points in the robot's
-    frame, `low_m` and `high_m` their minimum and maximum. `distance_m` is that of the nearest point from the robot's center
-    over ground. Some points are in front of the background (`foreground`), or in the space that must be free (`near`)."""
+    """An object that `scanhub tilt` found in one sweep. `x_m`, `y_m` and `z_m` are the mean of its points in the
+    robot's frame, and `low_m` and `high_m` are the lowest and highest coordinates of the points. `distance_m` is the
+    horizontal distance of the nearest point from the robot's center. `foreground` is set if some points are in front of
+    the background, and `near` if some points are in the space that must be free."""
 
     x_m: float
     y_m: float
@@ -161,11 +168,12 @@ class Obstacle(NamedTuple):
 
 @dataclass(frozen=True)
 class Robot:
-    """Surroundings of the robot at one moment, by value.
+    """Verdict of a robot at one moment, as a copy.
 
-    `verdict` is the worst of all sensors: `stop`, `unknown`, `slow`, `clear`; `unknown` as long as there are no sensors. Treat
-    `unknown` as `stop`. `worst` is the first sensor with it, `nearest_mm` the distance of the nearest point from the robot's
-    center, and `nearest_sensor` the sensor that sees this point. `sensors` has the verdict of each sensor.
+    `verdict` is the worst verdict of all sensors. From worst to best, the verdicts are `stop`, `unknown`, `slow` and
+    `clear`. It is `unknown` as long as there are no sensors. Treat `unknown` as `stop`. `worst` is the first sensor
+    with this verdict. `nearest_mm` is the distance of the nearest point from the robot's center, and `nearest_sensor`
+    the sensor that sees this point. `sensors` has the verdict of each sensor.
     """
 
     verdict: str = "unknown"
