@@ -1,5 +1,5 @@
-//! Figures on revolutions of rotating scanners for docs/measured.md, measured behind a whole hub in virtual time. The
-//! tables cover:
+//! Measures figures on revolutions of rotating scanners for docs/measured.md, on the scans that a whole hub publishes
+//! in virtual time. The tables cover:
 //!
 //! - each model in each mode for ten minutes,
 //! - a hundred lines that lose bytes in bursts,
@@ -28,7 +28,7 @@ const RPLIDAR_MODELS: [(&str, &[&str]); 8] = [
 /// One model and mode for each packet format.
 const PACKET_KINDS: [&str; 5] = ["a1:standard", "a1:express", "a1:boost", "s1:denseboost", "s3:ultradense"];
 
-/// Prefixes of the names of the selected tables. If it is empty, all tables are selected.
+/// Prefixes of the names of the selected tables. An empty list selects all tables.
 struct Tables(Vec<String>);
 
 impl Tables {

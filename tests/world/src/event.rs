@@ -1,4 +1,4 @@
-//! Events of a world. Every invariant and the history hash receive each of them.
+//! Events of a world. Every invariant and the history hash receive every event.
 
 use scanhub_network::lan::StreamCounters;
 use scanhub_network::lan::outgoing;
@@ -11,14 +11,14 @@ use crate::remote::Forgery;
 use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
-/// An event. Its time is passed separately.
+/// An event of a world. The time of the event is passed separately.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Event<'a> {
     /// The hub has started with the boot ID `boot`, as run number `run`.
     HubStarted { run: u64, boot: u64 },
     /// The hub was killed, or it ended in an orderly way.
     HubEnded { run: u64, killed: bool },
-    /// The process of the hub is stopped until this time.
+    /// The process of the hub is stopped until the time `until`.
     Stalled { until: Nanos },
     /// The hub has opened the line to a sensor. The `offset` bytes that the port had received before are lost.
     PortOpened { sensor: usize, offset: u64 },
@@ -53,7 +53,7 @@ pub(crate) enum Event<'a> {
     Attached { subscriber: SubscriberId, sensor: usize, topic: Topic, is_prompt: bool, is_listener: bool },
     /// A subscriber took a sample. The sequence number shows that the subscriber missed `missed` samples before it.
     Taken { subscriber: SubscriberId, sample: &'a Sample, missed: u64 },
-    /// A sample was dropped from the full queue of a subscriber.
+    /// A sample was dropped from a subscriber's queue, because the queue was full.
     Dropped { subscriber: SubscriberId, sample: &'a Sample },
     /// A subscriber has left or was killed. If `is_drained`, it had taken all samples before.
     Detached { subscriber: SubscriberId, is_drained: bool },
@@ -67,7 +67,7 @@ pub(crate) enum Event<'a> {
     Transmitted { datagram: &'a Datagram<'a>, bytes: &'a [u8], is_taken: bool },
     /// A row of the counters of a gateway that ends. The row that counts announcements has no topic.
     GatewayCounters { sensor: usize, topic: Option<Topic>, row: &'a outgoing::TopicStats },
-    /// Another sender sent these bytes.
+    /// A sender other than the gateway sent these bytes.
     Forged { forgery: Forgery, bytes: &'a [u8] },
     /// A listener has started.
     ListenerStarted { run: u64 },
@@ -92,7 +92,8 @@ pub(crate) enum Event<'a> {
     ActionTaken { text: &'a str },
     /// All faults are cleared, and no further faults follow.
     FaultsCleared,
-    /// The world is at its end, and its last hub has ended.
+    /// The world is at its end, and its last hub has ended. The numbers count EEPROM writes, open lines, unused loans
+    /// and held samples.
     WorldEnded { eeprom_writes: u64, handles: usize, loans: usize, held: usize },
 }
 
@@ -107,7 +108,7 @@ pub(crate) enum DatagramOutcome {
     Duplicate,
     /// An announcement.
     Announcement,
-    /// A complete sample. It is `late` if a newer one was complete before it.
+    /// A complete sample. The sample is `late` if a newer sample was complete before it.
     Sample { late: bool },
 }
 
@@ -118,18 +119,18 @@ pub(crate) struct Telegram<'a> {
     pub(crate) bytes: &'a [u8],
     /// Position of the first byte and position after the last byte, counted over all bytes that arrived at the port.
     pub(crate) span: (u64, u64),
-    /// Time at which the first bytes arrived at the port, and baud rate.
+    /// Time at which the first bytes arrived at the port, and baud rate of the scanner.
     pub(crate) first_at: Nanos,
     pub(crate) rate: u32,
     /// Reason why the bytes did not arrive as they were sent.
     pub(crate) damage: Option<&'static str>,
-    /// Whether the scanner did not send all of it.
+    /// Whether the scanner stopped before it had sent the whole telegram.
     pub(crate) aborted: bool,
-    /// Whether it is a reply, without measured values.
+    /// Whether the telegram is a reply, which has no measured values.
     pub(crate) is_reply: bool,
 }
 
-/// Events that are printed to standard error.
+/// Selection of the events that a world prints to standard error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Detail {
     /// Nothing.
@@ -153,23 +154,23 @@ pub struct RevolutionFigures {
     pub angle_deg: f64,
     /// Largest error of a range, in millimeters.
     pub range_mm: f64,
-    /// Largest error of a scan's stamp. Only scans whose stamps must be right count.
+    /// Largest error of a scan's stamp, among scans whose stamps must be right.
     pub stamp_ns: Nanos,
     /// Largest error of the time between two consecutive scans, calculated from their stamps.
     pub uneven_ns: Nanos,
-    /// Number of points that are more than 5 cm from every measured point, in scans without any mark.
+    /// Number of points that are more than 5 cm from every measured point, in scans that the hub did not mark.
     pub wrong: u64,
     /// Number of packets that the hub counted as lost on the line.
     pub lost: u64,
-    /// Time until the hub had the first packet of measured values. The time for which the scanner waited for its motor
-    /// does not count.
+    /// Time until the hub had the first packet of measured values, without the time for which the scanner waited for
+    /// its motor.
     pub data_ns: Nanos,
-    /// Time until the hub published the first scan. The time for which the scanner waited for its motor does not count.
+    /// Time until the hub published the first scan, without the time for which the scanner waited for its motor.
     pub scan_ns: Nanos,
 }
 
 impl RevolutionFigures {
-    /// Adds the counts of `other`, and takes the larger of each pair of errors.
+    /// Adds the counts of `other`. For errors and times, takes the larger of the two values.
     pub fn add(&mut self, other: &RevolutionFigures) {
         self.scans += other.scans;
         self.incomplete += other.incomplete;
@@ -205,7 +206,7 @@ impl std::fmt::Display for Violation {
 impl Event<'_> {
     /// Adds the event to the history hash.
     pub(crate) fn hash(&self, at: Nanos, history: &mut HistoryHash) {
-        // Not needed in the hash, because the hash contains the scanner's replies.
+        // The hash does not need the written bytes, because it contains the scanner's replies.
         if matches!(self, Event::Written { .. }) {
             return;
         }
@@ -232,7 +233,7 @@ impl Event<'_> {
                 history.add_bytes(bytemuck::bytes_of(&Header { hub_pid: 0, ..sample.header }));
                 history.add_bytes(&sample.bytes);
             }
-            // Not needed in the hash, because the hash contains the packets with these points.
+            // The hash does not need the points, because it contains the packets with these points.
             Event::Measured { .. } | Event::Written { .. } => {}
             Event::Rung { sensor, ring } => numbers(&[29, sensor as u64, ring as u64]),
             Event::Notified { sensor } => numbers(&[32, sensor as u64]),
@@ -279,7 +280,7 @@ impl Event<'_> {
                 numbers(&[27, row.epoch.into(), row.sensor.into(), row.topic.into()]);
                 numbers(&[row.received, row.lost(), row.duplicate, row.reordered]);
             }
-            // Not needed in the hash, because the counters follow from events in the hash.
+            // The hash does not need the counters, because they follow from events in the hash.
             Event::GatewayCounters { .. } => {}
             Event::ListenerEnded { run, refused, evicted: given_up, sensors } => {
                 numbers(&[28, run, refused, given_up, sensors as u64]);

@@ -26,7 +26,7 @@ pub(crate) trait Family {
     /// Returns the configuration keys of the link, as `KEY=VALUE`.
     fn keys(&self) -> Vec<String>;
 
-    /// Returns this scanner with a link that has no family and no key that implies one.
+    /// Returns this scanner with a link that configures no family and no key that implies a family.
     fn auto(&self) -> Rc<dyn Family>;
 
     /// Returns the family. Returns both families if an exchange replaces the scanner with one of another family.
@@ -48,14 +48,15 @@ pub(crate) trait Family {
     /// Returns the maximum number of telegrams or packets in a sample.
     fn max_telegrams(&self) -> usize;
 
-    /// Returns whether `unit` contains measured values and is not a reply.
+    /// Returns whether `unit`, a telegram or packet, contains measured values and is not a reply.
     fn is_data(&self, unit: &[u8]) -> bool;
 
-    /// Returns whether `scan` has the values of `sample`. Only families with one telegram per scan use it.
+    /// Returns whether `scan` has the values of `sample`. Only families with one telegram per scan check this; all
+    /// other families return `true`.
     fn is_scan_of(&self, scan: &Scan, sample: &[u8]) -> bool;
 
-    /// Returns whether the line may have changed a recently `damaged` unit into `got` so that the checksum is valid by
-    /// chance. The hub cannot detect this.
+    /// Returns whether the line may have changed one of the recently `damaged` units into `got`, with a checksum that
+    /// is valid by chance. The hub cannot detect such a change.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool;
 
     /// Returns whether this is a rotating scanner. The simulation records the points of rotating scanners.
@@ -63,7 +64,8 @@ pub(crate) trait Family {
         false
     }
 
-    /// Returns the position of the first point of `unit`, or `None` if it has no points or the scanner does not rotate.
+    /// Returns the position of the first point of `unit`, or `None` if `unit` has no points or the scanner does not
+    /// rotate.
     fn first_point(&self, unit: &[u8]) -> Option<FirstPoint> {
         let _ = unit;
         None
@@ -76,7 +78,7 @@ pub(crate) trait Family {
     }
 }
 
-/// Position of the points of a packet.
+/// Position of the points of a packet, which are consecutive.
 pub(crate) struct FirstPoint {
     /// Angle of the first point.
     pub(crate) clockwise_deg: f64,
@@ -86,21 +88,22 @@ pub(crate) struct FirstPoint {
     pub(crate) line_time: Nanos,
 }
 
-/// Accuracy of the points of a packet, and the limit of what may be missing from a scan without a mark.
+/// Accuracy of the points of a packet, and limits for the data that may be missing from a scan that the hub does not
+/// mark as incomplete.
 #[derive(Clone, Copy)]
 pub(crate) struct PointAccuracy {
     pub(crate) angle_deg: f64,
     pub(crate) range_mm: f64,
     /// Tolerance of the angle of a point without a return.
     pub(crate) no_return_deg: f64,
-    /// Number of points of a revolution that may be missing without a mark.
+    /// Number of points of a revolution that may be missing although the hub does not mark the scan as incomplete.
     pub(crate) points: usize,
     /// Number of packets before and after damaged bytes that may be lost with these bytes. If packets have a checksum,
     /// only the packet before the damaged bytes may be lost, and only if its points cannot be decoded without the
     /// following packet.
     pub(crate) neighbors: usize,
-    /// Whether packets contain a timestamp. Without one, the session needs a while to estimate the scanner's clock, and
-    /// cannot determine the number of packets that are missing in a long gap.
+    /// Whether packets contain a timestamp. Without a timestamp, the session needs a while to estimate the scanner's
+    /// clock, and cannot determine the number of packets that are missing in a long gap.
     pub(crate) has_clock: bool,
 }
 
@@ -136,7 +139,7 @@ pub(crate) trait Scanner {
         self.device_mut().brown_out(now);
     }
 
-    /// Starts the misbehavior that `action` specifies. With `None`, ends it.
+    /// Starts the misbehavior that `action` specifies. With `None`, ends all misbehavior.
     fn misbehave(&mut self, action: Option<&Action>);
 
     /// Injects a fault that only some scanners can have.
@@ -149,7 +152,8 @@ pub(crate) trait Scanner {
         let _ = share;
     }
 
-    /// Returns the points that were measured since the last call, if the simulation records them.
+    /// Returns the points that the scanner measured since the last call. The list is empty if the simulation does not
+    /// record points.
     fn measured(&mut self) -> Vec<TruePoint> {
         Vec::new()
     }
@@ -180,8 +184,8 @@ pub(crate) fn draw(random: &mut fastrand::Rng) -> Vec<Rc<dyn Family>> {
     (0..count).map(|_| one(random)).collect()
 }
 
-/// Returns `first` together with a rotating scanner of another family that replaces it at an exchange. Returns `first`
-/// alone if it does not rotate.
+/// Returns `first` together with a rotating scanner of another family, which replaces `first` at an exchange. Returns
+/// `first` alone if its scanner does not rotate.
 pub(crate) fn either(first: Rc<dyn Family>, random: &mut fastrand::Rng) -> Rc<dyn Family> {
     let second: Rc<dyn Family> = match first.families()[..] {
         [scanhub_schema::Family::Ld] => Rc::new(rplidar::Rplidar::draw(random)),
@@ -245,7 +249,8 @@ fn rooms(layers: impl Fn(Scene) -> Scene) -> Vec<Room> {
     rooms.to_vec()
 }
 
-/// Four walls, with the noise of a real scanner but without codes, so that every scan shows a near object.
+/// Configuration of a room with four walls. The noise is that of a real scanner but without codes, so that every scan
+/// shows a near object.
 const WORLD_CONFIG: &str = "
 [noise]
 tail = 0

@@ -1,5 +1,5 @@
-//! Hash of everything that happened in a world. Two runs with the same hash had the same events. The hash is the same
-//! in debug and release builds and on every machine.
+//! Hash of all events of a world. If two runs have the same hash, they had the same events. The hash is the same in
+//! debug and release builds and on every machine.
 
 /// A hash of a sequence of bytes and numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -22,7 +22,7 @@ pub(crate) fn run_hub(world: &mut World) {
     shared.log_event(&Event::HubStarted { run, boot });
     let ending = match start(world, &shared, boot) {
         Ok(ending) => ending,
-        // A service manager starts the hub again.
+        // A service manager would start the hub again.
         Err(failure) => {
             shared.log_event(&Event::ActionTaken { text: &format!("hub {run} did not start: {failure}") });
             HubEnding { is_killed: true, restart_at: now + RESTART_INTERVAL }
@@ -106,7 +106,7 @@ fn start(world: &mut World, shared: &Rc<SharedState>, boot: u64) -> Result<HubEn
             platform.clock.advance_to(now);
             link.end();
         }
-        // The last samples wake their subscribers.
+        // Wake the subscribers of the hub's last samples.
         world.deliver_wakeups();
         if let Some(saver) = &mut saver {
             saver.flush_due(world.now(), wall_ns(world.now()), true);
@@ -134,7 +134,7 @@ impl<'a> RunningLink<'a> {
         RunningLink { link, platform, watched: None, due_at: 0, ready_at: None, is_requested: false }
     }
 
-    /// Returns the time at which the link next has something to do, or at which its scanner may next send something.
+    /// Returns the time at which the link next has something to do, or at which the link's scanner may next send bytes.
     fn next_ns(&self) -> Nanos {
         let SimPlatform { shared, number, clock, .. } = self.platform;
         let due = match (self.is_requested, self.ready_at, self.watched) {
@@ -213,9 +213,9 @@ impl StateStore for StateFiles {
 
 /// Time from a ready port to a running thread.
 const WAKE_DELAY: Nanos = 50 * MICROS;
-/// Delay of timers.
+/// Time from the end of a timer to a running thread.
 const TIMER_DELAY: Nanos = 50 * MICROS;
-/// Maximum time until learned state is saved.
+/// Minimum time until the hub next saves learned state. The maximum is ten times as long.
 const WRITE_DELAY: Nanos = 100 * MILLIS;
 /// Time after which a service manager restarts a hub that failed to start.
 const RESTART_INTERVAL: Nanos = 1_000 * MILLIS;

@@ -1,5 +1,5 @@
 //! Injected defects: bugs that tests build in to prove that invariants find them. The bugs are in the models around the
-//! hub and its network. None is in the hub's own code, so the hub is not compiled twice.
+//! hub and its network. No bug is in the hub's own code, so the hub need not be compiled a second time.
 
 use std::cell::Cell;
 
@@ -33,7 +33,7 @@ pub enum Defect {
     EepromWrite,
     /// The hub is not notified of a hang-up of the line.
     SwallowedHangUp,
-    /// Some samples are sent only together with the next sample.
+    /// Some samples are sent late, together with the next sample.
     Delayed,
     /// Some pairs of samples arrive in the wrong order.
     Reordered,
@@ -163,8 +163,8 @@ impl InjectedDefect {
         self.defect == Some(defect)
     }
 
-    /// Counts an opportunity, and returns whether `defect` takes effect. The defect takes effect once in every `of`
-    /// opportunities.
+    /// Counts an opportunity for the injected defect. Returns whether the injected defect is `defect` and takes effect
+    /// now, which happens at one of every `of` opportunities.
     pub(crate) fn triggers(&self, defect: Defect, of: u64) -> bool {
         if !self.is_active(defect) {
             return false;
@@ -177,7 +177,7 @@ impl InjectedDefect {
 /// Applies those [`Defect`]s that change published samples.
 #[derive(Debug, Default)]
 pub(crate) struct SampleCorrupter {
-    /// The last scan as it was before a change.
+    /// The last published scan, as it was before the injected defect changed it.
     last_scan: Option<Box<Scan>>,
 }
 

@@ -30,7 +30,7 @@ impl LinkClock {
         self.0.get()
     }
 
-    /// Advances the clock to `time`. If the clock is later than `time`, it does not change.
+    /// Advances the clock to `time`. If the clock is already later than `time`, it does not change.
     pub(crate) fn advance_to(&self, time: Nanos) {
         self.0.set(self.0.get().max(time));
     }
@@ -104,7 +104,7 @@ impl PortIo for OpenLine {
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
         let is_deaf = shared.defect.is_active(Defect::IgnoredRequests) && tty.sensor.is_streaming();
-        // An incomplete request has no effect.
+        // Without its command byte, a request is incomplete and has no effect.
         let cuts = shared.defect.is_active(Defect::UnstartedMotor);
         let is_cut = |byte: &&u8| cuts && matches!(byte, 0xF0 | 0xA8);
         if self.check(tty.is_plugged_in(*device))? && !is_deaf {

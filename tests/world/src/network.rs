@@ -19,9 +19,9 @@ pub(crate) struct Faults {
     pub(crate) damage: f64,
     /// Minimum delay.
     pub(crate) delay_ns: Nanos,
-    /// Maximum additional delay. It is drawn for each datagram, so datagrams overtake each other.
+    /// Maximum additional delay. The additional delay is drawn for each datagram, so datagrams overtake each other.
     pub(crate) jitter_ns: Nanos,
-    /// Maximum duration of a partition. Partitions start every few seconds. With 0, there are none.
+    /// Maximum duration of a partition. Partitions start every few seconds. With 0, there are no partitions.
     pub(crate) partition_ns: Nanos,
 }
 
@@ -29,7 +29,7 @@ pub(crate) struct Faults {
 pub(crate) struct Network {
     rng: Rng,
     faults: Faults,
-    /// Datagrams in transit. The key is the time of arrival, with a number that makes it unique.
+    /// Datagrams in transit. The key is the time of arrival, with a number that makes the key unique.
     queue: BTreeMap<(Nanos, u64), Vec<u8>>,
     number: u64,
     /// Start and end of the current or next partition.

@@ -1,5 +1,5 @@
 //! The other machine of a world, which receives the hub's topics. This module has a gateway, a network, a listener that
-//! publishes, and a robot. Each of them starts and ends independently of the others.
+//! publishes topics, and a robot. Gateway and listener start and end independently of each other.
 
 mod forger;
 mod gateway;
@@ -35,7 +35,8 @@ use topics::TopicMemory;
 /// Settings of gateway, network and listener, drawn from the seed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LinkSettings {
-    /// Interval at which the gateway sends samples that are derived from a scan, in samples.
+    /// Interval at which the gateway sends scans and samples derived from scans: the gateway sends one of this number
+    /// of samples.
     pub(crate) send_interval: NonZeroU64,
     /// Whether the gateway also sends telegrams.
     sends_telegrams: bool,
@@ -45,7 +46,7 @@ pub(crate) struct LinkSettings {
     background_interval: Option<Duration>,
     /// Minimum delay of the network.
     pub(crate) delay_ns: Nanos,
-    /// Time of the listener's clocks when the world begins.
+    /// Time on the clocks of the listener's machine when the world begins.
     pub(crate) initial_clocks: WallTimestamp,
     /// Whether gateway and listener have a key.
     pub(crate) has_key: bool,
@@ -53,8 +54,8 @@ pub(crate) struct LinkSettings {
     pub(crate) are_bridges: bool,
     /// Topics that the gateway does not send.
     without_subscribers: [bool; Topic::ALL.len()],
-    /// With a key: time by which the wall clock of the listener's machine is ahead of the hub's wall clock, in
-    /// nanoseconds.
+    /// Time by which the wall clock of the listener's machine is ahead of the hub's wall clock, in nanoseconds. Only
+    /// used with a key.
     clock_offset_ns: i64,
 }
 
@@ -85,7 +86,7 @@ impl LinkSettings {
     }
 
     /// Returns the interval at which the gateway sends samples of `topic`, in samples. Returns `None` if the gateway
-    /// does not send them.
+    /// does not send this topic.
     pub(crate) fn send_interval(&self, topic: Topic) -> Option<NonZeroU64> {
         match topic {
             Topic::Telegram if !self.sends_telegrams => None,
@@ -95,13 +96,13 @@ impl LinkSettings {
         }
     }
 
-    /// Returns the time of the listener's clocks at `now`.
+    /// Returns the time on the clocks of the listener's machine at `now`.
     fn stamp(&self, now: Nanos) -> WallTimestamp {
         let WallTimestamp { monotonic_ns, wall_ns } = self.initial_clocks;
         WallTimestamp { monotonic_ns: monotonic_ns + now, wall_ns: wall_ns + now }
     }
 
-    /// Returns the key of gateway and listener, or `None` if they have none.
+    /// Returns the key of gateway and listener, or `None` if they have no key.
     fn key(&self) -> Option<Key> {
         self.has_key.then(|| Key::new(&[7; Key::LEN]))
     }
@@ -113,14 +114,14 @@ impl LinkSettings {
     }
 }
 
-/// All machines and networks after the hub: gateway, network or router, listener and robot.
+/// Everything between the hub and a remote robot: gateway, network or router, listener and robot.
 pub(crate) struct RemoteMachines {
     terms: LinkSettings,
     sensors: usize,
     gateway: Option<Gateway>,
     /// Number of gateways that have been started.
     gateways: u32,
-    /// Times until which two processes are stalled: the gateway and the listener.
+    /// Times until which the process of the gateway and the process of the listener are stalled.
     gateway_stalled_until: Nanos,
     listener_stalled_until: Nanos,
     network: Network,
@@ -137,7 +138,7 @@ pub(crate) struct RemoteMachines {
     memory: TopicMemory,
     robot: RemoteRobot,
     forger: Forger,
-    /// Additional difference of the wall clocks that an action has set, in nanoseconds.
+    /// Additional time by which an action has set the wall clock of the listener's machine ahead, in nanoseconds.
     extra_clock_offset_ns: i64,
     /// Highest epoch of each hub that listeners have saved.
     epochs: HashMap<u64, u32>,
@@ -171,7 +172,7 @@ impl RemoteMachines {
         }
     }
 
-    /// Starts a gateway, if none is running.
+    /// Starts a gateway, if no gateway is running.
     pub(crate) fn begin_gateway(&mut self, shared: &SharedState) {
         if self.gateway.is_none() {
             self.gateways += 1;
@@ -190,7 +191,7 @@ impl RemoteMachines {
         gateway.detach(shared, is_killed, false);
     }
 
-    /// Starts a listener, if none is running.
+    /// Starts a listener, if no listener is running.
     pub(crate) fn begin_listener(&mut self, shared: &SharedState) {
         if self.listener.is_none() {
             self.listeners += 1;
@@ -224,7 +225,7 @@ impl RemoteMachines {
         self.extra_clock_offset_ns = offset_ns;
     }
 
-    /// Sends `count` datagrams of this kind from a machine without the key.
+    /// Sends `count` datagrams of the kind `forgery` from a machine without the key.
     pub(crate) fn forge(&mut self, shared: &SharedState, forgery: Forgery, count: usize) {
         let now = shared.clock.get();
         for bytes in self.forger.forge(forgery, count, self.wall_ns(shared, now)) {
@@ -233,14 +234,15 @@ impl RemoteMachines {
         }
     }
 
-    /// Returns the wall clock of the listener's machine at `now`, for a world with a key. Without an additional offset
-    /// from an action, its difference from the hub's clock is as small as for clocks that the same server sets.
+    /// Returns the wall clock of the listener's machine at `now`, for a world with a key. Unless an action sets an
+    /// additional offset, the difference between this clock and the hub's clock is as small as between clocks that the
+    /// same time server sets.
     fn wall_ns(&self, shared: &SharedState, now: Nanos) -> Nanos {
         (now + shared.wall_offset.get())
             .saturating_add_signed(self.terms.clock_offset_ns + self.extra_clock_offset_ns)
     }
 
-    /// Replaces the faults of the network. Its minimum delay remains.
+    /// Replaces the faults of the network. The network keeps its minimum delay.
     pub(crate) fn set_faults(&mut self, faults: Faults, now: Nanos) {
         self.faults = Faults { delay_ns: self.terms.delay_ns + faults.delay_ns, ..faults };
         self.apply_network_faults(now);

@@ -1,4 +1,4 @@
-//! Runner of many worlds. Each world runs in one thread, and several run at the same time.
+//! Runner of many worlds. Each world runs in one thread, and several worlds run at the same time.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc;
@@ -25,7 +25,7 @@ pub struct Runner {
 /// Sums over all worlds.
 #[derive(Clone, Debug, Default)]
 pub struct Totals {
-    /// Number of worlds. A world that was run twice counts once.
+    /// Number of worlds. A world that was run twice is counted once.
     pub worlds: usize,
     /// Virtual seconds, multiplied by the number of sensors.
     pub sensor_seconds: u64,
@@ -33,8 +33,8 @@ pub struct Totals {
     pub samples: u64,
     /// CPU time of all threads.
     pub busy: Duration,
-    /// Scenarios that ended with violations or whose second run had another hash. The flag is false if the hashes
-    /// differ.
+    /// Scenarios that ended with violations or whose second run had another hash. The flag is false if the hashes of
+    /// the two runs differ.
     pub failed: Vec<(Scenario, Outcome, bool)>,
 }
 

@@ -18,8 +18,8 @@ pub struct Scenario {
     pub seed: u64,
     /// Duration, in virtual seconds.
     pub seconds: u64,
-    /// Model of the only sensor. For some models, it includes the mode and the state at the start. If it is `None`, one
-    /// or two sensors are drawn.
+    /// Name of the only sensor's model. For an RPLIDAR, the name may include the mode and the state at the start. If it
+    /// is `None`, one or two sensors are drawn.
     pub model: Option<String>,
     /// Whether half of the links have no family, so that the hub searches for their scanners. If there is only one
     /// sensor, its link has no family.
@@ -39,15 +39,16 @@ pub struct Action {
 }
 
 impl Scenario {
-    /// Draws a scenario of `seconds` seconds. It contains about half of the kinds of actions, each of them one or more
-    /// times. This is swarm testing: some kinds are left out because many faults hide each other. The last 12 seconds
-    /// contain no actions.
+    /// Draws a scenario of `seconds` seconds. The scenario contains about half of the kinds of actions, each of them
+    /// one or more times. The other kinds are omitted, because many faults hide each other (swarm testing). The last 12
+    /// seconds contain no actions.
     pub fn from_seed(seed: u64, seconds: u64) -> Scenario {
         let mut random = fastrand::Rng::with_seed(seed ^ 0x5EED_0F1A_C710_0000);
         let end_ms = (seconds * 1_000).saturating_sub(RECOVERY_TIME / MILLIS);
         let mut actions = Vec::new();
         for kind in ACTION_KINDS {
-            // Each kind has its own random numbers, so a new kind hardly changes the actions of other kinds.
+            // Each kind has its own random numbers, so the number of values that one kind draws does not change the
+            // actions of other kinds.
             let mut random = random.fork();
             if random.bool() || end_ms <= START_DELAY_MS {
                 continue;
@@ -67,13 +68,14 @@ impl Scenario {
         Scenario { is_auto: true, ..Scenario::from_seed(seed, seconds) }
     }
 
-    /// Returns the time at which all faults are cleared, 12 seconds before the end. In this time, the hub must recover.
+    /// Returns the time at which all faults are cleared, 12 seconds before the end. In these 12 seconds, the hub must
+    /// recover.
     pub fn faults_clear_at(&self) -> Nanos {
         (self.seconds * 1_000 * MILLIS).saturating_sub(RECOVERY_TIME)
     }
 }
 
-/// Time without actions at the end of a world, in which everything has to recover.
+/// Time without actions at the end of a world, in which the hub and the remote machines must recover.
 pub(crate) const RECOVERY_TIME: Nanos = 12_000 * MILLIS;
 /// Time without actions at the start of a world, in which the hub starts.
 const START_DELAY_MS: u64 = 200;
@@ -85,7 +87,7 @@ impl Action {
         at.and_then(|at| self.values.get(at)).copied().unwrap_or_default()
     }
 
-    /// Returns the line faults of the action if it starts at `now`, or `None` if it does not affect bytes.
+    /// Returns the line faults of the action if it starts at `now`, or `None` if the action does not affect bytes.
     pub fn faults(&self, now: Nanos) -> Option<Faults> {
         actions::faults(self, now)
     }
@@ -175,11 +177,12 @@ impl FromStr for Scenario {
     }
 }
 
-/// Returns the scenarios that once ended in a violation, each with its reason. They must no longer end in a violation.
+/// Returns the scenarios that once ended in a violation, each with the reason of the violation. They must no longer end
+/// in a violation.
 ///
 /// # Panics
 ///
-/// Panics if the file is not a valid corpus.
+/// Panics if a scenario in the file is not valid.
 pub fn corpus() -> Vec<(String, Scenario)> {
     let scenarios = CORPUS_TEXT.split("\n\n").filter(|text| text.lines().any(|line| !line.starts_with('#')));
     let parse = |text: &str| {
@@ -192,12 +195,12 @@ pub fn corpus() -> Vec<(String, Scenario)> {
     scenarios.map(parse).collect()
 }
 
-/// Scenarios as text, separated by empty lines. The lines before each scenario give its reason.
+/// Scenarios as text, separated by empty lines. The lines before each scenario give the reason of the violation.
 const CORPUS_TEXT: &str = include_str!("corpus.txt");
 
-/// Returns the shortest scenario found for which `check` returns the same invariant as for `scenario`. The search
-/// removes halves of the actions as long as the invariant stays the same, then quarters, and so on down to single
-/// actions.
+/// Returns the shortest scenario found that still violates the same invariant as `scenario`. `check` runs a scenario
+/// and returns the violated invariant. The search tries to remove halves of the actions, then quarters, and so on down
+/// to single actions. It keeps a removal if the invariant stays the same.
 pub fn shrink(scenario: &Scenario, mut check: impl FnMut(&Scenario) -> Option<&'static str>) -> Scenario {
     let Some(expected) = check(scenario) else { return scenario.clone() };
     let mut best = scenario.clone();

@@ -1,5 +1,5 @@
-//! A simulated scanner and the line between it and a port. Bytes of the host and of the scanner are delivered in order
-//! of time.
+//! A simulated scanner and the line between the scanner and a port. Bytes of the host and of the scanner are delivered
+//! in order of time.
 
 use std::collections::VecDeque;
 
@@ -49,8 +49,8 @@ impl Sensor {
         self.line.poll_timeout(self.scanner.device(), self.now).into_iter().chain(received_at).min()
     }
 
-    /// Advances the time to `to`. If the time is later than `to`, it does not change. Passes bytes that arrive and
-    /// points that are measured until then to `on_event`.
+    /// Advances the time to `to`. If the time is already later than `to`, it does not change. Calls `on_event` for
+    /// bytes that arrive and points that are measured until `to`.
     pub(crate) fn advance(&mut self, to: Nanos, mut on_event: impl FnMut(Nanos, SensorEvent)) {
         while let Some(at) = self.next_ns().filter(|&at| at <= to) {
             self.now = self.now.max(at);
@@ -66,7 +66,7 @@ impl Sensor {
             while self.outgoing.front().is_some_and(|(at, ..)| *at <= self.now)
                 && let Some((at, byte, rate)) = self.outgoing.pop_front()
             {
-                // If a byte has another rate, the scanner cannot read it as a part of a request.
+                // The scanner cannot read a byte that the host sent at another rate.
                 if self.scanner.device().rate() == rate {
                     self.line.receive(self.scanner.device_mut(), byte, Arrival::at(at));
                 }
@@ -117,12 +117,12 @@ impl Sensor {
         self.line.set_faults(faults, seed);
     }
 
-    /// Starts the misbehavior that `action` specifies. With `None`, ends it.
+    /// Starts the misbehavior that `action` specifies. With `None`, ends all misbehavior.
     pub(crate) fn misbehave(&mut self, action: Option<&Action>) {
         self.scanner.misbehave(action);
     }
 
-    /// Injects a fault of the scanner.
+    /// Injects a fault into the scanner.
     pub(crate) fn inject_fault(&mut self, fault: ScannerFault) {
         self.scanner.inject_fault(fault, self.now);
     }

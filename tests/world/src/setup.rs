@@ -21,9 +21,9 @@ pub(crate) struct Setup {
     pub(crate) unsupported_rates: Vec<Vec<u32>>,
     /// Whether a service manager keeps the ports of a killed hub.
     pub(crate) keeps_ports: bool,
-    /// Number of consecutive scans after which a zone is violated.
+    /// Number of consecutive scans with an object in a zone after which the zone is violated.
     pub(crate) min_scans: u64,
-    /// Permanent subscribers: sensor, topic, behavior, and number of samples that they hold.
+    /// Sensor, topic, behavior, and maximum number of held samples of each permanent subscriber.
     pub(crate) subscribers: Vec<(usize, Topic, Behavior, usize)>,
 }
 
@@ -55,7 +55,8 @@ impl Setup {
         format!("s{sensor}")
     }
 
-    /// Returns the configuration. Edition 1 has other settings of processors, and edition 2 is invalid.
+    /// Returns an edition of the configuration. Edition 0 is the first one, edition 1 has other settings of processors,
+    /// and edition 2 is invalid.
     pub(crate) fn config(&self, edition: u64) -> Result<Config, Failure> {
         let mut set = vec![format!("zones.min_scans={}", self.min_scans)];
         let mut links = Vec::new();
@@ -81,11 +82,12 @@ impl Setup {
     }
 }
 
-/// Removes the family from the link of the only sensor of `scenario`, or from half of the links. At some of these
-/// links, an exchange connects a scanner of another family. Some ports of these links do not support all rates of the
-/// search. Returns the sensors, and the rates that each port does not support.
+/// Removes the family from half of the links, or from the only link if `scenario` has a model. At some of the links
+/// without a family, an exchange connects a scanner of another family. Some ports of these links do not support all
+/// rates of the search. Returns the sensors, and the rates that each port does not support.
 fn half_auto(sensors: &[Rc<dyn Family>], scenario: &Scenario) -> (Vec<Rc<dyn Family>>, Vec<Vec<u32>>) {
-    // Separate random numbers keep everything else the same as in the world in which all links have a family.
+    // The random numbers are separate, so that everything else is the same as in a world in which all links have a
+    // family.
     let mut random = fastrand::Rng::with_seed(scenario.seed ^ 0xA070_0000_0000_0000);
     let of = |sensor: &Rc<dyn Family>| {
         let mut random = random.fork();
@@ -103,6 +105,6 @@ fn half_auto(sensors: &[Rc<dyn Family>], scenario: &Scenario) -> (Vec<Rc<dyn Fam
     sensors.iter().map(of).unzip()
 }
 
-/// Rates of the search, in bits per second, without the slowest rate. Every port supports the slowest rate.
+/// Rates of the search, in bits per second. The slowest rate is missing, because every port supports it.
 const SEARCH_RATES: [u32; 9] =
     [19_200, 38_400, 115_200, 230_400, 256_000, 460_800, 500_000, 921_600, 1_000_000];

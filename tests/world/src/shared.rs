@@ -1,4 +1,4 @@
-//! State that all parts of a world share: the clock, the ports, the topics, the files, and the log of events. It
+//! State that all parts of a world share: the clock, the ports, the topics, the files, and the log of events. The state
 //! belongs to one thread.
 
 use std::cell::{Cell, RefCell};
@@ -16,11 +16,11 @@ use crate::subscriber::{Behavior, Subscriber, SubscriberId, WakeSource};
 use crate::topics::TopicBoard;
 use crate::tty::Tty;
 
-/// The parts of a world that a hub can reach.
+/// The parts of a world that a hub can access.
 pub(crate) struct SharedState {
     /// Nanoseconds since the machine was started.
     pub(crate) clock: Cell<Nanos>,
-    /// Time to add to `clock` to get the time since 1970, in nanoseconds.
+    /// Number of nanoseconds that is added to `clock` to get the time since 1970.
     pub(crate) wall_offset: Cell<u64>,
     pub(crate) ports: Vec<RefCell<Tty>>,
     pub(crate) topics: RefCell<TopicBoard>,
@@ -29,14 +29,14 @@ pub(crate) struct SharedState {
     /// Files with learned state, and whether their disk is full.
     pub(crate) files: RefCell<BTreeMap<String, String>>,
     pub(crate) disk_is_full: Cell<bool>,
-    /// Small files in the domain's directory.
+    /// Records in the domain's directory, by name.
     pub(crate) records: RefCell<BTreeMap<String, Vec<u8>>>,
     /// Whether a service manager keeps the ports of a killed hub.
     pub(crate) keeps_ports: bool,
     pub(crate) stored_lines: RefCell<BTreeMap<String, Rc<Handle>>>,
     /// Number of open lines, including those that a service manager keeps.
     pub(crate) handles: Cell<usize>,
-    /// Whether every attempt to open something fails.
+    /// Whether every attempt to open a port fails, because no file descriptor is free.
     pub(crate) lacks_descriptors: Cell<bool>,
     /// Wakeups that are not delivered yet: sensor, source and time.
     pub(crate) wakeups: RefCell<Vec<(usize, WakeSource, Nanos)>>,
@@ -44,13 +44,13 @@ pub(crate) struct SharedState {
     pub(crate) next_subscriber: Cell<u32>,
     /// Changes of subscribers that must happen while a hub sends the samples of a scan.
     pub(crate) changes: RefCell<Vec<SubscriberChange>>,
-    /// Subscribers that these changes have attached, with the milliseconds for which they stay; and subscribers that
-    /// have left.
+    /// Subscribers that `changes` have attached, each with the number of milliseconds for which it stays; and
+    /// subscribers that `changes` have removed.
     pub(crate) attached: RefCell<Vec<(Subscriber, u64)>>,
     pub(crate) detached: RefCell<Vec<SubscriberId>>,
 }
 
-/// A change of a sensor's subscribers. It happens after the sensor has sent some more samples.
+/// A change of a sensor's subscribers, which happens after the hub has sent a number of the sensor's samples.
 pub(crate) struct SubscriberChange {
     pub(crate) sensor: usize,
     /// Number of samples that are sent before the change.
@@ -79,7 +79,7 @@ impl SharedState {
         SubscriberId(number)
     }
 
-    /// Applies the changes of subscribers that are due after a sample of `sensor` was sent at `now`.
+    /// Applies the changes of subscribers that are due at `now`, when a sample of `sensor` was sent.
     pub(crate) fn change_subscribers(&self, sensor: usize, now: Nanos) {
         let mut due = Vec::new();
         self.changes.borrow_mut().retain_mut(|change| {
@@ -114,7 +114,7 @@ impl SharedState {
 pub(crate) struct EventLog {
     inner: RefCell<LogState>,
     detail: Detail,
-    /// Invariants whose first violation ends the world.
+    /// Invariants that end the world at their first violation.
     sought_invariants: &'static [&'static str],
     /// Whether one of the `sought_invariants` has reported a violation.
     is_found: Cell<bool>,

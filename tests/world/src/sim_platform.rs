@@ -25,7 +25,7 @@ pub(crate) struct SimPlatform<'a> {
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
     pub(crate) save_slot: Option<scanhub_daemon::SaveSlot<'a>>,
-    /// Whether an injected defect delays the first ring of the doorbell.
+    /// Whether an injected defect currently delays the first ring of the doorbell for a scan.
     is_ring_delayed: Cell<bool>,
 }
 
@@ -75,7 +75,7 @@ impl Platform for SimPlatform<'_> {
     }
 
     fn pause(&self, until: Nanos) {
-        // The typical delay of a sleeping thread is added.
+        // A sleeping thread typically wakes 50 us late.
         self.clock.advance_to(until + 50 * MICROS);
     }
 
@@ -132,7 +132,7 @@ impl Platform for SimPlatform<'_> {
     }
 
     fn release(&self, name: &str) {
-        // The borrow must end first, because dropping the line may close the port.
+        // The borrow must end before the line is dropped, because the drop may close the port.
         let kept = self.shared.stored_lines.borrow_mut().remove(name);
         drop(kept);
     }

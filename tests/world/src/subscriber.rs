@@ -1,5 +1,5 @@
 //! Models of subscribers. Prompt subscribers sleep until they are woken. Slow subscribers poll at fixed intervals. Some
-//! subscribers hold samples. A robot accepts the verdicts of a sensor's zones. All of them use the rules of the client
+//! subscribers hold samples. A robot accepts the verdicts of a sensor's zones. All models use the rules of the client
 //! library.
 
 use std::collections::VecDeque;
@@ -27,7 +27,7 @@ pub(crate) enum Behavior {
     Slow { every_ms: u64 },
     /// Like `Prompt`, but sleeps on the event of the sensor.
     Listener,
-    /// Like `Prompt`, and also accepts the verdicts.
+    /// Like `Prompt`, and also accepts the verdicts of the zones.
     Robot,
 }
 
@@ -36,7 +36,7 @@ pub(crate) enum Behavior {
 pub(crate) enum WakeSource {
     /// A word of the doorbell.
     Ring(DoorbellWord),
-    /// The event.
+    /// The event of the sensor.
     Event,
 }
 
@@ -46,7 +46,7 @@ pub(crate) struct Subscriber {
     pub(crate) sensor: usize,
     pub(crate) topic: Topic,
     behavior: Behavior,
-    /// Samples that the subscriber holds, and the maximum number of them.
+    /// Samples that the subscriber holds, and the maximum number of held samples.
     held_samples: VecDeque<Rc<Sample>>,
     max_held: usize,
     sequence: SequenceTracker,
@@ -90,7 +90,7 @@ impl Subscriber {
         })
     }
 
-    /// Wakes the subscriber if it sleeps on `source`. The hub rang or sent `source` at `at`.
+    /// Wakes the subscriber if it sleeps on `source`. At `at`, the hub rang this doorbell word or sent this event.
     pub(crate) fn wake(&mut self, source: WakeSource, at: Nanos) {
         let awaited = match self.behavior {
             Behavior::Listener => WakeSource::Event,
@@ -108,7 +108,7 @@ impl Subscriber {
         }
     }
 
-    /// Returns whether the subscriber takes all samples as soon as it is woken.
+    /// Returns whether the subscriber sleeps on the doorbell and takes all samples as soon as it is woken.
     pub(crate) fn is_prompt(&self) -> bool {
         self.behavior == Behavior::Prompt
     }
@@ -128,7 +128,7 @@ impl Subscriber {
         self.next_poll_at.min(silent).max(self.stalled_until)
     }
 
-    /// Takes the samples that are due at `now`, and detects a silence.
+    /// Takes the samples that are due at `now`, and drops a verdict that has become stale.
     pub(crate) fn run(&mut self, shared: &SharedState, now: Nanos) {
         match self.behavior {
             Behavior::Slow { every_ms } => {
@@ -152,7 +152,7 @@ impl Subscriber {
         while self.take(shared, shared.clock.get()) {}
     }
 
-    /// Removes the subscriber, which left or was killed. `is_drained` means that its queue is empty.
+    /// Removes the subscriber, which has left or was killed. `is_drained` means that the subscriber's queue is empty.
     pub(crate) fn detach(self, shared: &SharedState, is_killed: bool, is_drained: bool) {
         shared.topics.borrow_mut().detach(self.sensor, self.topic, self.id, is_killed);
         shared.log_event(&Event::Detached { subscriber: self.id, is_drained });
@@ -192,5 +192,6 @@ fn moment(now: Nanos) -> Timestamp {
 
 /// Time from the hub's ring until a subscriber has a sample.
 const WAKE_DELAY: Nanos = 60 * MICROS;
-/// Maximum time until a running hub passes the history to a new subscriber. It does so without waking the subscriber.
+/// Maximum time until a running hub passes the history to a new subscriber. The hub does not wake the subscriber for
+/// the history.
 const HISTORY_DELAY: Nanos = 110 * MILLIS;

@@ -1,5 +1,6 @@
-//! Topics in the memory of one process, with the limits of the real topics. Each subscriber has a queue that drops its
-//! oldest sample when it is full. A topic has the history for late joiners and the loans of a publisher.
+//! Topics in the memory of one process, with the limits of the real topics. Each subscriber has a queue, which drops
+//! its oldest sample when it is full. A topic has a history for late joiners, and its publisher has a limited number of
+//! loans.
 
 use std::borrow::{Borrow, BorrowMut};
 use std::cell::{Cell, RefCell};
@@ -28,13 +29,13 @@ pub(crate) struct Sample {
     /// Time at which the sample was sent; and number of samples of its topic that the same hub had sent before it.
     pub(crate) sent_at: Nanos,
     pub(crate) index: u64,
-    /// Number of subscribers that the sample was sent to.
+    /// Number of subscribers to which the sample was sent.
     pub(crate) receivers: usize,
     /// Counts the sample as long as a queue, a history or a subscriber contains it.
     _counted: LiveCount,
 }
 
-/// Increments a counter while it exists.
+/// Increments a counter, and decrements it when dropped.
 #[derive(Debug)]
 struct LiveCount(Rc<Cell<usize>>);
 
@@ -90,12 +91,13 @@ impl TopicBoard {
         }
     }
 
-    /// Returns the numbers of loans and samples.
+    /// Returns the number of loans that were not sent, and the number of samples that exist.
     pub(crate) fn in_use(&self) -> (usize, usize) {
         (self.loans.get(), self.samples.get())
     }
 
-    /// Prepares a topic for a new hub. Subscribers of dead processes are removed, and all others must connect again.
+    /// Prepares a topic for a new hub. Removes subscribers whose process was killed. All other subscribers must connect
+    /// again.
     fn begin(&mut self, sensor: usize, topic: Topic) {
         self.remove_killed();
         let channel = &mut self.sensors[sensor][topic as usize];
@@ -124,8 +126,8 @@ impl TopicBoard {
         self.sensors[sensor].iter().flat_map(|channel| &channel.slots).any(|place| place.is_listener)
     }
 
-    /// Attaches `subscriber`. It sleeps on the event of the sensor if `is_listener`. Returns whether there was a free
-    /// slot.
+    /// Attaches `subscriber`, which sleeps on the event of the sensor if `is_listener`. Returns whether there was a
+    /// free slot.
     pub(crate) fn attach(
         &mut self,
         sensor: usize,
@@ -336,5 +338,5 @@ impl<P: Payload + ?Sized> SimTransport<P> {
     }
 }
 
-/// Value of the first byte of unknown zones.
+/// Value of the first byte in the payload of unknown zones.
 const UNKNOWN: u8 = Verdict::Unknown as u8;

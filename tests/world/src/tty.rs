@@ -1,5 +1,5 @@
 //! A serial port with the properties of a Linux tty: a buffer, a baud rate, and one owner. The port can be unplugged,
-//! and returns as another device. It logs everything that happens to bytes.
+//! and is another device after it is plugged in again. The port logs everything that happens to bytes.
 
 use std::collections::VecDeque;
 
@@ -50,8 +50,8 @@ struct PartialTelegram {
 
 /// Maximum number of bytes that a tty buffers, as in a pty of Linux. Further bytes are lost.
 const BUFFER_LEN: usize = 17_024;
-/// Maximum number of buffered bytes in the line discipline. The tty reports and returns only these bytes at once. The
-/// other bytes are in the driver's buffers.
+/// Maximum number of buffered bytes in the line discipline. A single read returns only these bytes, and the tty reports
+/// only these bytes as readable. The other bytes are in the driver's buffers.
 const LINE_DISCIPLINE_LEN: usize = 4_095;
 
 impl Tty {
@@ -185,12 +185,13 @@ impl Tty {
         self.device == Some(device)
     }
 
-    /// Returns the number of readable bytes that a driver reports. These are the bytes in the line discipline.
+    /// Returns the number of bytes that the tty reports as readable. These are the bytes in the line discipline.
     pub(crate) fn waiting(&self) -> usize {
         self.buffer.len().min(LINE_DISCIPLINE_LEN)
     }
 
-    /// Reads buffered bytes into `into`, at most those in the line discipline. Returns the number of bytes.
+    /// Reads buffered bytes into `into`, but no more than those in the line discipline. Returns the number of bytes
+    /// read.
     pub(crate) fn read(&mut self, into: &mut [u8], log: &EventLog, now: Nanos) -> usize {
         let len = into.len().min(self.waiting());
         for (place, byte) in into.iter_mut().zip(self.buffer.drain(..len)) {
@@ -227,7 +228,7 @@ impl Tty {
         }
     }
 
-    /// Returns the rate that another process has set since the hub set its own.
+    /// Returns the rate that another process has set since the hub set its own rate, or `None`.
     pub(crate) fn altered_rate(&self) -> Option<u32> {
         (self.rate != self.hub_rate).then_some(self.rate)
     }

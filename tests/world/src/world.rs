@@ -49,13 +49,13 @@ pub fn is_found(scenario: &Scenario, defect: Option<Defect>, invariants: &'stati
     outcome.violations.iter().any(|violation| invariants.contains(&violation.invariant))
 }
 
-/// A task that runs at its time, or when all faults are cleared.
+/// A task that runs at a scheduled time, or when all faults are cleared.
 type ScheduledTask = Box<dyn FnOnce(&mut World)>;
 
 /// Requests from actions to the hub.
 #[derive(Default)]
 pub(crate) struct HubRequests {
-    /// Request to end.
+    /// Request that the hub end in this way.
     pub(crate) ending: Option<HubEnding>,
     /// Request to reload the configuration.
     pub(crate) reload: bool,
@@ -186,7 +186,7 @@ impl World {
             .unwrap_or(self.end)
     }
 
-    /// Sets the time to `now`, and does everything that is due outside the hub.
+    /// Sets the time to `now`, and runs all actions, tasks, subscribers and remote machines that are due.
     pub(crate) fn run_due(&mut self, now: Nanos) {
         self.shared.clock.set(self.now().max(now));
         while self.actions.front().is_some_and(|action| action.at_ms * MILLIS <= now)
@@ -241,15 +241,15 @@ impl World {
         }
     }
 
-    /// Makes all subscribers poll. Each subscriber searches for a hub at fixed intervals, and finds the hub that has
-    /// started.
+    /// Makes all subscribers poll soon, because a hub has started. Each subscriber without a hub searches for one at
+    /// fixed intervals.
     pub(crate) fn poll_all_subscribers(&mut self) {
         let at = self.now() + HUB_POLL_INTERVAL;
         self.subscribers.iter_mut().for_each(|subscriber| subscriber.poll_at(at));
         self.remote_machines.wake(at);
     }
 
-    /// Schedules `task` to run in `span_ms`, or when all faults are cleared.
+    /// Schedules `task` to run after `span_ms` milliseconds, or when all faults are cleared.
     pub(crate) fn schedule(&mut self, span_ms: u64, task: impl FnOnce(&mut World) + 'static) {
         let at = self.now() + span_ms * MILLIS;
         self.scheduled.insert((at, self.next_task_id), Box::new(task));
@@ -271,7 +271,7 @@ impl World {
         Some(number)
     }
 
-    /// Removes a subscriber. The subscriber leaves, or is killed if `is_killed`.
+    /// Removes a subscriber. With `is_killed`, the subscriber is killed, and otherwise it leaves.
     pub(crate) fn detach(&mut self, id: SubscriberId, is_killed: bool) {
         if let Some(at) = self.subscribers.iter().position(|subscriber| subscriber.id == id) {
             self.subscribers.remove(at).detach(&self.shared, is_killed, false);
@@ -359,9 +359,10 @@ impl World {
     }
 }
 
-/// Wall clock at the start of a world, in nanoseconds since 1970. It is a day in 2026.
+/// Wall clock at the start of a world, in nanoseconds since 1970. This time is on a day in 2026.
 const WALL_NS: u64 = 1_780_000_000_000_000_000;
-/// Exclusive limit for the number of samples after which a subscriber leaves. A scan has fewer samples.
+/// Exclusive limit for the number of further samples after which a subscriber leaves. A scan has fewer samples than
+/// this.
 const MAX_SENDS: u64 = 12;
 /// Interval at which a subscriber without a hub searches for one.
 const HUB_POLL_INTERVAL: Nanos = 50 * MILLIS;

@@ -1,4 +1,4 @@
-//! Tests of the invariants: within 200 seeds, each injected defect is found by the invariant that checks for it.
+//! Tests of the invariants: each injected defect is found within 200 seeds, by an invariant that must find it.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -58,7 +58,7 @@ const ROTATING_DEFECTS: [(Defect, &str); 12] = [
     (Defect::UnsentWarning, "ld19"),
 ];
 
-/// First seed that finds a defect, for each defect whose first seed is not 0. The test starts with this seed. It tries
+/// First seed that finds a defect, for each defect whose first seed is not 0. The test tries this seed first. It tries
 /// all other seeds only if this seed no longer finds the defect.
 const SEEDS: [(Defect, &str, u64); 17] = [
     (Defect::MergedRevolution, "", 1),
@@ -112,7 +112,7 @@ fn every_injected_defect_is_found() {
     assert_eq!(missed.into_inner().expect("whole"), []);
 }
 
-/// Kinds of actions between the machines. Each one has a defect that it reveals without other actions.
+/// Kinds of actions between the machines. Each kind has a defect that a world with only this kind of action reveals.
 const NETWORK_DEFECTS: [(&str, Defect); 3] = [
     ("partition", Defect::RemoteSurvivingVerdict),
     ("router_killed", Defect::RouterNotReconnected),

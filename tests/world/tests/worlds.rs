@@ -36,7 +36,7 @@ fn random_scenarios_keep_all_invariants() {
     assert_no_violation((0..20).map(|seed| Scenario::from_seed(seed, 60)).collect());
 }
 
-/// Runs the first seeds of those that `.ci/run` runs. The hub searches for scanners in these worlds.
+/// Runs the first seeds of those that `.ci/run` runs with `--auto`. In these worlds, the hub searches for scanners.
 #[test]
 fn random_scenarios_with_auto_family_keep_invariants() {
     assert_no_violation((0..10).map(|seed| Scenario::auto_from_seed(seed, 60)).collect());

@@ -7,7 +7,7 @@ use crate::event::Event;
 use crate::scenario::Action;
 use crate::world::{HubEnding, World};
 
-/// Kills the hub. Another one starts after `away_ms`.
+/// Kills the hub. Another hub starts after `away_ms`.
 pub(super) const KILL_HUB: ActionKind = ActionKind {
     name: "kill_hub",
     per_minute: 3.0,
@@ -15,7 +15,7 @@ pub(super) const KILL_HUB: ActionKind = ActionKind {
     act: |world, action| end_hub(world, action, true),
 };
 
-/// Ends the hub in an orderly way. Another one starts after `away_ms`.
+/// Ends the hub in an orderly way. Another hub starts after `away_ms`.
 pub(super) const END_HUB: ActionKind = ActionKind {
     name: "end_hub",
     per_minute: 1.5,
@@ -68,7 +68,7 @@ fn fill_disk(world: &mut World, action: &Action) {
     world.schedule(action.value("span_ms"), |world| world.shared.disk_is_full.set(false));
 }
 
-/// Makes all requests for sample memory fail for `span_ms`.
+/// Makes every attempt of the hub to get memory for a sample fail for `span_ms`.
 pub(super) const NO_MEMORY: ActionKind = ActionKind {
     name: "no_memory",
     per_minute: 2.0,

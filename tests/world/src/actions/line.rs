@@ -9,7 +9,8 @@ use super::{ActionKey, ActionKind, SENSOR};
 use crate::scenario::Action;
 use crate::world::World;
 
-/// Loses, flips, inserts and duplicates bytes on the line for `span_ms`. Shares are in units of 1e-5.
+/// Loses, flips, inserts and duplicates bytes on the line for `span_ms`. The keys `loss`, `flip`, `insert` and `double`
+/// are shares in units of 1e-5.
 pub(super) const NOISE: ActionKind = ActionKind {
     name: "noise",
     per_minute: 3.0,
@@ -71,7 +72,7 @@ pub(super) fn garbage_faults(action: &Action) -> Faults {
 }
 
 /// Damages whole telegrams for `span_ms`: the line truncates them, changes their length fields or duplicates them, or
-/// the scanner aborts them. Shares are in percent.
+/// the scanner aborts them. The keys from `truncate` to `abort` are shares in percent.
 pub(super) const TELEGRAMS: ActionKind = ActionKind {
     name: "telegrams",
     per_minute: 3.0,
@@ -102,7 +103,7 @@ pub(super) fn telegram_faults(action: &Action) -> Faults {
     }
 }
 
-/// Drops all bytes for `span_ms`, or delays all bytes in this time.
+/// Drops all bytes on the line for `span_ms`, or holds them back until the end of this time.
 pub(super) const SILENCE: ActionKind = ActionKind {
     name: "silence",
     per_minute: 4.0,
@@ -111,12 +112,12 @@ pub(super) const SILENCE: ActionKind = ActionKind {
 };
 
 fn silence_line(world: &mut World, action: &Action) {
-    // Otherwise the line would still hold back bytes after the faults are cleared.
+    // Without the limit, the line would still hold back bytes after all faults are cleared.
     let faults = silence_faults(action, world.now(), world.time_until_faults_clear());
     world.inject_line_fault(action, &faults);
 }
 
-/// Returns the line faults of a `silence` action that starts at `now`. They last for at most `max_span`.
+/// Returns the line faults of a `silence` action that starts at `now`. The faults last for at most `max_span`.
 pub(super) fn silence_faults(action: &Action, now: Nanos, max_span: Nanos) -> Faults {
     let span = (action.value("span_ms") * MILLIS).min(max_span) as f64 / 1e9;
     let at = now as f64 / 1e9 + 1e-3;
@@ -164,8 +165,8 @@ fn replug_elsewhere(world: &mut World, action: &Action) {
     });
 }
 
-/// Makes opening the port fail for `span_ms`: the hub has no permission, another program has the port open, or the
-/// driver rejects the rate.
+/// Makes the hub's attempts to open the port fail for `span_ms`. The reason is that the hub has no permission, that
+/// another program has the port open, or that the driver rejects the rate.
 pub(super) const PORT_DENIED: ActionKind = ActionKind {
     name: "denied",
     per_minute: 2.0,
@@ -200,5 +201,5 @@ fn alter_rate(world: &mut World, action: &Action) {
     world.with_port(sensor, |tty, log, now| tty.alter(rate, log, now));
 }
 
-/// Rates that programs often use, in bits per second.
+/// Rates to which the action `altered` sets a port, in bits per second. Programs often use these rates.
 const ALTERED_RATES: [u32; 5] = [9_600, 38_400, 57_600, 115_200, 500_000];

@@ -42,7 +42,7 @@ impl ActionKey {
 /// Index of the sensor that the action affects.
 const SENSOR: ActionKey = ActionKey::new("sensor", 0, 1);
 
-/// All kinds, in the order in which a scenario draws them.
+/// All kinds of actions, in the order in which a scenario draws them.
 pub(crate) const ACTION_KINDS: &[ActionKind] = &[
     scanner::OBJECT_INSIDE,
     line::UNPLUG,
@@ -105,7 +105,7 @@ pub(crate) fn topics_without_constant_subscriber(actions: &[Action], seed: u64) 
     topics.into_iter().filter(|_| random.u8(..4) > 0).collect()
 }
 
-/// Returns the line faults of `action` if it starts at `now`, or `None` if it does not affect bytes.
+/// Returns the line faults of `action` if it starts at `now`, or `None` if the action does not affect bytes.
 pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
     let name = action.name();
     if name == line::SILENCE.name {
@@ -121,7 +121,7 @@ pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
 }
 
 impl ActionKind {
-    /// Draws values for the keys, log-uniformly from wide ranges.
+    /// Draws a value for each key. If the range is wide, the logarithm of the value is distributed uniformly.
     pub(crate) fn draw(&self, random: &mut fastrand::Rng) -> Vec<u64> {
         let value = |key: &ActionKey| match key {
             ActionKey { min: minimum, max: maximum, .. } if *maximum > 20 * (*minimum).max(1) => {

@@ -8,8 +8,8 @@ use crate::remote::Forgery;
 use crate::scenario::Action;
 use crate::world::World;
 
-/// Loses, duplicates, damages, delays and reorders datagrams for `span_ms`. The gateway's sockets refuse some, too.
-/// Shares are in thousandths.
+/// Loses, duplicates, damages, delays and reorders datagrams for `span_ms`. The gateway's sockets refuse some
+/// datagrams, too. The keys from `loss` to `refuse` are shares in thousandths.
 pub(super) const NETWORK_LOSS: ActionKind = ActionKind {
     name: "network_loss",
     per_minute: 4.0,
@@ -75,7 +75,7 @@ fn stall_network(world: &mut World, action: &Action) {
     world.remote_machines.stall(action.value("is_listener") > 0, until);
 }
 
-/// Kills the gateway, or ends it in order. Another one starts after `away_ms`.
+/// Kills the gateway, or ends it in an orderly way. Another gateway starts after `away_ms`.
 pub(super) const GATEWAY_KILLED: ActionKind = ActionKind {
     name: "gateway_killed",
     per_minute: 3.0,
@@ -88,7 +88,7 @@ fn kill_gateway(world: &mut World, action: &Action) {
     world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_gateway(&world.shared));
 }
 
-/// Kills the listener. Another one starts after `away_ms`.
+/// Kills the listener. Another listener starts after `away_ms`.
 pub(super) const LISTENER_KILLED: ActionKind = ActionKind {
     name: "listener_killed",
     per_minute: 3.0,
@@ -102,8 +102,8 @@ fn kill_listener(world: &mut World, action: &Action) {
 }
 
 /// Kills the router between two bridges. The router loses everything that it holds. Another router starts after
-/// `away_ms`. A scenario with this action has bridges instead of a gateway and a listener, unless another action needs
-/// a key. In that case there is no router, and the action cuts the network instead.
+/// `away_ms`. A scenario with this action has bridges instead of a gateway and a listener. The exception is a scenario
+/// in which another action needs a key: it has no router, and this action cuts the network instead.
 pub(super) const ROUTER_KILLED: ActionKind = ActionKind {
     name: "router_killed",
     per_minute: 4.0,
@@ -117,8 +117,8 @@ fn kill_router(world: &mut World, action: &Action) {
     world.schedule(action.value("away_ms"), |world| world.remote_machines.begin_router(&world.shared));
 }
 
-/// Sends datagrams from a machine that does not have the key, or makes the clocks of both machines differ for
-/// `span_ms`. A scenario with this action has a gateway and a listener with a key.
+/// Sends datagrams from a machine that does not have the key, or makes the clocks of the hub's machine and of the
+/// listener's machine differ for `span_ms`. A scenario with this action has a gateway and a listener with a key.
 ///
 /// Values of `what`: 0 no MAC, 1 another key, 2 the MAC of another datagram, 3 recorded datagrams that are sent again,
 /// 4 clocks that differ.

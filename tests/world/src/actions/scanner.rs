@@ -9,7 +9,8 @@ use crate::family::ScannerFault;
 use crate::scenario::{Action, Scenario};
 use crate::world::World;
 
-/// Connects another scanner to the line, at some rate, idle or already streaming.
+/// Connects another scanner to the line. The action defines the rate of the scanner, and whether the scanner is idle or
+/// streams already.
 pub(super) const EXCHANGE: ActionKind = ActionKind {
     name: "exchange",
     per_minute: 1.5,
@@ -48,7 +49,8 @@ fn brown_out(world: &mut World, action: &Action) {
     });
 }
 
-/// Makes a scanner overlook or refuse requests, or reply twice or late, for `span_ms`. Shares are in percent.
+/// Makes a scanner overlook or refuse requests, or reply twice or late, for `span_ms`. Keys that are shares are in
+/// percent.
 pub(super) const PROTOCOL_QUIRKS: ActionKind = ActionKind {
     name: "habits",
     per_minute: 1.5,
@@ -73,7 +75,7 @@ fn misbehave(world: &mut World, action: &Action) {
 }
 
 /// Makes the head of a scanner rotate slower or faster for `span_ms`. The speed is given in percent of the usual speed.
-/// It changes gradually, like the speed of a motor. Scanners without full revolutions ignore the action.
+/// The speed changes gradually, like the speed of a motor. Scanners without full revolutions ignore the action.
 pub(super) const HEAD_SPEED: ActionKind = ActionKind {
     name: "pace",
     per_minute: 3.0,
@@ -102,7 +104,7 @@ pub(super) const HEAD_HELD: ActionKind = ActionKind {
 };
 
 fn hold_head(world: &mut World, action: &Action) {
-    // The head must be free again when all faults are cleared.
+    // The head must be free again when all faults are cleared, so the time is limited.
     let span = (action.value("span_ms") * MILLIS).min(world.time_until_faults_clear());
     world.inject_scanner_fault(action, ScannerFault::HeadHeld { span });
 }
@@ -141,8 +143,8 @@ fn ignore_requests(world: &mut World, action: &Action) {
     world.inject_scanner_fault_later(action, ScannerFault::IgnoresRequests(false));
 }
 
-/// Puts a post ahead of a sensor for `span_ms`, inside the larger zone or inside both zones. The world computes its
-/// scans before it starts, so the action does nothing when it is run.
+/// Puts a post ahead of a sensor for `span_ms`, inside the larger zone or inside both zones. A scanner receives all
+/// changes of its scene when the world starts, so the effect of the action is empty.
 pub(crate) const OBJECT_INSIDE: ActionKind = ActionKind {
     name: "object",
     per_minute: 12.0,
@@ -175,8 +177,8 @@ pub(crate) fn objects_inside(scenario: &Scenario, sensor: usize, sensors: usize)
     joined
 }
 
-/// Returns the changes of the scene of `sensor`. The post is inside the larger zone in room 1, and inside both zones in
-/// room 2.
+/// Returns the changes of the scene of `sensor`. Room 0 has no post. In room 1, the post is inside the larger zone, and
+/// in room 2, it is inside both zones.
 pub(crate) fn scene_changes(scenario: &Scenario, sensor: usize, sensors: usize) -> Changes {
     let spans = object_spans(scenario, sensor, sensors);
     let mut times: Vec<Nanos> = spans.iter().flat_map(|&(from, until, _)| [from, until]).collect();

@@ -93,7 +93,7 @@ fn attach_subscriber(world: &mut World, action: &Action, is_killed: bool) {
     }
 }
 
-/// Stops a subscriber that is not prompt until the end of the action.
+/// Stops one of the subscribers that are not prompt. The subscriber continues at the end of the action.
 fn stall_subscriber(world: &mut World, action: &Action) {
     let until = world.now() + action.value("span_ms") * MILLIS;
     let mut slow: Vec<_> =

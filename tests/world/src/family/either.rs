@@ -1,5 +1,6 @@
-//! Two rotating scanners of different families at one port. An exchange replaces one with the other. Packets of an
-//! LDROBOT are recognized by their header; all other bytes belong to the other family.
+//! Two rotating scanners, an LDROBOT and a scanner of another family, at one port. An exchange replaces the connected
+//! scanner with the other one. Packets of the LDROBOT are recognized by their header. All other bytes belong to the
+//! other family.
 
 use std::rc::Rc;
 

@@ -65,8 +65,9 @@ impl Family for Ld {
         vec![self.settings.model.baud()]
     }
 
-    /// If an object appears just after the head has passed it, the scanner measures the object one revolution later.
-    /// The hub publishes that revolution when it is complete.
+    /// Returns the time of a revolution, and a delay of two revolutions and the last packet. If an object appears just
+    /// after the head has passed it, the scanner measures the object one revolution later. The hub publishes that
+    /// revolution when it is complete.
     fn scan_times(&self) -> (Nanos, Nanos) {
         let LdSettings { revolutions_per_second, speed_variation: wander, .. } = self.settings;
         let slowest = revolutions_per_second * MIN_SPEED * (1.0 - wander);
@@ -90,12 +91,12 @@ impl Family for Ld {
         true
     }
 
-    /// The points of a revolution come from many samples.
+    /// Returns `true`, because the points of a revolution come from many samples.
     fn is_scan_of(&self, _: &Scan, _: &[u8]) -> bool {
         true
     }
 
-    /// A damaged packet has a valid checksum in 1 of 256 cases.
+    /// Returns whether any packet was damaged, because a damaged packet has a valid checksum in 1 of 256 cases.
     fn is_collision(&self, _: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         damaged.next().is_some()
     }
@@ -144,9 +145,9 @@ impl Scanner for LdScanner {
         &mut self.head
     }
 
-    /// Does nothing. After a restart, the scanner's clock starts at zero. A running clock can show zero at the same
-    /// time by chance. Then no session can distinguish the restart from a stall, and stamps are wrong until the next
-    /// revolutions. The session's own tests cover restarts.
+    /// Does nothing. After a restart, the scanner's clock starts at zero. A clock that was not restarted can also be
+    /// near zero at that time, by chance. Then the session cannot distinguish the restart from a stall, and stamps are
+    /// wrong until the next revolutions. The session's own tests cover restarts.
     fn brown_out(&mut self, _: Nanos) {}
 
     /// Replaces the scanner with a new one, whose power is turned on at `now`.

@@ -119,7 +119,8 @@ impl Family for Lms {
         scan.beams() == count && words.len() >= count && scan.ranges().iter().zip(&words[..count]).all(same)
     }
 
-    /// A damaged telegram of the same length has a valid checksum in 1 of 65,536 cases.
+    /// Returns whether a damaged telegram of the same length differs from `got` in only a few bytes. A damaged telegram
+    /// has a valid checksum in 1 of 65,536 cases.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         let others = |sent: &[u8], got: &[u8]| sent.iter().zip(got).filter(|(sent, got)| sent != got).count();
         damaged.filter(|sent| sent.len() == got.len()).any(|sent| {
@@ -128,7 +129,7 @@ impl Family for Lms {
             };
             let last = sent.iter().zip(got).rposition(|(sent, got)| sent != got).unwrap_or(first);
             let (sent, got) = (&sent[first..=last], &got[first..=last]);
-            // If one byte is inserted and another one is lost, all bytes between them are shifted.
+            // If one byte is inserted and another byte is lost, all bytes between these two are shifted.
             let shifted = [others(&sent[1..], got), others(sent, &got[1..])];
             others(sent, got).min(shifted[0]).min(shifted[1]) <= MAX_CHANGED_BYTES
         })
@@ -152,7 +153,7 @@ impl Scanner for LmsScanner {
         &mut self.machine
     }
 
-    /// The new scanner has the rate of `action`, and is idle or streams already.
+    /// Replaces the scanner with one that has the rate of `action`, and is idle or streams already.
     fn exchange(&mut self, action: &Action, _: Nanos) -> Vec<u8> {
         let baud = Baud::ALL[action.value("rate") as usize % Baud::ALL.len()];
         let seed = self.settings.seed.wrapping_add(1);
@@ -194,8 +195,8 @@ fn measured(variant: Variant) -> Arc<PrecomputedScans> {
     }
 }
 
-/// Number of different scans of each room, so that processors do not receive the same scan all the time.
+/// Number of different scans of each room. With a single scan, processors would receive the same scan all the time.
 const SCANS_PER_ROOM: usize = 12;
-/// Maximum number of changed bytes in a telegram that still looks intact. If the line changes more bytes, it also
-/// damages the neighboring telegrams, and the hub marks the telegram as suspect.
+/// Maximum number of changed bytes in a telegram that still looks intact. If the line changes more bytes than this, it
+/// also damages the neighboring telegrams, and the hub marks the telegram as suspect.
 const MAX_CHANGED_BYTES: usize = 32;

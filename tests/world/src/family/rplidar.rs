@@ -1,6 +1,6 @@
 //! Slamtec RPLIDAR scanners, which measure on request, in one of several modes with different packets. The simulated
-//! points have no noise, so that each published point can be found among the measured ones. An RPLIDAR has no EEPROM; a
-//! single request changes its permanent settings, and counts as an EEPROM write.
+//! points have no noise, so that each published point can be found among the measured ones. An RPLIDAR has no EEPROM.
+//! Only one request changes its permanent settings, and this request counts as an EEPROM write.
 
 use std::rc::Rc;
 
@@ -25,7 +25,7 @@ pub(super) struct Rplidar {
     family: &'static str,
     /// Whether the motor is off at the start.
     is_off: bool,
-    /// Whether the link configures the model, and the mode that it configures.
+    /// Whether the link configures the model, and the index of the mode that the link configures.
     is_model_configured: bool,
     mode: Option<usize>,
     beams: Option<usize>,
@@ -58,8 +58,8 @@ impl Rplidar {
         Rplidar { settings, family: "rplidar", is_off: false, is_model_configured, mode: None, beams: None }
     }
 
-    /// Returns the scanner with this name: `MODEL`, `MODEL:MODE` or `MODEL:MODE:STATE`. It has the fastest mode if
-    /// there is no mode, and is idle if there is no state.
+    /// Returns the scanner with this name: `MODEL`, `MODEL:MODE` or `MODEL:MODE:STATE`. Without `MODE`, the scanner has
+    /// its fastest mode, and without `STATE`, it is idle.
     pub(super) fn from_name(text: &str, random: &mut fastrand::Rng) -> Option<Rplidar> {
         let mut words = text.split(':');
         let (model, mode, state) = (words.next()?, words.next(), words.next());
@@ -78,8 +78,8 @@ impl Rplidar {
         words.next().is_none().then_some(named)
     }
 
-    /// Returns the packet format, derived from the first bytes of `sample`. A wrong checksum does not change the
-    /// format.
+    /// Returns the packet format, derived from the length of `sample` and the first bytes of each packet. A wrong
+    /// checksum does not change the format.
     fn kind(&self, sample: &[u8]) -> Option<PacketFormat> {
         let is_of = |kind: &PacketFormat| {
             let begins = |packet: &[u8]| packet[0] >> 4 == 0xA && packet[1] >> 4 == 0x5;
@@ -115,8 +115,8 @@ impl Family for Rplidar {
         models_alike(self.settings.model).iter().map(|model| model.baud()).collect()
     }
 
-    /// Returns times like those for other rotating scanners. The session detects the end of a revolution only when the
-    /// head is well past it.
+    /// Returns times like those of an LDROBOT, but with a longer delay: the session detects the end of a revolution
+    /// only when the head is well past that end.
     fn scan_times(&self) -> (Nanos, Nanos) {
         let slowest = models_alike(self.settings.model).iter().map(|model| model.revolutions_per_second());
         let slowest =
@@ -149,12 +149,13 @@ impl Family for Rplidar {
         !is_reply(unit) && self.kind(unit).is_some_and(|kind| kind.byte_len() == unit.len())
     }
 
-    /// The points of a revolution come from many samples.
+    /// Returns `true`, because the points of a revolution come from many samples.
     fn is_scan_of(&self, _: &Scan, _: &[u8]) -> bool {
         true
     }
 
-    /// A damaged packet has a valid checksum in 1 of 256 cases, and standard packets have none.
+    /// Returns whether the checksum of `got` is valid and any packet was damaged. A damaged packet has a valid checksum
+    /// in 1 of 256 cases. Standard packets have no checksum.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
         let sum = || got[2..].iter().fold(0, |sum, byte| sum ^ byte);
         let is_right = match self.kind(got).filter(|_| !is_reply(got)) {
@@ -170,7 +171,7 @@ impl Family for Rplidar {
 
     fn first_point(&self, unit: &[u8]) -> Option<FirstPoint> {
         let kind = self.kind(unit).filter(|kind| !is_reply(unit) && kind.byte_len() == unit.len())?;
-        // The first point does not depend on the next packet.
+        // The first point does not depend on the next packet, so `unit` can take the place of that packet.
         let before = kind.point(unit, unit, 0).before;
         let clockwise_deg = f64::from(kind.start_angle(unit) - before).rem_euclid(360.0);
         Some(FirstPoint {
@@ -189,7 +190,8 @@ impl Family for Rplidar {
             Some(PacketFormat::Ultra) => PointAccuracy { angle_deg: 0.4, range_mm: 6.0, points: 16, ..plain },
             Some(PacketFormat::UltraDense) => PointAccuracy { range_mm: 6.0, ..plain },
             Some(PacketFormat::Dense) => plain,
-            // A standard packet is one point. This number of points may be missing without a mark.
+            // A standard packet is one point, so up to 45 packets may be missing from a scan that is not marked as
+            // incomplete.
             Some(PacketFormat::Standard) | None => PointAccuracy { points: 45, neighbors: 16, ..plain },
         }
     }
@@ -200,7 +202,7 @@ struct RplidarScanner {
     unit: RplidarSimulator,
     settings: RplidarSettings,
     changes: Changes,
-    /// Start time of the stream to which `reported` applies, and number of packets whose points have been reported as
+    /// Start time of the current stream, and number of packets of this stream whose points have been reported as
     /// measured.
     stream: Option<Nanos>,
     reported: u64,
@@ -227,7 +229,7 @@ impl RplidarScanner {
         }
     }
 
-    /// Changes the speed of the head toward the target speed.
+    /// Changes the speed of the head toward the target speed, after `passed_s` seconds have passed.
     fn change_speed(&mut self, passed_s: f64) {
         let usual = self.settings.revolutions_per_second;
         let Some(share) = self.unit.revolutions_per_second().map(|turns| turns / usual) else { return };
@@ -252,8 +254,8 @@ impl Scanner for RplidarScanner {
         &mut self.unit
     }
 
-    /// The new scanner may be another model that measures in the same way. Its power is turned on at `now`, or it
-    /// streams already.
+    /// Replaces the scanner. The new scanner may be another model that measures in the same way. Its power is turned on
+    /// at `now`, or it streams already.
     fn exchange(&mut self, action: &Action, now: Nanos) -> Vec<u8> {
         let models = models_alike(self.settings.model);
         let at = models.iter().position(|model| *model == self.settings.model).unwrap_or(0);
@@ -314,8 +316,8 @@ impl Scanner for RplidarScanner {
     }
 }
 
-/// Returns the models that measure in the same way as `model`. Each of them may send what another one of them sends. No
-/// model outside this group has packets that look like theirs.
+/// Returns the models that measure in the same way as `model`. The hub cannot distinguish these models by their
+/// packets. All other models have different packets.
 fn models_alike(model: Model) -> &'static [Model] {
     if is_triangulating(model) {
         &[Model::A1, Model::A2m8, Model::A2m12, Model::A3]
@@ -328,7 +330,7 @@ fn is_triangulating(model: Model) -> bool {
     matches!(model, Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)
 }
 
-/// Returns whether the mode has so few packets per second that many worlds can check it.
+/// Returns whether the mode has few packets per second, so that a world runs fast with this mode.
 fn is_moderate(mode: &scanhub_sim::rplidar::Mode) -> bool {
     mode.form != scanhub_sim::rplidar::PacketFormat::Standard || mode.sample_us > 150.0
 }
@@ -358,7 +360,8 @@ fn line_time(unit: &[u8], model: Model) -> Nanos {
     scanhub_schema::line_time(unit.len(), model.baud())
 }
 
-/// Models from which a seed draws. Fast models are rare, because their points take long to compute.
+/// Models from which a seed draws a scanner, with repetitions. Fast models occur only once, because their points take
+/// long to compute.
 const DRAWN_MODELS: [Model; 13] = [
     Model::A1,
     Model::A1,

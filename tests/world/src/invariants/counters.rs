@@ -12,8 +12,9 @@ use crate::subscriber::SubscriberId;
 use crate::topics::Sample;
 
 /// Invariant: the counters of each subscriber are right. A subscriber detects missed samples by their sequence numbers.
-/// The samples that it took and the samples that it missed are together the published ones. No sample arrives twice or
-/// out of order. Each sample that was sent to a subscriber was taken, or was dropped from the subscriber's queue.
+/// The number of samples that it took and the number of samples that it missed add up to the number of published
+/// samples. No sample arrives twice or out of order. Each sample that the hub sent to a subscriber was taken by it, or
+/// was dropped from its queue.
 #[derive(Default)]
 pub(crate) struct SubscriberCounters {
     subscribers: BTreeMap<SubscriberId, SubscriberState>,
@@ -29,7 +30,7 @@ struct SubscriberState {
 
 struct RunCounters {
     boot: u64,
-    /// Sequence number of the first sample that counts, and index of this sample.
+    /// Sequence number and index of the first sample that the counters include.
     first: u64,
     first_index: u64,
     taken: u64,
@@ -111,14 +112,15 @@ impl SubscriberState {
     }
 
     fn drop(&mut self, sample: &Sample) {
-        // If samples were dropped before the first taken sample, the index of the first taken sample shows how many.
+        // Before the subscriber takes its first sample, dropped samples need no count: the index of the first taken
+        // sample shows how many samples were dropped before it.
         if let Some(run) = self.run.as_mut().filter(|run| run.boot == sample.header.boot) {
             run.dropped += 1;
         }
     }
 }
 
-/// Invariant: at the end, no line is open, no loan is unused, and no sample is held.
+/// Invariant: at the end of the world, no line is open, no loan of memory is unused, and no sample is held.
 pub(crate) struct Resources;
 
 impl Invariant for Resources {
@@ -141,18 +143,19 @@ impl Invariant for Resources {
 type StreamKey = (u32, u8, u8);
 
 /// Invariant: the counters of each listener are right (`docs/datagram.md`). In each row, `received` counts datagrams
-/// that arrived, and `duplicate` counts those that arrived again. `lost` counts the sequence numbers between the first
-/// and the last known one that did not arrive. If the faults are cleared at the end and the last announcement arrived,
-/// the listener knows every sequence number that the gateway sent. The counters belong to the running listener.
+/// that arrived, and `duplicate` counts those that arrived again. `lost` counts sequence numbers that did not arrive,
+/// from the first known sequence number to the last known one. If the faults are cleared at the end of the world and
+/// the last announcement arrived, the listener knows every sequence number that the gateway sent. A new listener starts
+/// with new counters.
 #[derive(Default)]
 pub(crate) struct ListenerCounters {
-    /// Next sequence number of each stream.
+    /// Next sequence number that the gateway sends in each stream.
     sequence_counts: BTreeMap<StreamKey, u32>,
     rows: BTreeMap<StreamKey, ExpectedRow>,
-    /// Number of datagrams that the listener accepted, and number of those that it refused.
+    /// Number of datagrams that the listener accepted, and number of datagrams that it refused.
     arrived: u64,
     refused: u64,
-    /// Sum of the counters checked so far, and number of their rows.
+    /// Sum of the counters of all rows that were checked so far, and number of these rows.
     counted: u64,
     counted_rows: usize,
     is_over: bool,
@@ -299,11 +302,11 @@ fn announce(datagram: &Datagram<'_>) -> Option<Announce> {
 }
 
 /// Invariant: the counters of a bridge are right (`docs/bridge.md`). Each sample that the bridge took is sent once,
-/// counted as replaced, or still queued. Announcements report replaced samples. If the faults are cleared at the end,
-/// the announcements report all of them.
+/// counted as replaced, or still queued. Announcements report replaced samples. If the faults are cleared at the end of
+/// the world, the announcements report all replaced samples.
 pub(crate) struct BridgeCounters {
     are_bridges: bool,
-    /// Whether every sample of scans, telegrams and foregrounds is sent.
+    /// Whether the bridge must send every scan, telegram and foreground.
     sends_all: bool,
     topics: BTreeMap<(usize, Option<Topic>), TopicCounters>,
     is_over: bool,
@@ -312,12 +315,12 @@ pub(crate) struct BridgeCounters {
 
 #[derive(Default)]
 struct TopicCounters {
-    /// Three numbers of samples: those that the bridge took from the hub, those that it sent, and those that it sent
-    /// but the router did not accept.
+    /// Number of samples that the bridge took from the hub; number of samples that it sent; and number of sent samples
+    /// that the router did not accept.
     taken: u64,
     sent: u64,
     failed: u64,
-    /// Number of replaced samples that the last announcement reports, and number in the bridge's counters.
+    /// Number of replaced samples in the last announcement, and number of replaced samples in the bridge's counters.
     reported_replaced: u64,
     replaced: u64,
 }
@@ -395,7 +398,8 @@ impl Invariant for BridgeCounters {
                 }
                 of.replaced = row.replaced;
             }
-            // The last announcement has arrived. An announcement does not count itself.
+            // The last announcement has arrived. The counters in an announcement do not include this announcement
+            // itself.
             Event::ListenerEnded { .. } if self.is_over => {
                 let topics = self
                     .topics

@@ -1,7 +1,8 @@
 //! Invariant on early warnings, which are verdicts from partial scans. An early warning is slow or stop, never clear.
-//! It is confirmed by zones that are at least as bad, or withdrawn before the next zones with the same or a greater
-//! `seq`. While nothing is wrong, two more rules hold. No warning is withdrawn. Zones are stop only after a warning,
-//! and that warning was sent when at most three quarters of the scan had arrived.
+//! The next zones with the same or a greater `seq` confirm the warning if their verdict is at least as bad. Otherwise,
+//! the hub withdraws the warning before these zones. While nothing is wrong, two more rules hold. No warning is
+//! withdrawn. The verdict of zones becomes stop only after a warning, and the hub sent that warning when at most three
+//! quarters of the scan had arrived.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +26,7 @@ struct Warning {
     verdict: Verdict,
     /// Whether the scan must have exactly the `seq` of the warning. Otherwise the scan's `seq` may be greater.
     is_of_telegram: bool,
-    /// Number of beams that had arrived.
+    /// Number of beams that had arrived when the warning was sent.
     beams_seen: u16,
 }
 
@@ -58,7 +59,7 @@ impl Invariant for EarlyWarnings {
                 let wrong = match sample.topic {
                     Topic::Scan => {
                         let before = std::mem::replace(&mut of.beams, Scan::of_bytes(&sample.bytes).beams());
-                        // With another number of beams, the session estimates the scan period again.
+                        // When the number of beams changes, the session estimates the scan period again.
                         of.scans = if before == of.beams { of.scans + 1 } else { 0 };
                         None
                     }
@@ -87,7 +88,8 @@ impl Invariant for EarlyWarnings {
 }
 
 impl SensorWarnings {
-    /// Returns a description of the error in a warning, or in its withdrawal.
+    /// Returns a description of the error in a warning or in the withdrawal of a warning, or `None` if there is no
+    /// error.
     fn check_warning(
         &mut self,
         seq: u64,
@@ -119,12 +121,13 @@ impl SensorWarnings {
             .map(|before| format!("{warning:?} follows {before:?}, and is not worse"))
     }
 
-    /// Returns a description of the error in the current warning for these `zones`, or of its absence. If
-    /// `is_faultless`, nothing is wrong in the world.
+    /// Returns a description of the error if the current warning contradicts `zones`, or if a required warning is
+    /// missing. If `is_faultless`, nothing is wrong in the world.
     fn check_zones(&mut self, seq: u64, zones: &Zones, is_faultless: bool) -> Option<String> {
         self.zones = Some(seq);
-        // A hub that ends withdraws its warning, and sends no zones after that. The hub publishes a scan before the
-        // zones of the scan. If the number of beams changes, the scan that the warning belongs to is never completed.
+        // A hub that ends withdraws its warning, and sends no zones after the withdrawal. The hub publishes a scan
+        // before the zones of the scan. If the number of beams changes, the scan that the warning belongs to is never
+        // completed.
         if std::mem::take(&mut self.is_needless) && self.scans > 0 {
             return Some("a warning was withdrawn although nothing went wrong".to_owned());
         }
@@ -144,7 +147,7 @@ impl SensorWarnings {
     }
 }
 
-/// Time after the last fault until no fault has an effect any more.
+/// Time after the last fault, after which no fault has an effect any more.
 const RECOVERY_TIME: Nanos = 3_000 * MILLIS;
 /// Number of consecutive scans after which the session has estimated the scan period.
 const LEARNING_SCANS: usize = 20;

@@ -66,7 +66,7 @@ impl Invariant for HeaderConsistency {
                 let Header { seq, boot, stamp_first_ns, stamp_last_ns, wall_ns, reasons, .. } = *header;
                 (seq, boot, stamp_first_ns, stamp_last_ns, wall_ns, reasons)
             };
-            // The sample at the source was not published if there was no memory for it.
+            // If there was no memory for the sample of the source topic, that sample was not published.
             let source = self.last.get(&(sensor, source));
             if source.is_some_and(|source| source.seq >= header.seq && of(source) != of(header)) {
                 broken("not the header of the source");
@@ -77,8 +77,9 @@ impl Invariant for HeaderConsistency {
 
 /// Invariant: a listener publishes the sequence numbers, stamps and periods that `docs/topics.md` describes. The
 /// sequence number comes from the datagram and continues over runs of the gateway. Both stamps are the time of arrival.
-/// The period is the median of the last five intervals between two samples as sent. Once a topic exists, the listener
-/// publishes every sample that arrived in time.
+/// The period is the median of the last five intervals between the arrivals of consecutive samples. If samples are
+/// missing between two arrivals, the time is divided by the difference of the sequence numbers. Once a topic exists,
+/// the listener publishes every sample that arrived in time.
 pub(crate) struct RemoteHeaders {
     terms: LinkSettings,
     topics: BTreeMap<(usize, Topic), TopicHeaders>,
@@ -86,9 +87,9 @@ pub(crate) struct RemoteHeaders {
 
 #[derive(Default)]
 struct TopicHeaders {
-    /// Datagrams that arrived in time and are not published yet. Each has its time of arrival and its header.
+    /// Time of arrival and header of each datagram that arrived in time and is not published yet.
     unpublished: VecDeque<(Nanos, Head)>,
-    /// The last published datagram that arrived in time.
+    /// Time of arrival and header of the last published datagram that arrived in time.
     last: Option<(Nanos, Head)>,
     /// Last sequence number of the republished topic.
     number: Option<u64>,
@@ -149,7 +150,7 @@ impl TopicHeaders {
             of == (header.stamp_last_ns, header.seq, header.wall_ns)
         };
         let Some(at) = self.unpublished.iter().position(is_it) else {
-            // The sample was published because of a silence.
+            // No datagram matches, so the listener published the sample because of a silence.
             let due = before.map_or(0, |before| before + 1);
             return if header.topic_seq == due {
                 Ok(())
@@ -166,7 +167,7 @@ impl TopicHeaders {
         let steps =
             last.filter(|(_, last)| last.epoch == head.epoch).map(|(_, last)| head.sequence - last.sequence);
         if let (Some(steps), Some((last_came, _))) = (steps.filter(|steps| *steps > 0), last) {
-            // A sample with an earlier time of arrival does not define a period.
+            // If a sample has an earlier time of arrival than the last sample, there is no interval between the two.
             let distance_ns = arrived_at.checked_sub(last_came).map(|apart| apart / u64::from(steps));
             self.intervals_ns.extend(distance_ns.filter(|distance_ns| *distance_ns <= MAX_INTERVAL));
             if self.intervals_ns.len() > PERIOD_INTERVALS {
@@ -176,8 +177,8 @@ impl TopicHeaders {
         let mut known: Vec<_> = self.intervals_ns.iter().copied().collect();
         known.sort_unstable();
         let period_us = known.get(known.len().saturating_sub(1) / 2).map_or(0, |period_ns| period_ns / 1000);
-        // The first sequence number of a run of the listener comes from the datagram. Datagrams of another gateway that
-        // are missing also count.
+        // The first sequence number of a run of the listener comes from the datagram. When another run of the gateway
+        // starts, its datagrams that did not arrive increase the sequence number, too.
         let due = match (before, steps) {
             (Some(before), Some(steps)) => before + u64::from(steps),
             (Some(before), None) => before + 1 + u64::from(head.sequence),
@@ -195,7 +196,7 @@ impl TopicHeaders {
     }
 }
 
-/// Number of intervals between samples from which the period is calculated, and maximum length of an interval that
-/// counts.
+/// Number of intervals from which the period is calculated, and maximum length of such an interval. Longer intervals
+/// are ignored.
 const PERIOD_INTERVALS: usize = 5;
 const MAX_INTERVAL: Nanos = 2_500 * MILLIS;

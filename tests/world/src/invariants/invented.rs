@@ -1,4 +1,5 @@
-//! Invariants against invented data. A scanner has sent each sample, and the hub has published each remote sample.
+//! Invariants against invented data. A scanner has sent the data of each sample, and the hub has published each remote
+//! sample.
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
@@ -15,21 +16,24 @@ use crate::hash::HistoryHash;
 use crate::remote::{Forgery, LinkSettings, PayloadBuffer};
 
 /// Invariant: the hub delivers only what a scanner sent, except for data that the hub marks as suspect. Each telegram
-/// is compared byte by byte. It is published at most as often as it was sent. Each scan is compared value by value.
+/// is compared byte by byte, and is published at most as often as it was sent. Each scan is compared with its telegram
+/// value by value.
 pub(crate) struct NothingInvented {
     sensors: Vec<SensorTelegrams>,
 }
 
 struct SensorTelegrams {
     family: Rc<dyn Family>,
-    /// For the hash of each telegram: how often the telegram was sent and not yet published.
+    /// Number of times that each telegram was sent and not yet published. The key is the hash of the telegram.
     unpublished: HashMap<u64, u32>,
-    /// Published units that no scanner sent. The next telegram decides whether foreign bytes arrived before it: in that
-    /// case, more bytes were read than the known telegrams contain.
+    /// Published units that no scanner sent. If the hub has read more bytes than the known telegrams contain, foreign
+    /// bytes may have arrived. Then the units are checked only after the next telegram, because its position shows
+    /// whether foreign bytes did arrive.
     foreign: Vec<Vec<u8>>,
     /// Position after the last byte that was read.
     read_end: u64,
-    /// Last telegrams that the line damaged. An empty entry represents foreign bytes between two telegrams.
+    /// Last telegrams that the line damaged. An empty entry represents foreign bytes between two telegrams, which no
+    /// scanner sent.
     damaged: VecDeque<Vec<u8>>,
     /// Position after the last telegram.
     sent_end: u64,
@@ -107,7 +111,7 @@ impl Invariant for NothingInvented {
 }
 
 impl SensorTelegrams {
-    /// Reports the foreign units, except those that are a mixture of damaged telegrams.
+    /// Reports each foreign unit, except a unit that may be a mixture of damaged telegrams.
     fn check_foreign(&mut self, sensor: usize, reporter: &mut ViolationReporter<'_>) {
         for unit in std::mem::take(&mut self.foreign) {
             if !self.family.is_collision(&unit, &mut self.damaged.iter().map(Vec::as_slice)) {
@@ -116,13 +120,14 @@ impl SensorTelegrams {
         }
     }
 
-    /// Remembers a telegram that the line damaged.
+    /// Stores a telegram that the line damaged.
     fn damage(&mut self, telegram: &[u8]) {
         self.damaged.truncate(MAX_DAMAGED - 1);
         self.damaged.push_front(telegram.to_vec());
     }
 
-    /// Removes a telegram that was sent and not yet published. Returns whether the telegram existed.
+    /// Removes the telegram with the hash `key` from the telegrams that were sent and not yet published. Returns
+    /// whether it was one of them.
     fn take(&mut self, key: u64) -> bool {
         let Entry::Occupied(mut entry) = self.unpublished.entry(key) else { return false };
         *entry.get_mut() -= 1;
@@ -133,7 +138,7 @@ impl SensorTelegrams {
     }
 }
 
-/// Number of damaged telegrams that are kept.
+/// Maximum number of stored damaged telegrams.
 const MAX_DAMAGED: usize = 4;
 
 /// Invariant: the network delivers nothing that the hub did not publish. The listener accepts only datagrams that were
@@ -142,8 +147,9 @@ const MAX_DAMAGED: usize = 4;
 /// hub with sequence number, time and quality, and never only a part of a sample.
 ///
 /// Two samples have no source (`docs/topics.md`). The first one is unknown zones, which the listener publishes because
-/// no sample arrived. The second one is a silent sensor after 3 s of silence. A late listener may report a past
-/// silence, so the stamp counts: no sample arrived in the 3 s before the stamp.
+/// no sample arrived. The second one is a status that reports a silent sensor, after 3 s of silence. A listener that
+/// runs late may report a past silence, so the invariant checks the stamp of the status: no sample arrived in the 3 s
+/// before it.
 pub(crate) struct RemoteNothingInvented {
     published: HashSet<u64>,
     /// Boot IDs of the hub's runs.
@@ -152,20 +158,20 @@ pub(crate) struct RemoteNothingInvented {
     sent: BTreeMap<(u32, u8, u8, u32, u8), u64>,
     /// Highest epoch that the listener accepted.
     epoch: u32,
-    /// Epoch and sensor of each announcement that the listener accepted. Before the announcement, the sensor of a
-    /// sample is unknown.
+    /// Epoch and sensor of each announcement that the listener accepted. Before this announcement, the listener cannot
+    /// assign a sample to a sensor.
     announced: HashSet<(u32, u8)>,
     /// Sensor and time of arrival of each sample that the listener accepted, assigned to a sensor and did not mark as
     /// late.
     arrived_at: BTreeSet<(usize, Nanos)>,
-    /// With a key, two sequence numbers for each epoch, sensor and topic: the first one that was announced to the
-    /// listener, and the highest one that the listener accepted.
+    /// Two sequence numbers for each epoch, sensor and topic: the first one that was announced to the listener, and the
+    /// highest one that the listener accepted. Only used if the listener has a key.
     numbers: BTreeMap<(u32, u8, u8), (u32, u32)>,
     has_key: bool,
     /// `CLOCK_MONOTONIC` of the listener's machine when the world began.
     clock_offset: Nanos,
     packet: PayloadBuffer,
-    /// Payload of unknown zones. A listener may publish unknown zones without a source.
+    /// Payload of unknown zones. A listener may publish these zones although the hub did not publish them.
     unknown: Vec<u8>,
 }
 
@@ -191,9 +197,9 @@ impl RemoteNothingInvented {
 }
 
 impl RemoteNothingInvented {
-    /// Returns whether a listener with a key is right to refuse a datagram. It is right if the datagram arrived before
-    /// the announcement of its sensor. It is also right if the datagram is older than the announcement or than the
-    /// window of sequence numbers, as a recorded datagram is.
+    /// Returns whether a listener with a key is right to refuse a datagram. The refusal is right if the datagram
+    /// arrived before the announcement of its sensor. It is also right if the datagram is older than the announcement
+    /// or than the window of sequence numbers, which is true of a recorded datagram.
     fn is_rightly_refused(&self, head: &Head, reason: DatagramError) -> bool {
         let known = self.numbers.get(&(head.epoch, head.sensor, head.topic));
         match (reason, known) {
@@ -301,8 +307,8 @@ impl Invariant for RemoteNothingInvented {
     }
 }
 
-/// Returns a hash of everything in a sample that a network must not change. A network may change the stamps of a
-/// status: the status gets its stamp when it is sent, and its state starts when the listener first receives the state.
+/// Returns a hash of everything in a sample that a network must not change. The stamps of a status may change: the
+/// status gets its stamp when it is sent, and its state starts when the listener first receives the state.
 fn key(sensor: usize, topic: Topic, header: &Header, payload: &[u8]) -> u64 {
     let flags = header.flags & (Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED);
     let is_suspect = header.quality() == Quality::Suspect;

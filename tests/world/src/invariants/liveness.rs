@@ -1,4 +1,4 @@
-//! Invariants on recovery: soon after the last fault, everything works again.
+//! Invariants on recovery: soon after the last fault, each link and each remote robot works again.
 
 use std::rc::Rc;
 
@@ -10,10 +10,10 @@ use crate::family::Family;
 use crate::remote::{LinkSettings, MAX_DRAIN_TIME, RECONNECT_INTERVAL};
 use crate::setup::Setup;
 
-/// Invariant: soon after the last fault, each link reports that it streams, and publishes measured values. It publishes
-/// scans as soon as the scanner has reported the mode that defines the bits of its values. The session repeats the
-/// request for the mode from time to time. The search for a scanner of another family starts after ten seconds without
-/// data.
+/// Invariant: soon after the last fault, each link reports that it streams, and publishes measured values. The link
+/// publishes scans as soon as the scanner has reported the mode that defines the meaning of the bits in its values. The
+/// session repeats the request for the mode from time to time. If the scanner was replaced by one of another family,
+/// the search for the new scanner starts after ten seconds without data.
 pub(crate) struct Liveness {
     faults_cleared_at: Option<Nanos>,
     sensors: Vec<SensorProgress>,
@@ -26,8 +26,8 @@ struct SensorProgress {
     search_starts_at: Nanos,
     /// Whether telegrams with measured values have been published, and whether scans have been published.
     has_arrived: [bool; 2],
-    /// Time of the first telegram, and time of the first scan. The time for which the scanner waited for its motor does
-    /// not count.
+    /// Time of the first telegram, and time of the first scan, without the time for which the scanner waited for its
+    /// motor.
     first_at: [Option<Nanos>; 2],
     /// Time of the scanner's last reply before the first telegram, and time of the first measurement after that reply.
     answered_at: Nanos,
@@ -120,18 +120,18 @@ impl Invariant for Liveness {
     }
 }
 
-/// Maximum time until the link streams, and maximum time until it publishes scans. After a second of silence, the hub
-/// searches for about 2.4 s, because the scanner may have another rate. If the scanner's last
-/// bytes were damaged just before the faults were cleared, the session first repeats its requests for up to 3 s. If a
-/// scanner streams without reporting its settings, the session requests them every ten seconds.
+/// Maximum time from the last fault until the link streams, and maximum time until the link publishes scans. After a
+/// second of silence, the hub searches for about 2.4 s (`docs/measured.md`), because the scanner may have another rate.
+/// If the scanner's last bytes were damaged just before the faults were cleared, the session first repeats its requests
+/// for up to 3 s. If a scanner streams without reporting its settings, the session requests them every ten seconds.
 const RECOVERY_LIMITS: [Nanos; 2] = [5_500 * MILLIS, 11_000 * MILLIS];
 /// Time without data from the scanner after which the search starts again.
 const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
 
 /// Invariant: soon after the last fault, a remote robot has the same verdict as the hub. The next announcement names
-/// the sensor, and after it the next zones are sent. From then on, the robot's verdict is not unknown. There is one
-/// exception: zones may be so rare that the first ones expire before the second ones arrive, because the first ones
-/// have no period yet (`docs/topics.md`).
+/// the sensor, and after this announcement the gateway sends the next zones. From then on, the robot's verdict is
+/// `clear`, `slow` or `stop`. There is one exception: the gateway may send zones so rarely that the first zones, which
+/// have no period yet, expire before the second zones arrive (`docs/topics.md`).
 pub(crate) struct RemoteLiveness {
     are_faults_cleared: bool,
     sensors: Vec<RemoteSensor>,
@@ -142,7 +142,7 @@ struct RemoteSensor {
     max_delay: Nanos,
     /// Whether the interval of zones is longer than the time for which a verdict without a period is valid.
     is_slow: bool,
-    /// Time since which the hub has published a known verdict, or `None` if the last verdict is unknown.
+    /// Time since which the hub's verdicts have been known, or `None` if its last verdict is unknown.
     known_since: Option<Nanos>,
     is_known: bool,
     /// Whether the robot has had a known verdict since the last fault.
@@ -154,8 +154,8 @@ impl RemoteLiveness {
         let sensor = |of: usize| {
             let (period, _) = setup.sensors[of].scan_times();
             let every = terms.send_interval.get() * period;
-            // Maximum time until both bridges find a router that starts when the faults are cleared, and have sent the
-            // queue.
+            // Maximum time until both bridges have connected to a router that starts when the faults are cleared, and
+            // the sender has sent its queue.
             let over_router = if terms.are_bridges { RECONNECT_INTERVAL + MAX_DRAIN_TIME } else { 0 };
             let max_delay = ANNOUNCE_INTERVAL + every + period + terms.delay_ns + over_router + TIMER_DELAY;
             RemoteSensor {
@@ -231,7 +231,7 @@ impl RemoteSensor {
     }
 }
 
-/// Maximum interval of zones at which the robot's verdict is always known.
+/// Maximum interval between zones at which the first zones are valid until the second zones arrive.
 const MAX_FREQUENT_INTERVAL: Nanos = 230 * MILLIS;
 /// Interval between two announcements.
 const ANNOUNCE_INTERVAL: Nanos = 1_000 * MILLIS;

@@ -10,8 +10,9 @@ use super::{Invariant, ViolationReporter};
 use crate::event::{Event, RevolutionFigures, Telegram};
 use crate::family::Family;
 
-/// Invariant: no byte disappears. A status reports exactly the number of bytes that the port returned to the running
-/// hub. Each of these bytes is in a telegram, in an acknowledgement, discarded, or still in the buffer.
+/// Invariant: no byte disappears. A status reports exactly the number of bytes that the running hub has read from the
+/// port. The status also assigns each of these bytes: to a telegram, to an acknowledgement, to the discarded bytes, or
+/// to the bytes still in the buffer.
 pub(crate) struct ByteCounters(Vec<u64>);
 
 impl ByteCounters {
@@ -52,9 +53,9 @@ impl Invariant for ByteCounters {
     }
 }
 
-/// Invariant: a running hub loses no intact telegram. A telegram is due if the port returned all its bytes as they were
-/// sent, while the hub reported that it streams. The hub publishes each due telegram once and in order, unless there
-/// was no memory for it.
+/// Invariant: a running hub loses no intact telegram. A telegram is due if the hub read all its bytes as the scanner
+/// sent them, while the hub reported that the scanner streams. The hub publishes each due telegram once and in order,
+/// unless there was no memory for it.
 pub(crate) struct NothingLost {
     sensors: Vec<SensorTelegrams>,
 }
@@ -64,19 +65,19 @@ struct SensorTelegrams {
     sent: VecDeque<SentTelegram>,
     /// Position of the first byte that the current session can have received.
     valid_from: u64,
-    /// Position after the last byte that the hub had read when it reported that it streams, or `None` if it does not
-    /// stream.
+    /// Position after the last byte that the hub had read when it reported that the scanner streams, or `None` if the
+    /// hub does not report this.
     streams_from: Option<u64>,
     read_end: u64,
-    /// Number of earlier scanners on this line, and whether the hub has not yet received a scan from the current one.
-    /// The session accepts a scanner with different scans only after a silence.
+    /// Number of earlier scanners on this line, and whether the hub has not yet received a scan from the current
+    /// scanner. If the scans of a new scanner have a different form, the session accepts them only after a silence.
     exchanged: u32,
     is_other: bool,
     /// Time until which bytes of the previous scanner may still be on the line.
     mixed_until: Nanos,
     /// Number of telegrams for which there was no memory.
     lacked_memory: usize,
-    /// Position after the last telegram, and number of the next telegrams that may be lost together with damaged bytes
+    /// Position after the last telegram; and how many of the next telegrams may be lost together with the damaged bytes
     /// before them.
     sent_end: u64,
     allowed_losses: usize,
@@ -247,7 +248,8 @@ impl SensorTelegrams {
         }
     }
 
-    /// Ends the stream. The session may have held back the last telegrams until it can examine the bytes after them.
+    /// Ends the stream. The last telegrams are no longer due, because the session may have held them back to wait for
+    /// the bytes after them.
     fn end_stream(&mut self, at: Nanos) {
         let at = if self.stall.1 >= at { self.stall.0 } else { at };
         for sent in
@@ -263,8 +265,8 @@ impl SensorTelegrams {
         }
     }
 
-    /// Returns whether damaged bytes arrived before `unit`, which has a checksum and is published now. If they did, the
-    /// hub must mark `unit`.
+    /// Returns whether damaged bytes arrived before `unit`, which has a checksum and is published now. If damaged bytes
+    /// arrived, the hub must mark `unit`.
     fn is_after_damage(&self, unit: &[u8]) -> bool {
         let exactness = self.family.point_accuracy(unit);
         if !self.foreign.is_empty()
@@ -287,13 +289,13 @@ impl SensorTelegrams {
     /// Handles the publication of a telegram. Returns a description of the telegrams that were lost before it.
     fn publish(&mut self, at: Nanos, bytes: &[u8]) -> Option<String> {
         let is_it = |sent: &SentTelegram| sent.is_read && sent.bytes == bytes;
-        // Replies are often identical, and standard packets sometimes are. Among identical units, choose a due one if
-        // there is one, and otherwise an intact one.
+        // Replies are often identical, and standard packets are sometimes identical. Among identical units, a due unit
+        // is the first choice, and an intact unit the second.
         let due = self.sent.iter().position(|sent| sent.due_at.is_some() && is_it(sent));
         let whole = due.or_else(|| self.sent.iter().position(|sent| sent.is_whole && is_it(sent)));
         let first = self.sent.iter().position(is_it);
-        // Of two identical units, choose the first one if choosing the other would mean that a unit between them was
-        // lost. A later check detects a real loss.
+        // If a due unit lies between the first identical unit and the chosen one, choose the first one instead, because
+        // otherwise the unit between them would be reported as lost. A later check detects a real loss.
         let is_due = |sent: &SentTelegram| sent.due_at.is_some();
         let skips = whole.is_some_and(|whole| self.sent.range(first.unwrap_or(0)..whole).any(is_due));
         let found = if skips { first } else { whole.or(first) };
@@ -304,13 +306,13 @@ impl SensorTelegrams {
         };
         let is_of_this = self.family.is_data(bytes) && self.sent[found].exchanged == self.exchanged;
         self.is_other &= !is_of_this || at < self.mixed_until;
-        // A unit that lost its first byte may be intact again together with the last byte of the previous unit, if both
-        // bytes have the same value. Either unit may be the published one.
+        // A unit may have lost its first byte. If the previous unit ends with a byte of the same value, this byte can
+        // replace the lost one. Then the previous unit is the one that lost a byte, and it is not due.
         let is_lent = !self.sent[found].is_whole;
         let passed = self.sent.drain(..=found).take(found);
         let mut lost: Vec<SentTelegram> = passed.filter(|sent| sent.due_at.is_some()).collect();
-        // A checksum of one byte is valid by chance in 1 of 256 cases. If damage combines two packets into one unit,
-        // the unit contains a part of the intact packet.
+        // A checksum of one byte is valid by chance in 1 of 256 cases. If damage combines two packets into one
+        // published unit, the unit contains a part of an intact packet. This packet does not count as lost.
         if let Some(torn) = lost.iter().position(|sent| overlaps(&foreign, &sent.bytes)) {
             lost.remove(torn);
         }
@@ -326,8 +328,8 @@ impl SensorTelegrams {
     }
 }
 
-/// Returns whether one unit ends with the same bytes with which the other unit starts. At least the header must be the
-/// same.
+/// Returns whether one unit ends with the bytes with which the other unit starts. The common part must be at least as
+/// long as a header.
 fn overlaps(foreign: &[u8], sent: &[u8]) -> bool {
     let is_end = |len: usize| foreign.ends_with(&sent[..len]) || sent.ends_with(&foreign[..len]);
     (MIN_HEADER_LEN..foreign.len().min(sent.len())).any(is_end)
@@ -339,12 +341,12 @@ const MIN_HEADER_LEN: usize = 2;
 const MAX_HOLD_TIME: Nanos = 100 * MILLIS;
 /// Maximum time for which a line holds back bytes (action `silence`).
 const MAX_LINE_DELAY: Nanos = 4_000 * MILLIS;
-/// Number of stored telegrams that were never due.
+/// Number of samples whose telegrams are stored although they were never due.
 const MAX_REMEMBERED: usize = 64;
 
-/// Invariant: the hub counts packets that a scanner sent and the hub did not receive. Packets have no sequence number,
-/// so the hub derives the number of missing packets from the times and angles of the packets around a gap. The count
-/// must be as exact as these times and angles permit.
+/// Invariant: the hub counts the packets that a scanner sent but the hub did not receive. Packets have no sequence
+/// number, so the hub derives the number of missing packets from the times and angles of the packets before and after a
+/// gap. The count must be as exact as these times and angles permit.
 pub(crate) struct LostOnLine {
     sensors: Vec<PacketCounters>,
 }
@@ -355,21 +357,22 @@ struct PacketCounters {
     sent: VecDeque<Vec<u8>>,
     /// The last published packet.
     last: Vec<u8>,
-    /// Count in the last status of this hub. The other fields apply to the time since the counts last agreed: lost
-    /// packets that the hub reported, packets that are missing, and the allowed difference between both numbers.
+    /// Count in the last status of this hub. The next three fields cover the time since the counts last agreed: number
+    /// of lost packets that the hub reported, number of packets that are missing, and allowed difference between these
+    /// two numbers.
     counted: Option<u64>,
     reported: u64,
     missing: u64,
     allowed_difference: u64,
     /// Sum of reported and missing packets at the last status.
     total_at_last_status: u64,
-    /// Whether the counts disagreed at the last status. The hub detects the number of missing packets later after a
-    /// stall, and for points without a checksum.
+    /// Whether the counts disagreed at the last status. A single disagreement is allowed, because after a stall, and
+    /// for points without a checksum, the hub determines the number of missing packets later.
     disagreed: bool,
-    /// Number of the next statuses that are not checked. It is set after an event that cannot be counted: a new
+    /// Number of the next statuses that are not checked. It is set after an event whose losses cannot be counted: a new
     /// session, or a packet that no scanner sent.
     unchecked_statuses: u8,
-    /// Whether packets were not published because of a lack of memory.
+    /// Whether a lack of memory prevented the publication of packets.
     lacked_memory: bool,
     measured_at: Nanos,
     /// Sum of the counts that all statuses report.
@@ -460,7 +463,7 @@ impl PacketCounters {
     }
 
     fn send(&mut self, unit: &[u8]) {
-        // A packet that the line duplicates was sent once.
+        // If the line duplicated a packet, the scanner sent it only once.
         let before = self.sent.back().map_or(&self.last[..], Vec::as_slice);
         if self.family.is_rotating() && before != unit {
             self.sent.push_back(unit.to_vec());
@@ -487,8 +490,8 @@ impl PacketCounters {
             self.unchecked_statuses = UNCHECKED_STATUSES;
         }
         self.missing += missing;
-        // The hub rounds the number of packets that fit between two packets. The speed of a head may change between the
-        // two packets.
+        // The hub rounds the number of packets that fit into a gap. In addition, the speed of the head may change
+        // during the gap.
         let exactness = self.family.point_accuracy(unit);
         let unmarked = if exactness.neighbors > 0 { MAX_UNMARKED_DIFFERENCE + missing / 10 } else { 1 };
         self.allowed_difference += if missing > 0 { unmarked + missing / 20 } else { 0 };
@@ -526,15 +529,15 @@ impl PacketCounters {
     }
 }
 
-/// Number of statuses that are not checked after an event that cannot be counted: the next status, and the one after
-/// it, which may contain losses that the hub detected later.
+/// Number of statuses that are not checked after an event whose losses cannot be counted. They are the next status and
+/// the following one, which may contain losses that the hub detected later.
 const UNCHECKED_STATUSES: u8 = 2;
-/// Maximum difference of the counts if only the number of points per revolution reveals a loss, in packets.
+/// Maximum difference of the counts, in packets, if the hub detects a loss only by the number of points per revolution.
 const MAX_UNMARKED_DIFFERENCE: u64 = 30;
-/// Maximum number of stored packets. A tty buffers no more packets of the fastest scanner.
+/// Maximum number of stored packets. The fastest scanner fills a tty with fewer packets.
 const MAX_SENT: usize = 20_000;
-/// Maximum countable gap, in packets. It corresponds to 1.5 s of the slowest scanner. In a longer gap, another scanner
-/// with another clock may have been connected.
+/// Maximum length of a gap that the hub can count, in packets: 1.5 s of the slowest scanner. During a longer gap,
+/// another scanner with another clock may have been connected.
 const MAX_GAP_PACKETS: u64 = 400;
 /// Minimum duration of a power cycle.
 const MIN_POWER_OFF: Nanos = 50 * MILLIS;

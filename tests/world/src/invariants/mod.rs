@@ -1,5 +1,5 @@
-//! Invariants of a world. Each one checks one property at every event, and reports its violations. An invariant does
-//! not depend on other invariants or on the scenario's actions.
+//! Invariants of a world. Each invariant checks one property at every event, and reports violations of this property.
+//! An invariant does not depend on other invariants or on the scenario's actions.
 
 mod counters;
 mod early;
@@ -45,7 +45,7 @@ pub(crate) struct ViolationReporter<'a> {
 impl ViolationReporter<'_> {
     /// Adds a violation.
     pub(crate) fn report(&mut self, message: String) {
-        // The same violation often repeats with every sample.
+        // The number is limited, because the same violation often repeats with every sample.
         if self.violations.len() < MAX_VIOLATIONS {
             self.violations.push(Violation { invariant: self.invariant, at_ns: self.at_ns, message });
         }

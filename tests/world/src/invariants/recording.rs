@@ -1,6 +1,6 @@
 //! Invariant on recordings: a recording contains each telegram of each sensor with its header, in order, and the number
 //! of missing telegrams. The real writer writes the recording into memory, and the real reader reads it. A recorded
-//! world takes about twice as long, so only one world in four is recorded.
+//! world takes about twice as long to run, so only one world in four is recorded.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -56,7 +56,8 @@ impl Recording {
         writer.write_sample(&name, *topic, header, bytes)
     }
 
-    /// Reads the recording. Returns a description of the difference from the samples that were recorded.
+    /// Reads the recording. Returns a description of the difference between the samples read and the recorded samples,
+    /// or `None` if they are equal.
     ///
     /// # Errors
     ///
@@ -80,7 +81,7 @@ impl Recording {
                 .map(|frame| (frame.header.unwrap_or_default(), HistoryHash::hash_bytes(&frame.telegram)))
                 .collect();
             let (missing, missed) = (part.contents().damage.telegrams, self.missed[&sensor]);
-            // A reader cannot detect the number of samples that were missed between two hubs.
+            // A reader cannot detect how many samples were missed from the end of one hub to the start of the next.
             if read != *taken || missing > missed {
                 let (read, taken) = (read.len(), taken.len());
                 return Ok(Some(format!(
@@ -124,5 +125,6 @@ impl Invariant for Recording {
 
 /// Interval of seeds at which worlds are recorded.
 const RECORDING_INTERVAL: u64 = 4;
-/// Encoding of the telegrams. Only logs that are not recordings of a hub need it.
+/// Encoding of the telegrams. The reader has a parameter for it, and uses it only for logs that are not recordings of a
+/// hub.
 const ENCODING: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };

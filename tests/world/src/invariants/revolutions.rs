@@ -1,6 +1,7 @@
-//! Invariant on revolutions: a scan of a rotating scanner contains only points of one revolution. It contains all of
-//! them unless the hub marks it as incomplete. Each point of the scan was measured at its angle, with its range, at the
-//! time that the scan states. While the port stays open, the number of beams changes at most every ten seconds.
+//! Invariant on revolutions: a scan of a rotating scanner contains only points of one revolution. The scan contains all
+//! points of this revolution, or the hub marks it as incomplete. The scanner measured each point of the scan at its
+//! angle, with its range, at the time that the scan states. While the port stays open, the number of beams changes at
+//! most every ten seconds.
 //!
 //! A stamp can be right only after the hub has received a packet without delay. Before that, the hub cannot distinguish
 //! a delayed line from a delayed scanner.
@@ -32,32 +33,33 @@ struct SensorPoints {
     family: Rc<dyn Family>,
     /// Recently measured points, in order of time.
     points: VecDeque<Point>,
-    /// Number of times that each recent packet was sent, by the packet's hash; and these hashes in the order of
+    /// Number of times that the scanner sent each recent packet, by the packet's hash; and these hashes in the order of
     /// sending.
     sent: HashMap<u64, u32>,
     sent_order: VecDeque<u64>,
-    /// Number of packets that were removed from the start of `sent_order`; and number of packets before the next one
-    /// that the hub will publish.
+    /// Number of packets that were removed from the start of `sent_order`; and number of all sent packets up to the
+    /// last one that the hub published.
     dropped: usize,
     matched: usize,
     /// Accuracy of the packets that were published last.
     exactness: PointAccuracy,
-    /// Time at which the last unit of unknown origin was published. No scanner sent this unit, or the hub could not
-    /// publish an earlier unit for lack of memory. The second field is the sequence number of the last telegram that a
-    /// scanner sent.
+    /// Time at which the hub published the last unit of unknown origin. No scanner sent this unit, or the hub could not
+    /// publish an earlier unit for lack of memory. The second field is the sequence number of the last published
+    /// telegram that a scanner sent.
     foreign_at: Option<Nanos>,
     last_known: Option<u64>,
-    /// Run of the hub, number of beams, and time of the first scan with this number of beams since the port was opened.
+    /// Boot ID of the hub, number of beams, and time of the first scan with this number of beams since the port was
+    /// opened.
     beams: Option<(u64, usize, Nanos)>,
     /// Position after the last packet that arrived without delay, and time at which that packet arrived.
     prompt: Option<(u64, Nanos)>,
-    /// Number of packets that were read without delay since the session began; time at which this number was large
-    /// enough; and time of the last of these packets.
+    /// Number of packets that were read without delay since the session began; time at which this number reached
+    /// `MIN_PROMPT_PACKETS`; and time of the last of these packets.
     prompts: u32,
     settled_at: Option<Nanos>,
     last_prompt_at: Option<Nanos>,
-    /// Position after the last sent packet; and time of the last bytes that took no time on the line. A packet that is
-    /// read together with such bytes seems to arrive early.
+    /// Position after the last sent packet; and time of the last bytes that arrived all at once, without time on the
+    /// line. A packet that is read together with such bytes seems to arrive early.
     end: u64,
     queued_at: Option<Nanos>,
     /// Time at which an intact packet was last on the line.
@@ -187,7 +189,8 @@ impl SensorPoints {
         }
     }
 
-    /// Returns the time at which the last point of `packet` was measured. The packet arrived completely at `at`.
+    /// Returns the time at which the scanner measured the last point of `packet`. The last byte of the packet arrived
+    /// at `at`.
     fn last_point_time(&self, at: Nanos, packet: &FirstPoint, exactness: PointAccuracy) -> Option<Nanos> {
         let (of, maximum) = (self.points.len(), at.saturating_sub(MAX_PACKET_TIME + packet.line_time));
         let lately = (0..of).rev().skip(packet.points - 1);
@@ -197,8 +200,8 @@ impl SensorPoints {
         Some(self.points[first + packet.points - 1].truth.at_ns)
     }
 
-    /// Checks a published sample. `was_backlogged` means that its packets may have been buffered while the hub was
-    /// stalled.
+    /// Checks a published sample. `was_backlogged` means that the packets of the sample may have been buffered while
+    /// the hub was stalled.
     ///
     /// # Errors
     ///
@@ -241,8 +244,8 @@ impl SensorPoints {
                 let before = self.beams.filter(|(of, ..)| *of == boot);
                 match before {
                     Some((_, before, _)) if before == beams => {}
-                    // While the port stays open, the number of beams changes only after the points per revolution have
-                    // been different for this time.
+                    // While the port stays open, the number of beams changes only after the number of points per
+                    // revolution has been different for `MIN_BEAM_COUNT_TIME`.
                     Some((_, before, since)) if at < since + MIN_BEAM_COUNT_TIME => {
                         return Err(format!("{beams} beams after {before}"));
                     }
@@ -283,14 +286,15 @@ impl SensorPoints {
         };
         let is_crowded = self.queued_at.is_some_and(|crowded_at| at < crowded_at + DELAY_WINDOW);
         let settles = if self.exactness.has_clock { SETTLE_TIME } else { CLOCK_LEARNING_TIME };
-        // While the hub is stalled, its estimate of the scanner's clock does not improve.
+        // While the hub is stalled, its estimate of the scanner's clock does not improve, so the last prompt packet
+        // counts.
         let learned_at = if self.exactness.has_clock { Some(at) } else { self.last_prompt_at };
         let is_learned =
             |settled_at: Nanos| learned_at.is_some_and(|learned_at| settled_at + settles < learned_at);
         let is_settled = self.settled_at.is_some_and(is_learned) && !is_crowded;
         let (mut points, mut shift) = (found(0), 0);
-        // If packets have no timestamp and are backlogged, the hub determines the number of missing revolutions in a
-        // gap later.
+        // If packets have no timestamp and are backlogged, the hub determines only later how many revolutions are
+        // missing in a gap.
         let is_open = was_backlogged && scan.is_incomplete() && !self.exactness.has_clock;
         if let Some(gap) = points.iter().position(Option::is_none).filter(|gap| is_open && *gap > 0)
             && self.is_from_later_revolution(
@@ -349,7 +353,7 @@ impl SensorPoints {
         let around = around.take_while(|turned| *turned < end_deg + MAX_REORDER_DEG);
         let measured = around.filter(|turned| (first_deg..end_deg).contains(turned)).count();
         let there = reported.len() + usize::from(scan.collisions);
-        // Points at the edge may belong to either revolution.
+        // Points at the edge may belong to this revolution or to a neighboring one.
         if !scan.is_incomplete() && measured.abs_diff(there) > self.exactness.points {
             return Err(format!("{there} of {measured} points in a scan that is not marked"));
         }
@@ -369,8 +373,8 @@ impl SensorPoints {
             return;
         }
         if telegram.damage.is_none() {
-            // The line lost all packets in this time. Without a timestamp in packets, the time of the next packets is
-            // not known yet.
+            // The line lost all packets for longer than `MAX_GAP`. If packets have no timestamp, the hub must estimate
+            // the scanner's clock again.
             if !self.exactness.has_clock && self.arrived_at + MAX_GAP < at {
                 self.restart();
             }
@@ -403,15 +407,16 @@ impl SensorPoints {
         }
     }
 
-    /// Returns whether a scanner sent the published `unit`. Standard packets are very short, so parts of two packets
-    /// often equal a packet that was sent before. Standard packets must therefore also be in order.
+    /// Returns whether a scanner sent the published `unit`. Standard packets are very short, so parts of two damaged
+    /// packets often equal a packet that was sent before. Standard packets must therefore be published in the order in
+    /// which they were sent.
     fn was_sent(&mut self, unit: &[u8]) -> bool {
         let key = HistoryHash::hash_bytes(unit);
         if self.exactness.neighbors == 0 {
             return self.sent.contains_key(&key);
         }
         let begin = self.matched.saturating_sub(self.dropped);
-        // A packet that the line duplicates was sent once.
+        // If the line duplicated a packet, the scanner sent it only once.
         let is_last = begin.checked_sub(1).and_then(|last| self.sent_order.get(last)) == Some(&key);
         let ahead = self.sent_order.iter().skip(begin).position(|sent| *sent == key);
         if !is_last && let Some(ahead) = ahead {
@@ -420,7 +425,8 @@ impl SensorPoints {
         is_last || ahead.is_some()
     }
 
-    /// Returns the measured point that matches `reported` at its time plus `shift`, within `tolerance`.
+    /// Returns the measured point that matches `reported`. The time of the measurement is the reported time plus
+    /// `shift`, within `tolerance`.
     fn find(&self, reported: &ReportedPoint, shift: i64, tolerance: Nanos) -> Option<&Point> {
         let at_ns = reported.at_ns.saturating_add_signed(shift);
         let begin = self.points.partition_point(|point| point.truth.at_ns + tolerance < at_ns);
@@ -428,8 +434,8 @@ impl SensorPoints {
         near.into_iter().find(|point| point.matches(reported, &self.exactness))
     }
 
-    /// Returns whether all `reported` points were measured later than reported, all by the same time, which is one or
-    /// several revolutions.
+    /// Returns whether all `reported` points were measured later than their reported times. The difference must be the
+    /// same for all points, and must be more than half a `period`.
     fn is_from_later_revolution(
         &self,
         reported: &[ReportedPoint],
@@ -454,8 +460,8 @@ impl SensorPoints {
         reported.iter().filter(is_wrong).count() as u64
     }
 
-    /// Returns the time difference between report and measurement for most points. Points are nearly the same in each
-    /// revolution, so the revolution that matches the most points counts.
+    /// Returns the time from the reported time of a point to its measurement, as the difference that fits the most
+    /// points. Points are nearly the same in each revolution, so all revolutions are compared.
     fn best_shift(&self, reported: &[ReportedPoint]) -> i64 {
         let Some(first) = reported.iter().find(|reported| reported.range_mm.is_some()) else { return 0 };
         let fit = |reported: &mut dyn Iterator<Item = &ReportedPoint>, shift: i64| {
@@ -473,26 +479,28 @@ impl SensorPoints {
     }
 }
 
-/// Maximum angle by which a point may lie before a point that was measured earlier, in degrees.
+/// Maximum angle by which a point may lie behind a point that was measured before it, in degrees.
 const MAX_REORDER_DEG: f64 = 40.0;
 /// Minimum time with the same number of beams while the port stays open.
 const MIN_BEAM_COUNT_TIME: Nanos = 10_000 * MILLIS;
 /// Maximum time between the first and the last point of a packet.
 const MAX_PACKET_TIME: Nanos = 60 * MILLIS;
-/// Maximum error of a stamp. While the speed of the head changes, the time of a later point may have an additional
-/// error of a tenth of the time since the stamp.
+/// Maximum error of a stamp. While the speed of the head changes, the time of a point of the scan may have an
+/// additional error: a tenth of the time from the stamp to the point.
 const MAX_STAMP_ERROR: Nanos = 5 * MILLIS;
-/// Maximum time that a packet spends on the line and in the port if it is not delayed.
+/// Maximum delay at which a packet is regarded as not delayed. It limits two times: the time from the measurement to
+/// the arrival of the packet, without the packet's time on the line; and the time from the arrival until the hub reads
+/// the packet.
 const MAX_PROMPT_DELAY: Nanos = 15 * MILLIS;
-/// Number of packets without delay after which the session has estimated the clock.
+/// Number of packets without delay after which the session has estimated the scanner's clock.
 const MIN_PROMPT_PACKETS: u32 = 10;
-/// Time from the last of these packets until stamps must be right.
+/// Time from the last of these packets after which stamps must be right.
 const SETTLE_TIME: Nanos = 10 * MILLIS;
-/// For packets without a timestamp: time that the session needs to estimate the scanner's clock; and time without a
-/// packet after which a different scanner may be connected.
+/// Two times that are used if packets have no timestamp: time that the session needs to estimate the scanner's clock;
+/// and time without a packet after which a different scanner may be connected.
 const CLOCK_LEARNING_TIME: Nanos = 1_500 * MILLIS;
 const MAX_GAP: Nanos = 300 * MILLIS;
-/// Time window in which the session determines the smallest delay.
+/// Length of the time window in which the session determines the smallest delay of a packet.
 const DELAY_WINDOW: Nanos = 9_000 * MILLIS;
 /// Maximum time after a foreign packet in which revolutions may contain points of that packet.
 const FOREIGN_POINTS_TIME: Nanos = 2_000 * MILLIS;
@@ -500,17 +508,17 @@ const FOREIGN_POINTS_TIME: Nanos = 2_000 * MILLIS;
 const CATCH_UP_TIME: Nanos = 10 * MILLIS;
 /// Minimum duration of a power cycle.
 const MIN_POWER_OFF: Nanos = 50 * MILLIS;
-/// Time for which measured points are stored; and maximum number of stored packets.
+/// Time for which this invariant stores measured points; and maximum number of stored packets.
 const HISTORY_TIME: Nanos = 12_000 * MILLIS;
 const MAX_SENT: usize = 65_536;
-/// Maximum time between a reported point and a matching measurement.
+/// Maximum time between a reported point and its measurement, when wrong points are counted.
 const POINT_MATCH_NS: Nanos = 15 * MILLIS;
 
 /// A measured point.
 #[derive(Clone, Copy, PartialEq)]
 struct Point {
     truth: TruePoint,
-    /// Angle since the first point of all, in degrees. It includes whole revolutions.
+    /// Angle by which the head has rotated since its very first point, in degrees. It includes whole revolutions.
     rotated_deg: f64,
 }
 
@@ -522,7 +530,7 @@ struct ReportedPoint {
     range_mm: Option<u16>,
 }
 
-/// Returns the measured beams of `scan`.
+/// Returns the beams of `scan` that the scanner measured, with or without a range.
 fn reported_points(stamp: Nanos, scan: &Scan) -> Vec<ReportedPoint> {
     let beams = (0..scan.beams()).filter(|&i| scan.code(i) != Some(Code::NotMeasured));
     let reported = |i: usize| ReportedPoint {
@@ -534,7 +542,8 @@ fn reported_points(stamp: Nanos, scan: &Scan) -> Vec<ReportedPoint> {
 }
 
 impl Point {
-    /// Returns whether `reported` is this point. A scanner may get no return from an object.
+    /// Returns whether `reported` is this point, within the accuracy. A reported point without a range can match a
+    /// point with a range, because a scanner may get no return from an object.
     fn matches(&self, reported: &ReportedPoint, exactness: &PointAccuracy) -> bool {
         let (is_there, most_deg) = match (reported.range_mm, self.truth.range_mm) {
             (Some(reported), Some(exact)) => {

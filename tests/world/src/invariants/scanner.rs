@@ -10,16 +10,18 @@ use crate::family::{Family, is_ld_packet};
 use crate::topics::Sample;
 
 /// Invariant: a sample has the family of its scanner. If a link has no family, its samples have no family until the
-/// scanner is found. Until then, the link publishes no telegram and no scan, and publishes a status only while the hub
-/// searches or has no port. The hub sends no byte to an LDROBOT that streams undisturbed.
+/// scanner is found. Until the scanner is found, the link publishes no telegram and no scan, and publishes a status
+/// without a family only while the hub searches or has no port. The hub sends no byte to an LDROBOT that streams
+/// undisturbed.
 pub(crate) struct Families(Vec<FamilyProgress>);
 
 struct FamilyProgress {
-    /// The family of the scanner. Both families if an exchange replaces the scanner with one of another family.
+    /// The family of the scanner. The list has both families if an exchange replaces the scanner with one of another
+    /// family.
     families: Vec<FamilyName>,
     is_auto: bool,
     opened_at: Nanos,
-    /// Time from which the hub must find a scanner of another family like any other scanner.
+    /// Time from which the hub must find a scanner of another family as soon as any other scanner.
     search_from: Nanos,
     /// Time since which packets have arrived without damage and without gaps; and time of the last packet.
     clean_since: Option<Nanos>,
@@ -55,7 +57,7 @@ impl Invariant for Families {
             Event::ScannerExchanged { sensor } => {
                 let of = &mut self.0[sensor];
                 of.clean_since = None;
-                // The session of the other family handles the silence of its scanner first.
+                // The session of the previous family first waits for its own scanner.
                 of.search_from = if of.families.len() > 1 { at + SEARCH_TIMEOUT } else { at };
             }
             Event::RateAltered { sensor } => self.0[sensor].clean_since = None,
@@ -76,7 +78,7 @@ impl FamilyProgress {
     /// Returns whether an LDROBOT has streamed since the port was opened, or for longer than the search takes to detect
     /// the stream.
     fn is_undisturbed(&self, at: Nanos) -> bool {
-        // The hub may have saved the other family, whose rates it then tries first.
+        // The hub may have saved the other of two families. It then tries the rates of that family first.
         let is_known = self.families == [FamilyName::Ld];
         let is_old = |since: Nanos| {
             is_known && since <= self.opened_at || since.max(self.search_from) + SEARCH_ROUND < at
@@ -86,7 +88,8 @@ impl FamilyProgress {
 
     fn send(&mut self, at: Nanos, telegram: &Telegram<'_>) {
         let begin = std::mem::replace(&mut self.sent_end, telegram.span.1);
-        // The scanner and the line work: the port has another rate, or the hub does not read.
+        // With these kinds of damage, the scanner and the line still work. The bytes are lost because the port has
+        // another rate or the hub does not read.
         let is_harmless = |damage: &str| matches!(damage, "baud" | "unread" | "flushed");
         let is_clean = is_ld_packet(telegram.bytes)
             && telegram.damage.is_none_or(is_harmless)
@@ -115,7 +118,8 @@ impl FamilyProgress {
                 searches
             }
             Topic::Telegram | Topic::Scan | Topic::Early => false,
-            // The zones are unknown, and the background is the saved one.
+            // Zones may have the verdict `unknown`, and the background may be the saved one. No scanner is needed for
+            // these samples.
             _ => true,
         };
         let is_unknown = self.is_auto && may_be_unknown && family.is_none();
@@ -126,9 +130,10 @@ impl FamilyProgress {
     }
 }
 
-/// Maximum time between two packets of a scanner that streams.
+/// Maximum time between two packets of a scanner that streams without gaps.
 const MAX_PACKET_GAP: Nanos = 50 * MILLIS;
-/// Maximum time of a round of the search. After a round, the search detects that a scanner has begun to stream.
+/// Maximum duration of one round of the search, in which it tries all rates. If a scanner has begun to stream, the
+/// search detects the stream within one round.
 const SEARCH_ROUND: Nanos = 4_000 * MILLIS;
 /// Time without data from the scanner after which the search starts again.
 const SEARCH_TIMEOUT: Nanos = 10_000 * MILLIS;
@@ -142,7 +147,7 @@ pub(crate) struct PortRate {
 #[derive(Clone, Copy, Default)]
 struct PortState {
     is_altered: bool,
-    /// Time of the first read since the alteration, or since the last telegram.
+    /// Time of the first read after the other process changed the rate, or after the last telegram if that is later.
     misread_since: Option<Nanos>,
     /// Whether the last read happened too long after `misread_since`.
     is_overdue: bool,
@@ -179,7 +184,7 @@ impl Invariant for PortRate {
                     reporter.report(format!("sensor {sensor}: the port keeps the rate of another process"));
                     of.is_altered = false;
                 }
-                // The hub sets the rate after a read, not before it.
+                // The hub restores its rate after a read, not before the read.
                 of.is_overdue = at > *of.misread_since.get_or_insert(at) + MAX_MISREAD_TIME;
             }
             _ => {}

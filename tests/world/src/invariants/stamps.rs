@@ -14,13 +14,13 @@ use crate::topics::Sample;
 /// Invariant: the stamps of a scan's telegram are right, or the hub marks them as estimates. Without the mark, the
 /// stamps are the times at which the first and last bytes of the telegram arrived at the port, even if the hub was
 /// stalled. While nothing is wrong, no stamp of a streaming scanner is an estimate. This invariant applies to families
-/// in which each sample is one telegram; the invariant `turns` checks the others.
+/// in which each sample is one telegram; the invariant `turns` checks the other families.
 pub(crate) struct Stamps {
     families: Vec<Rc<dyn Family>>,
     sensors: BTreeMap<usize, SensorStamps>,
     faults_cleared_at: Option<Nanos>,
-    /// Time until which bytes may arrive that took no time on the line. A telegram that is read together with such
-    /// bytes seems to arrive too early.
+    /// Time until which bytes may arrive all at once, without time on the line. A telegram that is read together with
+    /// such bytes seems to arrive too early.
     crowded_until: Nanos,
 }
 
@@ -29,7 +29,8 @@ struct SensorStamps {
     sent: VecDeque<SentTelegram>,
     /// Position after the last byte that the hub has read.
     read_end: u64,
-    /// Number of published scans since the line was opened, since its rate changed, and since the last reply.
+    /// Number of scans that were published since the last of three events: the line was opened, its rate changed, or a
+    /// reply arrived.
     consecutive_scans: usize,
 }
 
@@ -105,8 +106,8 @@ impl SensorStamps {
         }
     }
 
-    /// Returns a description of the error in the stamps of a scan's telegram. If `is_faultless`, nothing is wrong in
-    /// the world.
+    /// Returns a description of the error in the stamps of a scan's telegram, or `None` if there is no error. If
+    /// `is_faultless`, nothing is wrong in the world.
     fn publish(&mut self, header: &Header, bytes: &[u8], is_faultless: bool) -> Option<String> {
         if header.flags & Flags::STAMP_ESTIMATED != 0 {
             let is_new = self.consecutive_scans <= LEARNING_SCANS;
@@ -135,28 +136,30 @@ impl SensorStamps {
     }
 }
 
-/// Maximum error of a stamp without a mark. The time on the line of the bytes that a port passes on at once is added.
+/// Maximum error of a stamp that is not marked as an estimate. The time that [`USB_CHUNK_LEN`] bytes spend on the line
+/// is added.
 const MAX_STAMP_ERROR: Nanos = 5 * MILLIS;
-/// Maximum time by which a telegram may take longer than usual before the hub marks it as suspect.
+/// Maximum additional time, compared with the usual duration of a telegram, at which the hub does not yet mark the
+/// telegram as suspect.
 const MAX_DELAY: Nanos = 8 * MILLIS;
 /// Number of bytes that a USB adapter passes on at once. A longer chunk makes a stamp an estimate.
 const USB_CHUNK_LEN: usize = 64;
-/// Time after the last fault until no fault has an effect any more.
+/// Time after the last fault, after which no fault has an effect any more.
 const RECOVERY_TIME: Nanos = 3_000 * MILLIS;
 /// Number of consecutive scans after which the session has estimated the scan period.
 const LEARNING_SCANS: usize = 8;
-/// Maximum number of stored telegrams. A port buffers fewer.
+/// Maximum number of stored telegrams. The buffer of a port contains fewer telegrams.
 const MAX_TELEGRAMS: usize = 256;
 
 /// Invariant: the hub wakes a sleeping subscriber. A prompt subscriber receives each sample of a telegram shortly after
-/// the hub has sent it. A subscriber to zones need not wait for the marks of the same scan.
+/// the hub has sent it. The hub wakes a subscriber to zones before it sends the marks of the same scan.
 #[derive(Default)]
 pub(crate) struct Wakeups {
     /// Times at which prompt subscribers attached.
     attached_at: BTreeMap<SubscriberId, Nanos>,
     /// Topics of the subscribers.
     topics: BTreeMap<SubscriberId, (usize, Topic)>,
-    /// For each sensor, the `seq` of the telegram whose samples have subscribers that are not woken yet.
+    /// For each sensor, the `seq` of the telegram for whose samples the hub has not woken all subscribers yet.
     unwoken: BTreeMap<usize, u64>,
 }
 
@@ -211,5 +214,5 @@ impl Invariant for Wakeups {
     }
 }
 
-/// Maximum delay on a machine with idle processors.
+/// Maximum time from the publication of a sample until a prompt subscriber takes it, on a machine with idle processors.
 const MAX_WAKE_DELAY: Nanos = 2 * MILLIS;

@@ -12,8 +12,9 @@ use crate::topics::Sample;
 
 /// Invariant: a subscriber receives the samples of every scan that begins after the subscriber has attached
 /// (`docs/topics.md`). Each sample belongs to a word of the doorbell. The hub rings a word after it has sent all
-/// samples of the word, and before it sends samples of the next word or the next telegram. It rings a word only if a
-/// sample of the word has a subscriber. It then sends the event if one of the event's listeners has a sample.
+/// samples of the word, and before it sends samples of the next word or the next telegram. The hub rings a word only if
+/// a sample of the word has a subscriber. After the ring, the hub sends the event if one of the event's listeners has a
+/// new sample.
 pub(crate) struct Subscribers {
     sensors: Vec<SensorSubscribers>,
     sensor_of_subscriber: BTreeMap<SubscriberId, usize>,
@@ -29,11 +30,11 @@ struct SensorSubscribers {
     published: BTreeMap<Topic, u64>,
     /// Topics for whose samples there was no memory since the last scan.
     without_memory: Vec<Topic>,
-    /// For each word of the doorbell, whether a sample has subscribers that were not woken after it; and the `seq` of
-    /// the first telegram after whose samples the hub must ring.
+    /// For each word of the doorbell, whether the hub has sent a sample without ringing the word after it; and the
+    /// `seq` of the first telegram for whose samples the hub must still ring the word.
     is_due: [bool; RING_COUNT],
     due: [Option<u64>; RING_COUNT],
-    /// The `seq` of the telegram whose samples have listeners that the hub has not notified.
+    /// The `seq` of the telegram for whose samples the hub has not yet sent the event to its listeners.
     unnotified: Option<u64>,
 }
 
@@ -58,7 +59,7 @@ impl Invariant for Subscribers {
 
     fn on_event(&mut self, _: u64, event: &Event<'_>, reporter: &mut ViolationReporter<'_>) {
         match *event {
-            // The sequence numbers of a hub start at 0.
+            // The sequence numbers of each hub start at 0.
             Event::HubStarted { .. } | Event::HubEnded { .. } => {
                 self.sensors.iter_mut().for_each(SensorSubscribers::forget_hub);
             }
@@ -135,7 +136,7 @@ impl SensorSubscribers {
                 broken.extend(self.missing_topics(&[Topic::Scan], Some(seq)));
                 self.without_memory.clear();
             }
-            // A backlogged scan has no hub time either.
+            // Unknown zones have no hub time, and zones of a backlogged scan have no hub time either.
             self.scan = is_of_scan.then_some(seq);
         }
         self.published.insert(topic, seq);
@@ -145,7 +146,8 @@ impl SensorSubscribers {
         let ring = topic.spec().doorbell_word;
         if sample.receivers > 0 {
             self.is_due[ring as usize] = true;
-            // A status is sent before the next telegram.
+            // Only samples of a scan must be followed by the ring before the next telegram. A status may be sent at any
+            // time.
             if is_of_scan {
                 self.due[ring as usize].get_or_insert(seq);
             }
@@ -157,8 +159,8 @@ impl SensorSubscribers {
         broken
     }
 
-    /// Returns each of `topics` that has no sample of `scan`, although one of its subscribers had attached before the
-    /// scan.
+    /// Returns a message for each of `topics` that has no sample of `scan`, although a subscriber to the topic had
+    /// attached before the scan.
     fn missing_topics(&self, topics: &[Topic], scan: Option<u64>) -> Vec<String> {
         let Some(scan) = scan else { return Vec::new() };
         let is_absent = |of: &&AttachedSubscriber| {

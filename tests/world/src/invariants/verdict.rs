@@ -13,15 +13,15 @@ use crate::setup::Setup;
 /// Invariant: a robot does not accept a clear verdict for longer than documented while an object is inside a zone.
 ///
 /// According to `docs/topics.md`, a verdict is valid for two periods and 20 ms in the hub, and for 20 ms more in a
-/// subscriber. After that, it is unknown. A scan shows the objects at the time of its measurement, and needs some time
-/// on the line. A zone is violated only after a number of consecutive scans. Each of these scans may arrive as late as
-/// a verdict is valid in the hub.
+/// subscriber. After that, the verdict is unknown. A scan shows the objects at the time of its measurement, and needs
+/// some time on the line. A zone is violated only after a number of consecutive scans. The time between two of these
+/// scans may be as long as a verdict is valid in the hub.
 pub(crate) struct LocalVerdict {
     sensors: Vec<SensorVerdict>,
 }
 
 struct SensorVerdict {
-    /// Times at which an object is inside a zone.
+    /// Time spans in which an object is inside a zone.
     object_spans: Vec<(Nanos, Nanos)>,
     max_delay: Nanos,
     /// Time since which the robot has accepted a clear verdict, or `None` if the accepted verdict is not clear.
@@ -93,15 +93,16 @@ const TIMER_DELAY: Nanos = 3 * MILLIS;
 ///
 /// The maximum time has two parts. The first part is the time on the hub's machine: a gateway subscribes like a robot,
 /// so it sends clear zones for no longer than a robot next to the hub accepts them. The second part starts when the
-/// zones arrive, because the delay on the network is unknown (`docs/topics.md`). A verdict is then valid for two
-/// periods as sent and 40 ms, at least half a second and at most 5.04 s. After that, it is unknown.
+/// zones arrive, because the delay on the network is unknown (`docs/topics.md`). From its arrival on, a verdict is
+/// valid for two of the periods that the sender measured, plus 40 ms; at least for half a second and at most for 5.04
+/// s. After that, the verdict is unknown.
 pub(crate) struct RemoteVerdict {
     begin_ns: u64,
     sensors: Vec<RemoteSensor>,
 }
 
 struct RemoteSensor {
-    /// Times at which an object is inside a zone.
+    /// Time spans in which an object is inside a zone.
     object_spans: Vec<(Nanos, Nanos)>,
     /// Maximum time for which the gateway may send a clear verdict while an object is inside a zone.
     max_delay: Nanos,

@@ -1,5 +1,5 @@
-//! An attacker on the network. The attacker receives all datagrams for the listener's machine and sends similar ones,
-//! but does not have the key.
+//! An attacker on the network. The attacker receives all datagrams for the listener's machine and sends similar
+//! datagrams, but does not have the key.
 
 use std::collections::VecDeque;
 
@@ -23,7 +23,7 @@ pub(crate) enum Forgery {
 /// Datagrams that the attacker has recorded.
 #[derive(Default)]
 pub(super) struct Forger {
-    /// Recorded datagrams, oldest first. Each has its time of arrival on the listener's wall clock.
+    /// Recorded datagrams, oldest first, with their times of arrival on the wall clock of the listener's machine.
     recorded: VecDeque<(Nanos, Vec<u8>)>,
 }
 
@@ -36,9 +36,9 @@ impl Forger {
         self.recorded.push_back((wall_ns, bytes.to_vec()));
     }
 
-    /// Returns up to `count` datagrams of the kind `forgery`. For a recording, they are recorded datagrams that are at
-    /// least 8 s older than `wall_ns`. A listener that has just started may accept younger ones (docs/datagram.md). For
-    /// other kinds, they are derived from the datagrams that were recorded last.
+    /// Returns up to `count` datagrams of the kind `forgery`. For `Recording`, these are recorded datagrams that
+    /// arrived at least 8 s before or after `wall_ns`. A listener that has just started may accept younger datagrams
+    /// (docs/datagram.md). For the other kinds, the datagrams are derived from those that were recorded last.
     pub(super) fn forge(&self, forgery: Forgery, count: usize, wall_ns: Nanos) -> Vec<Vec<u8>> {
         let is_old = |at: Nanos| at.abs_diff(wall_ns) > MIN_REPLAY_AGE;
         let all = self.recorded.iter();
@@ -77,5 +77,5 @@ fn forge_next(bytes: &[u8], forgery: Forgery) -> Option<Vec<u8>> {
 
 /// Maximum number of recorded datagrams.
 const MAX_RECORDED: usize = 4_000;
-/// Minimum age at which no listener accepts a recorded datagram, in ns.
+/// Age from which on no listener accepts a recorded datagram, in ns.
 const MIN_REPLAY_AGE: Nanos = 8_000_000_000;

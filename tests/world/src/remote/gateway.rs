@@ -26,7 +26,7 @@ pub(super) struct Gateway {
     /// State of the zones of each sensor.
     zones: Vec<ZonesState>,
     background_interval: Option<std::time::Duration>,
-    /// Time at which the gateway polls its topics.
+    /// Time at which the gateway next polls its topics.
     next_poll_at: Nanos,
     tick_at: Nanos,
 }
@@ -72,14 +72,14 @@ impl Gateway {
         self.next_poll_at = self.next_poll_at.min(at + WAKE_DELAY);
     }
 
-    /// Returns the time at which the gateway has something to do.
+    /// Returns the time at which the gateway next has something to do.
     pub(super) fn next_ns(&self, now: Nanos) -> Nanos {
         let left = self.zones.iter().filter_map(|zones| zones.time_left(moment(now))).min();
         let silence = left.map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos));
         silence.min(self.next_poll_at).min(self.tick_at)
     }
 
-    /// Sends all samples that are queued, and everything that is due.
+    /// Sends all samples that are queued, and the announcements and silences that are due.
     pub(super) fn run(&mut self, shared: &SharedState, now: Nanos, uplink: &mut Uplink<'_>) {
         self.next_poll_at = Nanos::MAX;
         let stamp = stamp(shared, now);
@@ -129,8 +129,8 @@ impl Gateway {
         self.outgoing.is_waiting()
     }
 
-    /// Removes the sample that has been queued for the longest time, and returns its bytes. The router accepts them if
-    /// `is_taken`.
+    /// Removes the sample that has been queued for the longest time, and returns its bytes. With `is_taken`, the
+    /// gateway counts the sample as sent, because the router accepts these bytes.
     pub(super) fn take_next(&mut self, shared: &SharedState, now: Nanos, is_taken: bool) -> Option<Vec<u8>> {
         if shared.defect.triggers(Defect::UncountedDrop, 100) {
             self.outgoing.take_next(stamp(shared, now));
@@ -218,7 +218,8 @@ const BASE_EPOCH: u32 = 1_780_000_000;
 pub(crate) const FIRST_SUBSCRIBER_ID: u32 = 1_000_000;
 /// Interval between two announcements.
 const ANNOUNCE_INTERVAL: Nanos = ANNOUNCEMENT_INTERVAL.as_nanos() as Nanos;
-/// Maximum time until a running hub passes the history to a new subscriber. It does so without waking the subscriber.
+/// Maximum time until a running hub passes the history to a new subscriber. The hub does not wake the subscriber for
+/// the history.
 const HISTORY_DELAY: Nanos = 110 * MILLIS;
 
 /// Defines `lend`, which interprets the bytes of a sample as the table of topics specifies.

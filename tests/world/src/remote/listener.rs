@@ -58,7 +58,7 @@ impl Listener {
         }
     }
 
-    /// Adds a datagram to the kernel's buffer, if it has room.
+    /// Adds a datagram to the kernel's buffer, if the buffer has room.
     pub(super) fn receive(&mut self, now: Nanos, bytes: Vec<u8>) {
         if self.queued + bytes.len() <= RECEIVE_BUFFER_LEN {
             self.queued += bytes.len();
@@ -67,13 +67,14 @@ impl Listener {
         }
     }
 
-    /// Returns the time at which the listener has something to do.
+    /// Returns the time at which the listener next has something to do.
     pub(super) fn next_ns(&self) -> Nanos {
         self.next_at.min(self.next_check_at)
     }
 
-    /// Reads the datagrams in the kernel's buffer. With a key, the wall clock of the listener's machine is
-    /// `clock_offset_ns` ahead of virtual time, and the listener saves accepted epochs in `epochs`.
+    /// Reads the datagrams in the kernel's buffer. Two arguments matter only with a key: the wall clock of the
+    /// listener's machine is `clock_offset_ns` ahead of virtual time, and the listener saves accepted epochs in
+    /// `epochs`.
     pub(super) fn run(
         &mut self,
         shared: &SharedState,
@@ -131,7 +132,8 @@ impl Listener {
             ReceiveOutcome::Refused { reason: why, .. } => DatagramOutcome::Refused(*why),
             ReceiveOutcome::Untimely { .. } => DatagramOutcome::Refused(DatagramError::Untimely),
             ReceiveOutcome::Part => DatagramOutcome::Part,
-            // This listener selects no hub, and its gateway has no name.
+            // The last two outcomes do not occur, because this listener does not select hubs, and its gateway has no
+            // name.
             ReceiveOutcome::Duplicate | ReceiveOutcome::Ignored | ReceiveOutcome::Foreign => {
                 DatagramOutcome::Duplicate
             }
@@ -171,7 +173,7 @@ impl Listener {
     }
 }
 
-/// Returns the sample that a faulty listener would create from one part. Zeros replace the other parts.
+/// Returns the sample that a faulty listener would create from a single part. Zeros replace the other parts.
 fn partial_sample(bytes: &[u8]) -> Option<Vec<u8>> {
     let Datagram { head, payload, .. } = Datagram::read(bytes).ok().filter(|it| it.head.parts > 1)?;
     let begin = HEADER_LEN + payload.len() * usize::from(head.part);
@@ -181,9 +183,9 @@ fn partial_sample(bytes: &[u8]) -> Option<Vec<u8>> {
     Some(Head { part: 0, parts: 1, ..head }.seal(&mut buffer, len)?.to_vec())
 }
 
-/// ID of the publishing process.
+/// Process ID in the headers that the listener publishes.
 const PUBLISHER_PID: u32 = 77;
-/// Maximum number of datagrams that the listener handles before other work.
+/// Maximum number of datagrams that the listener handles before it does other work.
 const BATCH_SIZE: usize = 64;
 /// Size of the kernel's buffer, in bytes.
 const RECEIVE_BUFFER_LEN: usize = 1 << 20;
@@ -207,13 +209,13 @@ impl RemoteRobot {
         RemoteRobot { robot, sensors }
     }
 
-    /// Returns the time at which the first verdict expires if no sample arrives.
+    /// Returns the time at which the next verdict expires if no sample arrives.
     pub(super) fn next_ns(&self, terms: &LinkSettings, now: Nanos) -> Nanos {
         let left = self.sensors.iter().filter_map(|(_, state, _)| state.time_left(terms.moment(now)));
         left.min().map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos))
     }
 
-    /// Takes all published samples, and detects silences.
+    /// Takes all published samples, and updates the verdicts of sensors whose samples no longer arrive.
     pub(super) fn run(
         &mut self,
         shared: &SharedState,

@@ -1,6 +1,6 @@
 //! A router between two bridges, with a link to each of them. Everything that the router accepts arrives once and in
-//! order. However, the links can be slow or closed. If the router is killed, everything in it is lost. Both bridges
-//! reconnect by themselves.
+//! order. However, the links can be slow or closed. If the router is killed, all datagrams in the router are lost. Both
+//! bridges connect to the next router by themselves.
 
 use std::collections::VecDeque;
 
@@ -8,7 +8,7 @@ use scanhub_schema::{MICROS, MILLIS, Nanos};
 
 /// The router and its links.
 pub(super) struct Router {
-    /// Rate of a link without faults, and current rate of the link, in bytes per second.
+    /// Rate of the link if there are no faults, and current rate of the link, in bytes per second.
     rate: u64,
     current_rate: u64,
     delay_ns: Nanos,
@@ -18,7 +18,7 @@ pub(super) struct Router {
     /// Time span in which the sender can pass datagrams to the router. The span ends when the sender detects that its
     /// link is lost.
     connected: (Nanos, Nanos),
-    /// Time from which on the receiver is connected.
+    /// Time from which the receiver is connected.
     receives_from: Nanos,
     /// Time at which the link can accept the next datagram.
     has_room_at: Nanos,
@@ -29,7 +29,7 @@ pub(super) struct Router {
 }
 
 impl Router {
-    /// Creates a router to which both ends are connected.
+    /// Creates a router to which both bridges are connected.
     pub(super) fn new(seed: u64, delay_ns: Nanos) -> Router {
         let mut random = fastrand::Rng::with_seed(seed ^ 0x0B41_D6E0);
         let rate = LINK_RATES[random.usize(..LINK_RATES.len())];
@@ -48,7 +48,8 @@ impl Router {
         }
     }
 
-    /// Sets the packet loss and the delay of the link. The link sends lost packets again, which takes time.
+    /// Sets the packet loss and the delay of the link. Packets that are lost are sent again, so loss reduces the rate
+    /// of the link.
     pub(super) fn set_link(&mut self, loss: f64, delay_ns: Nanos) {
         self.current_rate = (self.rate as f64 / (1.0 + 100.0 * loss)) as u64;
         self.delay_ns = delay_ns;
@@ -65,8 +66,8 @@ impl Router {
         self.is_partitioned = is_partitioned;
     }
 
-    /// Kills the router. Everything in the router is lost. Everything that the sender passes on before it detects the
-    /// loss of its link is also lost.
+    /// Kills the router. All datagrams in the router are lost. Datagrams that the sender passes on before it detects
+    /// the loss of its link are lost, too.
     pub(super) fn kill(&mut self, now: Nanos) {
         if self.is_running {
             self.is_running = false;
@@ -77,7 +78,7 @@ impl Router {
         }
     }
 
-    /// Starts another router. Both bridges try to connect from time to time. With `gives_up`, they never try.
+    /// Starts another router. Both bridges try to connect from time to time. With `gives_up`, they never connect.
     pub(super) fn begin(&mut self, now: Nanos, gives_up: bool) {
         if !self.is_running && !gives_up {
             self.is_running = true;
@@ -95,7 +96,7 @@ impl Router {
         }
     }
 
-    /// Returns the time at which the router has room for a queued datagram, or [`Nanos::MAX`] if that time is unknown.
+    /// Returns the time at which the router has room for the next datagram, or [`Nanos::MAX`] if that time is unknown.
     pub(super) fn next_room_at(&self) -> Nanos {
         let at = self.has_room_at.max(self.connected.0);
         if at >= self.connected.1 || self.bytes >= SOCKET_BUFFER_LEN { Nanos::MAX } else { at }
@@ -132,16 +133,16 @@ impl Router {
 
 /// Possible rates of a link, in bytes per second. They range from a radio link to a fast network.
 const LINK_RATES: [u64; 3] = [2_000_000, 5_000_000, 50_000_000];
-/// Number of bytes that sockets buffer.
+/// Number of bytes that the sockets of a link buffer.
 const SOCKET_BUFFER_LEN: usize = 64 << 10;
-/// Maximum time between two datagrams that arrive after a partition, in nanoseconds.
+/// Time between the arrivals of datagrams that a partition has delayed, in nanoseconds.
 const MAX_SPACING_NS: usize = 10_000;
-/// Maximum time until a sender detects the loss of its link.
+/// Maximum time from the end of a router until a sender detects the loss of its link.
 const MAX_DISCONNECT_DELAY: Nanos = 20 * MILLIS;
-/// Time until a new listener is connected.
+/// Time from the start of a listener until it is connected.
 const CONNECT_TIME: Nanos = 500 * MICROS;
-/// Maximum time until a bridge is connected again.
+/// Maximum time from the start of a router until a bridge is connected to it.
 pub(crate) const RECONNECT_INTERVAL: Nanos = 500 * MILLIS;
-/// Maximum time in which a link without faults sends the whole queue. The queue contains the longest samples of all
-/// topics.
+/// Maximum time in which a link without faults sends a bridge's whole queue, even if the queue contains the longest
+/// samples of all topics.
 pub(crate) const MAX_DRAIN_TIME: Nanos = 200 * MILLIS;

@@ -1,4 +1,5 @@
-//! Topics of remote sensors, as queues in memory. A subscriber reads them when it is woken.
+//! Topics of remote sensors, as queues in memory. The listener publishes in them, and the remote robot reads them when
+//! it is woken.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
@@ -8,7 +9,7 @@ use scanhub_network::lan::incoming::CheckedPayload;
 use scanhub_network::lan::republish::{SensorTopics, TopicStore};
 use scanhub_schema::{Failure, Header, Topic, WakeEvent};
 
-/// Queues of all sensors, by name. They outlive their publisher.
+/// Queues of all sensors, by the sensor's name. A queue outlives its publisher.
 #[derive(Clone, Default)]
 pub(crate) struct TopicMemory(Rc<RefCell<BTreeMap<String, SensorQueue>>>);
 
