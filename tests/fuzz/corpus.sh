@@ -16,7 +16,7 @@ case $1 in
         [ -f "$text" ] || { echo "$usage" >&2; exit 2; }
         mkdir -p "$directory"
         while read -r hex name; do
-            # Use the name that the fuzzer would choose.
+            # Use the name that the fuzzer itself would choose for this content.
             [ -n "$name" ] || name=$(printf %b "$(sed 's/../\\x&/g' <<< "$hex")" | sha1sum | cut -d ' ' -f 1)
             printf %b "$(sed 's/../\\x&/g' <<< "$hex")" > "$directory/$name"
         done < "$text"
@@ -26,7 +26,7 @@ case $1 in
         for file in "$directory"/*; do
             name=$(basename "$file")
             [[ $name =~ ^[0-9a-f]{40}$ ]] && name=
-            # Named inputs sort before the others, and short ones before long ones.
+            # Sort named inputs before the others, and short inputs before long ones.
             printf '%s %08d %s %s\n' "${name:-~}" "$(stat -c %s "$file")" "$(od -An -v -tx1 "$file" | tr -d ' \n')" "$name"
         done | LC_ALL=C sort | awk '!seen[$3]++ { print $3 ($4 == "" ? "" : " " $4) }' > "$text.new"
         mv "$text.new" "$text"

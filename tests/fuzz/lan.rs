@@ -1,4 +1,5 @@
-//! Invariants for datagrams from a network: each datagram is refused, or its contents can be encoded again.
+//! Invariants for datagrams from a network: each datagram is refused, or the contents of the datagram can be encoded
+//! again.
 
 use scanhub_network::lan::{EvictedTotals, GatewayTable, MAX_ROWS, SequenceStatus};
 use scanhub_schema::Topic;
@@ -7,11 +8,11 @@ use scanhub_schema::datagram::{
 };
 
 /// Splits `data` into datagrams and checks three invariants. Each datagram is counted once. A refused datagram changes
-/// nothing else. An accepted datagram can be encoded again.
+/// nothing but the count of refusals. An accepted datagram can be encoded again.
 ///
-/// A datagram in `data` starts with a mode byte and a length of two bytes. With an even mode, the following bytes are
-/// the datagram itself. With an odd mode, they are a short header and a payload, and this function computes the
-/// checksum.
+/// A datagram in `data` starts with a mode byte and a length of two bytes. If the mode is even, the following bytes are
+/// the datagram itself. If the mode is odd, they are a short header and a payload, from which this function makes a
+/// datagram with a right checksum.
 pub(crate) fn lan(data: &[u8]) {
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
     let mut rest = data;
@@ -24,7 +25,7 @@ pub(crate) fn lan(data: &[u8]) {
         let bytes = if mode & 1 == 0 { Some(piece) } else { sealed_datagram(piece, &mut buffer) };
         let Some(bytes) = bytes else { continue };
         let before = counters(&table);
-        // Datagrams come from two senders, one every half second.
+        // Datagrams come from two senders, which one bit of the mode selects. A datagram arrives every half second.
         let (from, now_ns) = (u64::from(mode >> 1 & 1), 500_000_000 * given);
         let result = table.receive(bytes, from, now_ns);
         given += 1;
@@ -64,8 +65,8 @@ fn counters(table: &GatewayTable) -> (Vec<[u64; 4]>, EvictedTotals) {
     (rows.collect(), table.evicted())
 }
 
-/// Returns a datagram with a valid checksum, or `None` if `piece` is too short. There are only few hubs, epochs and
-/// sensors, so datagrams of the same stream are frequent.
+/// Returns a datagram with a valid checksum, or `None` if `piece` is too short. The header can name only a few hubs,
+/// epochs and sensors, so that many datagrams belong to the same stream.
 fn sealed_datagram<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
     let (short, payload) = piece.split_first_chunk::<10>()?;
     let head = Head {
@@ -96,7 +97,7 @@ fn can_be_reencoded(datagram: &Datagram<'_>) {
         let len = value.pack(&mut first).expect("room");
         assert!(T::unpack_into(&mut value, &first[..len]));
         assert_eq!(value.pack(&mut second), Some(len));
-        // Compare bytes, because a number may be NaN, which does not equal itself.
+        // Compare the bytes of the payloads, because a number in them may be NaN, which does not equal itself.
         assert_eq!(first, second);
     }
     let payload = datagram.payload;
@@ -114,8 +115,8 @@ fn can_be_reencoded(datagram: &Datagram<'_>) {
     scanhub_schema::for_each_topic!(by_topic);
 }
 
-/// Checks that the checksum detects one to three changed bits. The Hamming distance of the checksum at these lengths is
-/// 4.
+/// Checks that the checksum detects one to three changed bits. The checksum can do this, because its Hamming distance
+/// at these lengths is 4.
 fn is_damage_detected(bytes: &[u8], offsets: &[u8]) {
     let mut damaged = bytes.to_vec();
     let mut at = 0;

@@ -11,7 +11,7 @@ use super::scans::{Bytes, fill, layout};
 /// Reads settings from `data`, and then processes one scan after another until no bytes are left.
 pub(super) fn processors(data: &[u8]) {
     let mut bytes = Bytes(data);
-    // Some scans have more beams than this limit.
+    // Some scans in the input have more beams than this limit.
     let maximum = TopicLimits::default().beams;
     let pose = bytes.pose();
     let radii_mm: Vec<u16> = (0..bytes.u8() % 10).map(|_| bytes.u16()).collect();

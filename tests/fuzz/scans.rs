@@ -2,8 +2,8 @@
 
 use scanhub_schema::{ArrayFlags, Family, MAX_BEAMS, Pose, Scan, ScanArrays, ScanHead};
 
-/// Changes the layout of the scan: the number and angles of its beams, its unit and its longest range. Some layouts are
-/// the layouts of real scanners.
+/// Changes the layout of the scan: the number and angles of its beams, its unit and its longest range. Some of the
+/// possible layouts are those of real scanners.
 pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     let variant =
         [(361, -90_000, 500), (181, -90_000, 1000), (401, -50_000, 250)].get(usize::from(bytes.u8()));
@@ -47,7 +47,7 @@ pub(super) fn fill(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     }
 }
 
-/// The remaining bytes of the input. When no bytes are left, all values are zero.
+/// The bytes of the input that were not used yet. When no bytes are left, all values are zero.
 pub(super) struct Bytes<'a>(pub(super) &'a [u8]);
 
 impl Bytes<'_> {
@@ -82,7 +82,8 @@ impl Bytes<'_> {
         i32::from_le_bytes(self.take())
     }
 
-    /// Returns any number, including infinities and NaN. Most numbers are in the range of a sensor's coordinates.
+    /// Returns a number from the input, which may be infinite or NaN. Most numbers are in the range of a sensor's
+    /// coordinates.
     pub(super) fn number(&mut self) -> f64 {
         match self.u8() {
             0 => f64::from_bits(u64::from_le_bytes(self.take())),

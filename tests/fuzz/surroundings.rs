@@ -1,5 +1,5 @@
 //! Invariants for the processors that track the robot's motion: line features, motion, and the background of a moving
-//! robot. No uncertainty is smaller than the readings permit.
+//! robot. No estimated variance is smaller than the readings permit.
 
 use scanhub_preprocess::background::{BackgroundModel, Candidate, Class, Method, Settings, Start};
 use scanhub_preprocess::lines::{self, LineFinder, StopCriterion};
@@ -36,7 +36,7 @@ pub(super) fn surroundings(data: &[u8]) {
         if bytes.is_empty() {
             break;
         }
-        // With larger values, the previous scan is processed again.
+        // If the value is larger than those of the cases below, the previous scan is processed again.
         let what = bytes.u8();
         match what {
             0..=3 => estimator.reset(),
@@ -114,15 +114,16 @@ fn assert_motion(scan: &Scan, before: &Motion, motion: &Motion, settings: &motio
                 assert!((of(row, column) - of(column, row)).abs() <= 1e-5 * maximum, "{motion:?}");
                 assert!(of(row, column).abs() <= (1.0 + 1e-5) * maximum, "{motion:?}");
             }
-            // The variance if all beams measured the same wall and there were no other uncertainty.
+            // The variance that the estimate would have if all beams measured the same wall and nothing else were
+            // uncertain.
             let surest = MIN_VARIANCE / scan.beams() as f64;
             assert!(of(0, 0) >= surest && of(1, 1) >= surest && of(2, 2) > 0.0, "{motion:?}");
         }
     }
 }
 
-/// Fills the scan with walls. On a wall, the range changes by the same amount from each beam to the next one. Noise is
-/// added.
+/// Fills the scan with walls. On a wall, the range changes by the same amount from each beam to the next one. The input
+/// also adds noise.
 fn walls(bytes: &mut Bytes<'_>, scan: &mut Scan) {
     let ranges = scan.arrays().ranges;
     let mut end = 0;
@@ -148,8 +149,8 @@ const MAP_SETTINGS: Settings = Settings {
     start: Start::Empty,
     no_return_is_far: None,
 };
-/// A hundredth of the minimum variance of a range, which is (5 mm)^2. A beam that grazes its wall has a twentieth of
-/// the minimum variance.
+/// Minimum variance of a range in this check, in square meters. It is a hundredth of the minimum variance of a range,
+/// which is (5 mm)^2, because a beam that grazes its wall has only a twentieth of that.
 const MIN_VARIANCE: f64 = 2.5e-7;
-/// Maximum number of scans, because the background of a moving robot takes long to forget.
+/// Maximum number of scans in an input, because the background of a moving robot takes long to forget.
 const SCANS: usize = 40;

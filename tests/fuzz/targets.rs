@@ -27,7 +27,7 @@ use scanhub_schema::{MILLIS, Nanos};
 /// A target with its name.
 pub type Target = (&'static str, fn(&[u8]));
 
-/// All targets. The corpus of each is `corpus/NAME.txt`.
+/// All targets. The corpus of a target is `corpus/NAME.txt`.
 pub const TARGETS: [Target; 8] = [
     ("framer", framer),
     ("replies", replies),
@@ -39,10 +39,11 @@ pub const TARGETS: [Target; 8] = [
     ("recording", recording),
 ];
 
-/// Passes any bytes to the framer, in pieces. Each delivered telegram is at the reported position and has a valid
-/// checksum. Telegrams arrive in order, and no byte disappears.
+/// Passes any bytes to the framer, in pieces. Checks that each telegram that the framer delivers is at the reported
+/// position and has a valid checksum. Telegrams must arrive in order, and every byte must be counted.
 ///
-/// The first byte selects the expected headers, and the second one is the size of the pieces.
+/// The first byte of the input selects the headers that the framer expects, and the second byte is the size of the
+/// pieces.
 pub fn framer(data: &[u8]) {
     let [expects, piece, bytes @ ..] = data else { return };
     // A session copies the header of a stream from a telegram that it received, so the header's length is valid.
@@ -86,8 +87,8 @@ fn drain(framer: &mut Framer, bytes: &[u8], checked_len: &mut usize) {
     assert_eq!(read, in_telegrams + acknowledge + discarded + framer.buffered() as u64);
 }
 
-/// Decodes any data in a telegram with a valid checksum, as a request and as a reply. If decoding succeeds, the result
-/// can be encoded again.
+/// Decodes any data in a telegram with a valid checksum, both as a request and as a reply. If decoding succeeds, checks
+/// that the result can be encoded again.
 pub fn replies(data: &[u8]) {
     let [address, command, rest @ ..] = data else { return };
     let rest = &rest[..rest.len().min(MAX_LENGTH - 1)];
@@ -111,7 +112,7 @@ pub fn replies(data: &[u8]) {
             reply.encode(*address, status).map(|again| Reply::decode(again.telegram()) == Some(reply));
         assert_ne!(again, Some(false), "{reply:?}");
     }
-    // The fields cover the whole telegram without gaps.
+    // The explained fields must cover the whole telegram without gaps.
     let mut end = 0;
     explain(telegram, None, &mut |field| {
         assert_eq!(field.offset, end, "{}", field.name);
@@ -165,7 +166,7 @@ pub fn session(data: &[u8]) {
         let known = tally.in_telegrams + tally.acknowledge + tally.discarded + session.stats().buffered;
         assert_eq!((tally.read, known), (read, read), "bytes vanished");
         match what & 3 {
-            // Receive bytes that are part of the program.
+            // Receive bytes, which are part of the program.
             0 => {
                 let spare = session.read_buffer();
                 let len = rest.len().min(usize::from(*much)).min(spare.len());
@@ -174,7 +175,7 @@ pub fn session(data: &[u8]) {
                 read += len as u64;
                 session.commit(now, len);
             }
-            // Advance the time, perhaps by less than the session waits for.
+            // Advance the time, perhaps by less than the session wants to wait.
             1 => {
                 now += Nanos::from(*much) * MILLIS / 8;
                 session.commit(now, 0);
@@ -189,7 +190,7 @@ pub fn session(data: &[u8]) {
                 const CONTROLS: [Control; 3] = [Control::Pause, Control::Resume, Control::Resync];
                 session.control(CONTROLS[usize::from(*much) % CONTROLS.len()], now);
             }
-            // Receive a reply with a valid checksum. Its data are part of the program.
+            // Receive a reply with a valid checksum. The data of the reply are part of the program.
             _ => {
                 let len = rest.len().min(usize::from(*much)).min(120);
                 let (reply, after) = rest.split_at(len);
@@ -208,7 +209,7 @@ pub fn session(data: &[u8]) {
     assert_harmless(&request_bytes);
 }
 
-/// Checks that no telegram at any position in `request_bytes` writes the EEPROM.
+/// Checks that no request that writes the EEPROM starts at any position in `request_bytes`.
 fn assert_harmless(request_bytes: &[u8]) {
     for at in 0..request_bytes.len() {
         let [STX, _, low, high, command, ..] = request_bytes[at..] else { continue };
@@ -219,7 +220,7 @@ fn assert_harmless(request_bytes: &[u8]) {
     }
 }
 
-/// Loads any text as flags and as a configuration file. The configuration is accepted, or refused with a remedy.
+/// Loads any text as flags and as a configuration file. The configuration must be accepted, or refused with a remedy.
 ///
 /// The text is split at zero bytes. The first part is the file. The other parts are values of `--set` and `--link`,
 /// alternating.

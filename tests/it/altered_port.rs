@@ -46,7 +46,8 @@ fn hub_restores_baud_rate_changed_by_another_process() {
         (env, simulator, hub)
     });
     for (env, _simulator, hub) in hubs {
-        // The status keeps the message for only ten seconds, so a busy machine may miss it. The log has it, too.
+        // The status keeps the message for only ten seconds, so the test may not see the message there on a busy
+        // machine. It searches the log instead.
         env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] == "");
         let outcome = hub.end(TERM);
         let logs = |words: &str| outcome.stderr.contains(words);
@@ -62,7 +63,7 @@ fn message_names_a_program_that_changes_ports() {
     let other = OtherProcess::open(&env.path("front"));
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
-    // This symlink makes a process of `scanhub` look like ModemManager.
+    // Through this symlink, a process of `scanhub` has the name `ModemManager`.
     symlink(env!("CARGO_BIN_EXE_scanhub"), env.path("ModemManager")).expect("a link");
     let mut command = Command::new(env.path("ModemManager"));
     command

@@ -1,4 +1,5 @@
-//! Hub whose link has `family = "auto"`: it finds the scanner, reports and saves it, and reports if there is none.
+//! Hub whose link has `family = "auto"`. The hub finds the scanner, reports it and saves it, or reports that no scanner
+//! is connected.
 
 use std::fs;
 
@@ -131,7 +132,7 @@ fn silent_line_is_reported_with_unknown_family() {
 #[test]
 fn unrecognized_bytes_are_reported_with_probe_command() {
     let env = TestEnv::new();
-    // Every telegram is damaged.
+    // Every telegram is damaged, so the hub cannot recognize any.
     let damage = ["--baud=500000", "--state=streaming", "--fault=flip=0.5,flip_bits=64,overlook=1"];
     let _simulator = env.simulator(&["front"], &damage);
     let _hub = hub(&env);
@@ -186,7 +187,7 @@ fn number_of_beams_survives_a_hub_restart() {
         hub.end(how);
     }
     // Connect another model that uses the same rate. The hub publishes its first scans with the saved number of beams,
-    // and changes the number once it is certain.
+    // and changes this number as soon as it has measured the number of the new scanner.
     env.kill_port_simulator(ld14p, "front");
     let _ld19 = env.simulator(&["front"], LD19_FLAGS);
     let hub = hub(&env);
@@ -206,8 +207,8 @@ fn number_of_beams_survives_a_hub_restart() {
     assert_eq!(log.matches(message).count(), 1, "{log}");
 }
 
-/// A recording that starts during a stream contains no reply with the scanner's type. It contains a status with the
-/// type.
+/// A recording that starts during a stream contains no reply with the scanner's type. The test records topic `status`,
+/// too, which has the type.
 #[test]
 fn recording_has_the_model_of_its_scanner() {
     for (simulated, model) in [(LMS_FLAGS, "lms200"), (LD19_FLAGS, "ld19"), (A1_FLAGS, "a1")] {

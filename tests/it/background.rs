@@ -1,5 +1,5 @@
 //! `scanhub background` with a running hub: shows, saves, resets and loads the background model, and rejects files that
-//! do not fit.
+//! do not fit the sensor.
 
 use std::fs;
 
@@ -24,7 +24,8 @@ fn background_line(env: &TestEnv, arguments: &[&str]) -> Value {
     let [line] = &outcome.lines()[..] else { panic!("exactly one line was expected: {outcome}") };
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let mut line = line.clone();
-    // The hub may save the model at any time, and a file does not contain the time at which the hub saved it.
+    // Remove the time at which the hub saved the model, because the hub may save it at any time. A file does not
+    // contain this time.
     line.as_object_mut().map(|line| line.remove("kept_wall_ns"));
     line
 }
@@ -75,20 +76,21 @@ fn saved_background_can_be_loaded_again() {
     let text = env.run(&["background", "front", "show"]);
     assert!(String::from_utf8_lossy(&text.stdout).starts_with("front: generation "), "{text}");
 
-    // Subscribers receive each generation.
+    // Subscribers receive a sample for each new generation of the background.
     subscriber.await_line("the loaded model", |line| {
         line["class"] == "background" && line["generation"] == back["generation"]
     });
     drop(subscriber);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 
-    // A hub that starts with the file has the learned background at once, before the first scan changes it.
+    // A hub that starts with the file has the background of the file at once. No scan has changed this background yet,
+    // because no scanner is connected.
     drop(simulator_of_first);
     let begin = format!("--set=link.front.background.start={file}");
     let _hub = env.hub(&[&env.link("front"), QUICK_LEARNING, &begin]);
     let at_start = background_line(&env, &["show"]);
     assert_eq!(at_start["ranges"], model["ranges"]);
-    // The scans of the sensor fit the loaded background, so the hub continues with it.
+    // The scans of the sensor fit the loaded background, so the hub continues with this background.
     let _simulator = simulator(&env);
     let mut scans = env.echo(&["front/scan"]);
     scans.await_lines(5, "a scan", |line| line["class"] == "scan");

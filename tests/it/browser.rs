@@ -14,7 +14,7 @@ use tungstenite::{Message, WebSocket};
 
 use crate::testkit::{Child, WAIT_TIMEOUT, spawn};
 
-/// Names of the program in Debian, with and without support for windows.
+/// Names of the browser's program in Debian. The first program can open windows, the second one cannot.
 const BROWSER_NAMES: [&str; 2] = ["chromium", "chromium-headless-shell"];
 
 /// Window and device in which the browser shows a page.
@@ -60,7 +60,7 @@ impl Browser {
         let mut lines = BufReader::new(process.stderr.take()?).lines().map_while(Result::ok);
         let address = lines.find_map(|line| Some(line.split_once("listening on ws://")?.1.to_owned()));
         let address = address.unwrap_or_else(|| panic!("the browser does not print its debugging address"));
-        // Read the rest of its stderr, so that a full pipe does not block the browser.
+        // Read the rest of the browser's stderr, so that a full pipe does not block the browser.
         thread::spawn(move || lines.for_each(drop));
         let (host, _) = address.split_once('/').expect("a path");
         let stream = TcpStream::connect(host).expect("the debugging port accepts connections");
@@ -93,7 +93,8 @@ impl Browser {
         let screen =
             json!({ "width": width, "height": height, "deviceScaleFactor": ratio, "mobile": is_phone });
         self.call("Emulation.setDeviceMetricsOverride", screen);
-        // With reduced motion, the view reaches its final position in the next frame, however long that frame takes.
+        // With reduced motion, the view reaches its final position in the next frame, without an animation, so the test
+        // does not have to wait for an animation.
         let features = json!([
             { "name": "prefers-color-scheme", "value": scheme },
             { "name": "prefers-reduced-motion", "value": "reduce" },
@@ -146,7 +147,8 @@ impl Browser {
         }
     }
 
-    /// Sends a mouse event of this `kind` at a position, with the left button pressed if `is_held`.
+    /// Sends a mouse event of this `kind` at the position (`x`, `y`), with the left button pressed if `is_held` is
+    /// true.
     pub(crate) fn mouse(&mut self, kind: &str, (x, y): (f64, f64), is_held: bool) {
         let button = if is_held { "left" } else { "none" };
         let buttons = u8::from(is_held);
@@ -172,8 +174,8 @@ impl Browser {
         self.socket.send(Message::text(call.to_string())).expect("the browser accepts the call");
         loop {
             let response = match self.socket.read() {
-                // The process of the test was stopped and continued, for example because its virtual machine was
-                // suspended.
+                // The test process was stopped and continued in the meantime, for example because its virtual machine
+                // was suspended.
                 Err(tungstenite::Error::Io(error)) if error.kind() == ErrorKind::Interrupted => continue,
                 result => result.unwrap_or_else(|error| panic!("{method}: {error}")),
             };

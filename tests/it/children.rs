@@ -1,5 +1,5 @@
-//! Cleanup of child processes: the testkit ends each child with its descendants, and the processes of interrupted test
-//! runs.
+//! Cleanup of child processes. The testkit ends each child together with its descendants, and it ends the processes
+//! that interrupted test runs left.
 
 use std::fs;
 use std::io::{BufRead, BufReader};
@@ -15,12 +15,13 @@ use crate::testkit::{
     status, wait_until, write_program,
 };
 
-/// Variable that the testkit sets. It names the test binary from which a process descends.
+/// Variable that the testkit sets in the environment of each child. It names the test binary from which a process
+/// descends.
 const RUN_VARIABLE: &str = "SCANHUB_TEST_RUN";
-/// Variable that is set in the process that acts as the next test run.
+/// Variable that is set in the test process that acts as the next test run.
 const NEXT_RUN_VARIABLE: &str = "SCANHUB_TEST_NEXT_RUN";
 
-/// Returns whether a process is running. A zombie is not.
+/// Returns whether the process `pid` is running. A zombie does not count as running.
 fn is_running(pid: &str) -> bool {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     stat.rsplit_once(')').is_some_and(|(_, rest)| !rest.trim_start().starts_with(['Z', 'X']))
@@ -39,17 +40,17 @@ fn shell(script: &str) -> (Child, String) {
 
 #[test]
 fn dropping_a_script_ends_its_children() {
-    // Debian's browser is a shell script like this one, which does not `exec`.
+    // Debian's browser is such a shell script: it starts another program without `exec`.
     let (script, child) = shell("sleep 1000 & echo $!; wait");
     assert!(is_running(&child));
     drop(script);
     assert!(!is_running(&child), "the child of the script still runs");
-    // The script exits before its child.
+    // In this script, the shell exits before its child.
     let (mut script, child) = shell("sleep 1000 & echo $!");
     assert!(script.wait().is_ok_and(|status| status.success()) && is_running(&child));
     drop(script);
     assert!(!is_running(&child), "the child of an ended script still runs");
-    // The program and its child ignore TERM.
+    // In this script, the shell and its child ignore TERM.
     let (script, child) = shell("trap '' TERM; sleep 1000 & echo $!; wait");
     drop(script);
     assert!(!is_running(&child), "TERM was ignored");
@@ -99,11 +100,12 @@ fn ends_processes_of_interrupted_runs() {
     ended.wait().expect("the process exits");
     let start = run.rsplit(':').next().expect("the start time of this process");
     let (target, ended_pid) = (env.path_argument("target"), ended.id());
-    // The test binary of each process has ended. In the second case, another process now has its ID.
+    // The test binaries of these processes have ended. In the second case, the ID of the test binary now belongs to
+    // another process, which started later.
     let left =
         [format!("{target}:{ended_pid}:5"), format!("{target}:{own}:5")].map(|run| start_with_run(&run));
-    // These test binaries must not match: one still runs, one started too late, one is in another directory, and one is
-    // not named.
+    // The test binaries of these processes must not match. The first one still runs, the second one started too late,
+    // and the third one belongs to another target directory. The fourth value names no test binary.
     let kept = [
         format!("{target}:{own}:{start}"),
         format!("{target}:{ended_pid}:6"),
@@ -141,7 +143,8 @@ fn written_program_can_be_started_at_once() {
     let env = TestEnv::new();
     let is_over = AtomicBool::new(false);
     thread::scope(|scope| {
-        // These threads start processes. Each child would inherit a file that this process has open for writing.
+        // These threads start processes. If this process itself had the program's file open for writing, each child
+        // would inherit the open file.
         for _ in 0..4 {
             scope.spawn(|| {
                 while !is_over.load(Ordering::Relaxed) {

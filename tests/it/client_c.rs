@@ -1,5 +1,6 @@
-//! Library for C and C++, tested from outside. The tests compare its header with `schema`. They also build programs in
-//! C and C++ as users do, and run these programs with a hub. The tests are skipped if there is no C compiler.
+//! Library for C and C++, tested from outside. The tests compare the header of the library with `schema`. They also
+//! build programs in C and C++ as users do, and run these programs with a hub. If no C compiler is installed, the tests
+//! are skipped.
 
 pub(crate) mod installed;
 mod layout;
@@ -19,7 +20,7 @@ fn expect_success(output: &Output) -> String {
     text(&output.stdout)
 }
 
-/// Starts `program` with the arguments `words`. It finds the hub of `env`.
+/// Starts `program` with the arguments `words`, in an environment in which the program finds the hub of `env`.
 fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
     let mut command = Command::new(program);
     command.args(words).env("SCANHUB_DOMAIN", env.domain().name()).env_remove("XDG_RUNTIME_DIR");
@@ -28,7 +29,7 @@ fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
     Program::start(command)
 }
 
-/// Returns the bytes that the key `data` of a line has as hexadecimal digits.
+/// Returns the bytes in the field `data` of a JSON line, which has them as hexadecimal digits.
 fn data(line: &Value) -> Vec<u8> {
     let text = line["data"].as_str().unwrap_or_else(|| panic!("no data in {line}"));
     (0..text.len())
@@ -116,8 +117,8 @@ fn c_header_computes_the_same_values_as_schema() {
     }
 }
 
-/// Programs receive the same samples whether they wait by `doorbell`, `poll` or `event` or spin. The samples lie in the
-/// memory to which the hub wrote them.
+/// Programs receive the same samples with each wait method: `doorbell`, `poll`, `event` and `spin`. The program reads
+/// each sample in the shared memory to which the hub wrote it.
 #[test]
 fn c_program_receives_every_sample_in_shared_memory() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -191,8 +192,8 @@ fn c_program_continues_after_a_hub_restart() {
     drop(simulator);
 }
 
-/// Returns a condition for lines that have this reason (SCANHUB_SILENCE_.. of the header) and a text that contains
-/// `text`.
+/// Returns a condition that a JSON line meets if it has this reason (a value SCANHUB_SILENCE_.. of the header) and a
+/// text that contains `text`.
 fn has_reason(reason: u64, text: &str) -> impl Fn(&Value) -> bool {
     move |line| line["reason"] == reason && line["text"].as_str().is_some_and(|it| it.contains(text))
 }
@@ -233,7 +234,8 @@ fn c_program_receives_the_reason_for_a_silence() {
         let later = subscriber.await_line("another line", is_class("silence"));
         assert!(number(&later, "silent_ns") > earlier, "{line}, {later}");
     }
-    // Without a hub, a poll of half a second times out. Only then does the program print a line.
+    // Without a hub, `poll` does not return before its timeout of half a second. The program prints a line only after
+    // each timeout.
     let polled = mistyped[1].await_lines(6, "timeouts", is_class("silence"));
     let wakeups: u64 = polled.iter().map(|line| number(line, "wakeups")).sum();
     assert!(wakeups <= 5, "{polled:?}");
@@ -260,7 +262,8 @@ fn c_program_receives_the_reason_for_a_silence() {
     scans.await_line("scans again", is_streaming);
 }
 
-/// A program that acts on zones does not need its own timeout: the library reports `unknown` when the hub is killed.
+/// A program that acts on zones does not need its own timeout, because the library reports `unknown` when the hub is
+/// killed.
 #[test]
 fn c_zones_are_unknown_after_the_hub_is_killed() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -282,8 +285,8 @@ fn c_zones_are_unknown_after_the_hub_is_killed() {
     }
 }
 
-/// The combined verdict is the verdict of the worst sensor. The test first switches off one sensor and then kills the
-/// hub.
+/// The combined verdict of a robot is the verdict of its worst sensor. The test first switches off one sensor and then
+/// kills the hub.
 #[test]
 fn c_robot_has_the_verdict_of_its_worst_sensor() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -333,8 +336,8 @@ fn c_robot_has_the_verdict_of_its_worst_sensor() {
     }
 }
 
-/// Runs the program without memory checks, with the compiler's checks, and with valgrind's checks. The checks matter
-/// because the library shares memory with the program.
+/// Runs a program that misuses the library three times: without memory checks, with the checks that the compiler adds,
+/// and in valgrind. Memory checks matter because the library shares memory with the program.
 #[test]
 fn c_library_rejects_misuse() {
     let Some(installed) = InstalledLibrary::installed() else { return };
@@ -350,8 +353,8 @@ fn c_library_rejects_misuse() {
         Err(_) => eprintln!("not run with memory checks of the compiler, which has none"),
     }
     if is_installed("valgrind") {
-        // A child process has pointers into the middle of memory blocks that its parent allocated. These blocks are
-        // possible leaks, and only definite leaks are errors.
+        // A child process has pointers into the middle of memory blocks that its parent allocated. Valgrind reports
+        // these blocks as possible leaks. Only definite leaks are errors here.
         let leaks = ["--leak-check=full", "--show-leak-kinds=definite", "--errors-for-leak-kinds=definite"];
         let known =
             concat!("--suppressions=", env!("CARGO_MANIFEST_DIR"), "/tests/it/client_c/valgrind.supp");
@@ -381,7 +384,8 @@ fn examples_build_and_run() {
     built.extend(installed.compile_with_pkg_config(&env, &examples.join("nearest.c")));
     let cmake = installed.cmake(&env, &examples);
     built.extend(cmake.iter().map(|build| build.join("nearest")));
-    // Only the build from the sources has the static library, because a copy of it would take 100 MB.
+    // Only CMake's build from the sources has the static library. The installed library lacks it, because a copy would
+    // take 100 MB.
     built.extend(cmake.iter().skip(1).map(|build| build.join("nearest_static")));
     for nearest in &built {
         let outcome = program(&env, nearest, &["front", "5"]).wait();

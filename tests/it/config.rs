@@ -1,6 +1,6 @@
-//! `scanhub config`: its output can be loaded again, it checks configurations like a hub, and it shows the source of
-//! each value. Also tests the outputs that are generated from the definition of the command line: examples, suggestions
-//! for mistyped names, completions and manual pages.
+//! The command `scanhub config`: a hub can load its output, it checks configurations as a hub does, and it shows the
+//! source of each value. This file also tests the outputs that are generated from the definition of the command line:
+//! examples, suggestions for mistyped names, completions and manual pages.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -95,7 +95,7 @@ fn config_show_aligns_values_and_sources() {
     let columns = [file.as_str(), "default", "--set"];
     let begins: Vec<_> =
         shown.lines().map(|line| columns.iter().find_map(|word| line.find(&format!("  {word}")))).collect();
-    // Rows start at the same column. Only the row of the port may contain one of these words earlier.
+    // The source of the value must start at the same column in every row. Each source begins with one of these words.
     assert!(begins.iter().all(|at| at.is_some() && *at == begins[0]), "{shown}");
 }
 
@@ -143,7 +143,8 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     print_config(&env, &["man", &pages]);
     let completions = ["bash", "zsh", "fish"].map(|shell| print_config(&env, &["completions", shell]));
     for verb in &verbs {
-        // `bridge` is a separate program, which `cargo test` does not build here. Its own tests check its help.
+        // `bridge` is a separate program, which `cargo test` does not build for these tests. The tests of the bridge
+        // check its help.
         let is_apart = verb == "bridge";
         assert!(
             is_apart || print_config(&env, &[verb, "--help"]).contains(&format!("  scanhub {verb}")),
@@ -164,7 +165,7 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
         "{refused}"
     );
 
-    // bash itself prints its completions. It is installed on most machines.
+    // This command runs bash to print the completions that bash offers. bash is installed on most machines.
     let script = env.file("completion", &completions[0]);
     let ask = "source \"$0\"; COMP_WORDS=(scanhub ec); COMP_CWORD=1; _scanhub scanhub ec scanhub; echo \"${COMPREPLY[*]}\"";
     match output(Command::new("bash").args(["-c", ask, &script])) {
@@ -175,8 +176,8 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     }
 }
 
-/// Returns the completions of bash after `words`. The last of the words is incomplete. Returns `None` and skips the
-/// rest of the test if there is no bash.
+/// Returns the words with which bash completes the last one of `words`, which is incomplete. If bash is not installed,
+/// skips the rest of the test and returns `None`.
 fn complete_words(env: &TestEnv, words: &[&str]) -> Option<Vec<String>> {
     let program = Path::new(env!("CARGO_BIN_EXE_scanhub"));
     let script = env.file("completion", print_config(env, &["completions", "bash"]));
@@ -262,7 +263,7 @@ fn install_script_removes_manuals_and_completions() {
     assert!(unit.contains("\nExecReload=/bin/kill -HUP $MAINPID\n"), "{unit}");
     install(&["--remove"]);
     assert_eq!(files(&root), Vec::<PathBuf>::new());
-    // A program that does not run on this machine is installed without manual pages and completions.
+    // If the program does not run on this machine, the script installs it without manual pages and completions.
     let other = env.file("other", "of another processor");
     assert!(install(&["--program", &other]).contains("no manual pages, no completions"));
     assert!(!local.join("share").exists() || files(&local.join("share")).is_empty());

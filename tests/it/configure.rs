@@ -1,5 +1,5 @@
-//! `scanhub configure` with and without a terminal: it writes the scanner's EEPROM once after the answer `yes`, and
-//! never otherwise.
+//! `scanhub configure` with and without a terminal. It writes the scanner's EEPROM once after the answer `yes`, and
+//! never without this answer.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -11,7 +11,7 @@ use crate::testkit::{Child, INT, TERM, TestEnv, number, spawn, terminal, wait_un
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// A running `scanhub configure`. It has a terminal in which the test answers its question.
+/// A running `scanhub configure` in a terminal, in which the test answers the program's question.
 struct ConfigureSession {
     process: Child,
     /// User's side of the terminal.
@@ -43,7 +43,7 @@ impl ConfigureSession {
         });
         let mut errors = Vec::new();
         let mut byte = [0];
-        // Once no program has the terminal open, reading from it fails with an error.
+        // Reading fails as soon as no program has the terminal open.
         while !errors.ends_with(b"Type yes: ") && self.keys.read(&mut byte).is_ok_and(|len| len > 0) {
             errors.push(byte[0]);
         }
@@ -98,7 +98,7 @@ fn confirmed_configuration_is_written_once() {
         "{configured}"
     );
     assert_eq!(configured["before"], before["configuration"]);
-    // Stdout is a pipe, so the program shows the difference and the question on the terminal.
+    // Stdout is a pipe, so the program prints the difference and the question to the terminal.
     let shown = result.errors.split("Type yes").next().unwrap();
     assert!(shown.contains("unit: 01h (1 mm) -> 00h (10 mm)"), "{}", result.errors);
     let after = probe(&env, "front");
@@ -106,7 +106,8 @@ fn confirmed_configuration_is_written_once() {
     assert_eq!((number(&after, "unit_mm"), number(&after, "mode")), (10, 4), "{after}");
     assert_eq!((number(&after, "operating_mode"), number(&after, "baud")), (0x25, 38_400), "{after}");
 
-    // Restore the old configuration with the value that the program printed, this time without `--json`.
+    // Restore the old configuration. `probe` printed its value before the change. This run of `configure` is without
+    // `--json`.
     let backup = format!("configuration={}", before["configuration"].as_str().unwrap());
     let result = ConfigureSession::start(&env, &[&port, &backup]).type_text("yes\n");
     assert_eq!(result.code, Some(0), "{}", result.errors);
@@ -114,7 +115,7 @@ fn confirmed_configuration_is_written_once() {
     assert!(result.out.contains("to go back: scanhub configure"), "{}", result.out);
     assert_eq!(probe(&env, "front")["configuration"], before["configuration"]);
 
-    // A second time, nothing has to be changed, so the program asks no question.
+    // The scanner now has this configuration, so the program changes nothing and asks no question.
     let outcome = env.run(&["configure", &port, &backup, "unit=mm"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert!(String::from_utf8_lossy(&outcome.stdout).contains("nothing to change"), "{outcome}");
@@ -175,7 +176,7 @@ fn reports_command_that_restores_previous_settings() {
     let back = format!("to go back: scanhub configure {port} power_on_baud=9600\n");
     assert!(out.contains(&back), "{out}");
     assert_eq!(probe(&env, "front")["permanent_rate"], true);
-    // The scanner does not report its previous permanent rate.
+    // The scanner does not report which permanent rate it had before, so the program cannot print how to restore it.
     let out = done(&["power_on_baud=9600"]);
     assert!(out.contains("cannot be restored") && !out.contains("to go back"), "{out}");
     assert_eq!(probe(&env, "front")["permanent_rate"], false);
@@ -203,7 +204,7 @@ fn any_answer_but_yes_writes_nothing() {
     assert_eq!(outcome.exit_code, Some(2), "{outcome}");
     assert_eq!(outcome.of_class("difference").len(), 1, "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["kind"], "usage", "{outcome}");
-    // The program does not ask if the user cannot see the question, either.
+    // Even with a terminal as stdin, the program does not ask its question if the user cannot see it.
     let (_keys, screen) = terminal();
     let mut unseen = env.command(&["configure", &port, "unit=cm"]);
     unseen.stdin(Stdio::from(screen)).stdout(Stdio::null()).stderr(Stdio::null());
@@ -238,7 +239,7 @@ fn rejects_impossible_settings_without_writing() {
         assert!(wrong.errors.contains(words), "{words}: {}", wrong.errors);
     }
     assert!(wrong.errors.contains(" ..\r\nscanhub: "), "{:?}", wrong.errors);
-    // The port belongs to a hub.
+    // In this case, a hub has the port open.
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let outcome = env.run(&["configure", &port, "unit=cm"]);
@@ -279,10 +280,11 @@ fn signals_do_not_interrupt_a_write_in_progress() {
             ConfigureSession::start(&env, &[&port, setting, "--json"]).answer_questions(|keys, pid| {
                 let before = env.truth("front").len();
                 keys.write_all(b"yes\n").unwrap();
-                // The simulator may not have logged the last telegram before the question yet.
+                // Wait for two more telegrams in the log. The first one may have been sent before the question and
+                // logged late.
                 wait_until("the simulator has received a request", || env.truth("front").len() > before + 1);
                 if sent == Signal::HUP {
-                    // The terminal is closed, too.
+                    // The signal HUP means that the terminal has been closed, so close it here, too.
                     *keys = File::open("/dev/null").unwrap();
                 }
                 signal(pid, sent);

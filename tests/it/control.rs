@@ -36,14 +36,16 @@ fn paused_sensor_stops_and_resumes_without_a_gap() {
     }
     control_accepted(&env, "front", "pause");
     await_state(&env, "front", "paused");
-    // The right scanner was stopped: it sends nothing more, and the other one continues to stream.
+    // Check that the request stopped the right scanner. That scanner sends no more telegrams, while the other scanner
+    // continues to stream.
     let mut sent = 0;
     wait_until("the sensor is stopped", || {
         let before = std::mem::replace(&mut sent, env.truth("front").len());
         subscribers[2].await_lines(10, "a scan of the other sensor", is_class("scan"));
         before == sent
     });
-    // The hub repeats the status during the pause, so it sent the second status after the pause had begun.
+    // The hub sends the status repeatedly during the pause. The second status received here was therefore sent after
+    // the pause had begun.
     let statuses = env.run(&["echo", "front/status", "-n", "2", "--timeout", "5s"]);
     assert_eq!(statuses.exit_code, Some(0), "{statuses}");
     let paused = env.info("front");
@@ -105,7 +107,7 @@ fn absent_sensor_can_be_paused_before_it_appears() {
     await_state(&env, "front", "absent");
     let _simulator = env.simulator(&["front"], &["--seed=33", "--baud=500000"]);
     let info = await_state(&env, "front", "paused");
-    // The scanner stays paused: it has replied to requests, but sent no scan.
+    // The sensor stays paused. Its scanner has replied to requests, but has sent no scan.
     assert!(number(&info["counters"], "telegrams") <= 2, "{info}");
     control_accepted(&env, "front", "resume");
     await_state(&env, "front", "streaming");
@@ -147,17 +149,17 @@ fn concurrent_and_killed_control_clients_are_handled() {
             (0..10).map(|number| (number, env.start(&["control", "front", "pause", "--json"]))).collect();
         for (number, program) in asking {
             if number % 2 == 0 {
-                // Kill it at an arbitrary moment.
+                // Kill the client at an arbitrary moment.
                 drop(program.end(testkit::KILL));
                 continue;
             }
             let outcome = program.wait();
-            // The hub accepts the request, or it is busy and the client should try again.
+            // The hub accepts the request (0), or it is busy and the client must try again (75).
             assert!(matches!(outcome.exit_code, Some(0 | 75)), "{outcome}");
             assert_eq!(outcome.lines().len(), 1, "{outcome}");
         }
     }
-    // The killed programs may still hold all slots for requests.
+    // The hub may be busy for a short time, because the killed programs may still hold all slots for requests.
     wait_until("the hub accepts a request", || {
         let outcome = control(&env, "front", "resume");
         assert!(matches!(outcome.exit_code, Some(0 | 75)), "{outcome}");

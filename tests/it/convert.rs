@@ -19,11 +19,11 @@ fn stream_converts_to_a_playable_recording() {
     assert_eq!(line["sensors"], json!(["left"]));
     assert_eq!((&line["telegrams"], &line["scans"], &line["missing"]), (&json!(20), &json!(20), &missing));
     assert_eq!((&line["from"], &line["to"]), (&json!("telegram stream"), &json!("MCAP")));
-    // Stdout receives the unchanged telegrams.
+    // With `-` as output, the program writes the unchanged telegrams to stdout.
     let outcome = env.run(&["convert", &mcap, "-", "--sensor=left"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert!(outcome.stderr.contains("20 telegrams, 20 scans"), "{}", outcome.stderr);
-    // A reader that closes the pipe early causes no error and no message.
+    // If the reader of stdout closes the pipe early, the program prints no message and exits normally.
     let (reader, writer) = std::io::pipe().expect("a pipe");
     drop(reader);
     let mut command = env.command(&["convert", &mcap, "-"]);

@@ -1,4 +1,5 @@
-//! `scanhub demo` without any setup: it succeeds, reports that no sample was lost, and leaves no files or processes.
+//! `scanhub demo` without any setup. The demo succeeds, reports that no sample was lost, and leaves no files or
+//! processes.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +11,8 @@ use crate::testkit::{
 };
 use crate::web::{channels, connect_viewer};
 
-/// Runs the demo with an empty environment. `end` waits until the demo exits, and may make it exit.
+/// Runs the demo with an empty environment. The function `end` waits until the demo exits. It may first do something
+/// that makes the demo exit.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     let place = tempfile::tempdir().expect("a directory");
@@ -36,16 +38,16 @@ fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     outcome
 }
 
-/// Returns the command lines of processes that contain `domain`.
+/// Returns the command lines of the processes that have `domain` as an argument.
 fn processes(domain: &str) -> Vec<String> {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     let lines = entries.filter_map(|entry| fs::read_to_string(entry.path().join("cmdline")).ok());
     lines.filter(|line| line.split('\0').any(|word| word == domain)).collect()
 }
 
-/// Asserts that the last lines, one for each of `names`, account for every telegram of a stream. A telegram was
-/// received, or the demo's subscriber missed it on a busy machine. In the second case, the exit code and the message
-/// must report it.
+/// Asserts that the summary lines, one for each of `names`, account for every telegram of a stream. Each telegram was
+/// received, or the demo's subscriber missed it on a busy machine. If the subscriber missed any, the exit code and the
+/// message must report this.
 fn check_summaries(outcome: &Outcome, names: &[&str]) {
     let lines = outcome.of_class("summary");
     let sensors: Vec<_> = lines.iter().map(|line| line["sensor"].as_str().unwrap_or_default()).collect();
@@ -89,8 +91,8 @@ fn demo_runs_with_each_family() {
     ] {
         let outcome = demo(&["--headless", "--for", "2s", "--json", "--family", family], Program::wait);
         check_summaries(&outcome, names);
-        // The rate is ten revolutions per second, not hundreds of packets. It is computed from few scans, so it is
-        // inaccurate on a busy machine.
+        // The rate is ten revolutions per second, not hundreds of packets. The demo computes the rate from few scans,
+        // so the rate is inaccurate on a busy machine.
         let last = &outcome.of_class("summary")[1];
         assert!(last["hz"].is_null() || last["hz"].as_f64().is_some_and(|hz| hz < 50.0), "{last}");
     }
@@ -103,7 +105,7 @@ fn demo_with_a_mount_publishes_clouds() {
     let outcome = demo(&["--world", "tilt", "--headless", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
-        // The demo is ready before `tilt` has started.
+        // The demo reports `ready` before its child `tilt` has started.
         wait_until("hall is published", || {
             let list = run_in_demo(domain, &["list"]).wait();
             list.lines().iter().any(|line| line["sensor"] == "hall")
@@ -131,7 +133,7 @@ fn headless_demo_runs_in_an_empty_environment() {
             (domain, number(&ready, "pid")),
             (&*format!("demo-{}", program.pid()), u64::from(program.pid()))
         );
-        // A program in another terminal needs only the name of the domain.
+        // To subscribe, a program in another terminal needs only the name of the domain.
         let mut list = Command::new(env!("CARGO_BIN_EXE_scanhub"));
         list.args(["list", "--json", "--domain", domain]).env_clear();
         let list = output(list).expect("the program starts");
@@ -197,7 +199,7 @@ fn house_demo_tracks_people_between_rooms() {
     let outcome = demo(&["--world", "house", "--headless", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
-        // The demo is ready before `track` has started.
+        // The demo reports `ready` before its child `track` has started.
         wait_until("people is published", || {
             let list = run_in_demo(domain, &["list"]).wait();
             list.lines().iter().any(|line| line["sensor"] == "people")
@@ -227,7 +229,8 @@ fn house_demo_tracks_people_between_rooms() {
 
 #[test]
 fn interrupted_demo_ends_all_its_processes() {
-    // All processes of the demo end, too. SIGHUP is sent when a terminal is closed.
+    // In addition to the demo itself, all of its child processes must end. SIGHUP is the signal that a program gets
+    // when its terminal is closed.
     for signal in [INT, HUP] {
         let outcome = demo(&["--headless", "--json"], |program| {
             let name = format!("demo-{}", program.pid());
@@ -263,7 +266,7 @@ fn second_interrupt_ends_the_demo_at_once() {
     assert_eq!(outcome.of_class("summary").len(), 2, "{outcome}");
 }
 
-/// Returns the process of the demo in `domain` that runs `verb`.
+/// Returns the ID of the process that runs `verb` for the demo in `domain`.
 fn process_of(domain: &str, verb: &str) -> rustix::process::Pid {
     let entries = fs::read_dir("/proc").expect("procfs").flatten();
     let is_meant = |path: &Path| {
@@ -290,7 +293,7 @@ fn demo_page_keeps_running_without_viewers() {
             viewer
         };
         let mut first = connect();
-        // The browser reloads the page twice before a second viewer connects.
+        // First, one browser connects and reloads the page twice. Then a second viewer connects.
         for _ in 0..2 {
             drop(first);
             first = connect();

@@ -1,5 +1,5 @@
-//! Installation of the hub as a service: the script installs and removes all files, and the units are as restricted as
-//! they claim.
+//! Installation of the hub as a service: the script installs and removes all files, and each unit is as restricted as
+//! its settings promise.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::process::Command;
 
 use crate::testkit::{TestEnv, output, skip};
 
-/// Maximum exposure of a unit as systemd-analyze measures it, in tenths.
+/// Maximum exposure of a unit, in tenths of the level that `systemd-analyze security` reports (0.0 to 10.0).
 const MAX_EXPOSURE: u32 = 15;
 
 fn dist() -> PathBuf {
@@ -73,7 +73,8 @@ fn install_script_removes_every_file_it_installs() {
 fn unit_allows_adapters_plugged_in_after_the_start() {
     let unit = fs::read_to_string(dist().join("scanhub.service")).expect("the file exists");
     let has_line = |line: &str| unit.lines().any(|it| it == line);
-    // systemd.resource-control(5): systemd ignores a device group that no driver has registered when the unit starts.
+    // If no driver has registered a device group when the unit starts, systemd ignores the line for this group
+    // (systemd.resource-control(5)).
     for (group, driver) in [("ttyUSB", "usbserial"), ("ttyACM", "cdc_acm")] {
         assert!(has_line(&format!("DeviceAllow=char-{group} rw")), "{group}");
         for key in ["Wants=", "After="] {
@@ -84,7 +85,7 @@ fn unit_allows_adapters_plugged_in_after_the_start() {
     }
 }
 
-/// Hub and gateway run as one user. Only this user can read their saved state.
+/// Hub and gateway run as the same user, and only this user can read the state that they save.
 #[test]
 fn units_share_one_private_state_directory() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {
@@ -111,7 +112,8 @@ fn systemd_units_have_low_exposure() {
             return;
         }
         assert!(output.status.success(), "{unit} exceeds the maximum exposure:\n{text}");
-        // Messages about programs that are not installed on this machine are not faults of the unit.
+        // Ignore messages about programs that are not installed on this machine, because they are not faults of the
+        // unit.
         let output = analyze(&["verify"]).unwrap_or_else(|error| panic!("{error}"));
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
         let faults: Vec<_> = errors.lines().filter(|line| line.contains(unit)).collect();

@@ -9,8 +9,8 @@ use rustix::io::Errno;
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Returns state and finding of the check `name`, and appends the remedy to the finding. `port` is the port of the
-/// line, if the line has one.
+/// Returns the state and the text of the check `name`. The text is the finding followed by the remedy. `port` is the
+/// port that the check must belong to, or `None` for a check without a port.
 fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str, String) {
     let found = findings.iter().find(|line| line["name"] == name && line["port"].as_str() == port);
     let found = found.unwrap_or_else(|| panic!("no {name} of {port:?}: {findings:#?}"));
@@ -20,13 +20,14 @@ fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str,
     (text("state"), format!("{} {}", text("finding"), text("remedy")))
 }
 
-/// Runs `doctor`, which must exit with `code`. All lines must be checks, except for an error at the end.
+/// Runs `doctor`, which must exit with `code`. All lines that it prints must have class `check`, except for an error at
+/// the end.
 fn doctor(env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
     checks(run(env, arguments), code)
 }
 
-/// Runs [`doctor`] for the scanner at `port`. On a busy machine, a simulated scanner may reply too late. This function
-/// then runs `doctor` again.
+/// Runs [`doctor`] for the scanner at `port`. On a busy machine, a simulated scanner may reply too late. In this case,
+/// `doctor` is run again.
 fn doctor_of_port(port: &str, env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
     let is_late =
         |line: &Value| line["name"] == "sensor" && line["port"] == port && line["state"] == "failed";
@@ -70,7 +71,8 @@ fn doctor_accepts_a_working_setup() {
     for name in ["memory", "domain", "leftovers", "descriptors"] {
         assert_eq!(state(&findings, name, None).0, "ok", "{findings:#?}");
     }
-    // The latency is checked after the port was opened, because opening it sets the adapter to low latency.
+    // Opening the port sets the adapter to low latency, so `doctor` must check the latency after it has opened the
+    // port.
     let place = |name: &str| findings.iter().position(|line| line["name"] == name);
     assert!(place("latency") > place("access"), "{findings:#?}");
     for name in ["port", "holder", "access", "rate", "settings", "power-on", "health"] {
@@ -115,7 +117,8 @@ fn reports_bad_settings_and_ports() {
     assert!(found == "failed" && text.contains("100 or 180"), "{text}");
 }
 
-/// A port can have several names, and the hub may have been started in another directory.
+/// A port can have several names, and the hub may have been started in another directory, so that relative names
+/// differ.
 #[test]
 fn port_of_the_hub_is_found_by_any_of_its_names() {
     let env = TestEnv::new();
@@ -155,8 +158,8 @@ fn port_of_the_hub_is_found_by_any_of_its_names() {
             );
         }
     }
-    // Without arguments, `doctor` checks the links of the hub. It runs in another directory, and the port has a
-    // different name that leads to it.
+    // Without arguments, `doctor` checks the links of the hub that is running. `doctor` runs in another directory than
+    // the hub, so it finds the port under a different name.
     let (findings, _) = doctor(&env, &[], 0);
     let (found, text) = state(&findings, "sensor", Some(&env.path("./front").display().to_string()));
     assert!(found == "ok" && text.contains("link front of the hub: streaming"), "{text}");
@@ -189,7 +192,7 @@ fn doctor_warns_of_an_unhealthy_scanner() {
 #[test]
 fn reports_a_silent_port_after_a_bounded_search() {
     let env = TestEnv::new();
-    // The scanner does not reply.
+    // The scanner does not reply to any request.
     let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
     let (findings, _) = doctor(&env, &[&env.path_argument("front")], 5);
     let (found, text) = state(&findings, "sensor", Some(&env.path_argument("front")));
@@ -205,7 +208,7 @@ fn queries_a_running_hub_and_reports_a_killed_one() {
     let before = env.info("front");
     let (port, link) = (env.path_argument("front"), env.link("front"));
     let (findings, _) = doctor(&env, &[&link], 0);
-    // The name of a link stands for its port.
+    // The name of a link is accepted in place of its port.
     let (named, _) = doctor(&env, &["front"], 0);
     assert_eq!(state(&named, "sensor", Some(&env.path_argument("front"))).0, "ok", "{named:#?}");
     let pid = format!("process {}", hub.pid());
@@ -239,7 +242,7 @@ fn doctor_fails_for_a_stopped_hub() {
         let (found, text) = state(&findings, name, Some(&port));
         assert!(found == "skipped" && text.contains("does not publish"), "{text}");
     }
-    // `doctor` does not treat the name of the link as a port.
+    // While the hub does not respond, `doctor` must not treat the name of the link as a port.
     let (named, _) = doctor(&env, &["front"], 5);
     assert_eq!(state(&named, "port", Some("front")).0, "skipped", "{named:#?}");
     hub.signal(Signal::CONT);
@@ -272,7 +275,7 @@ fn does_not_open_a_port_held_by_another_program() {
     let watch = inotify::init(CreateFlags::CLOEXEC | CreateFlags::NONBLOCK).unwrap();
     let device = env.path("front").canonicalize().unwrap();
     inotify::add_watch(&watch, &device, WatchFlags::OPEN).unwrap();
-    // This process has the port open.
+    // The test process has the port open, so `doctor` must not open the port.
     let (findings, _) = doctor(&env, &[&env.path_argument("front")], 5);
     assert_eq!(rustix::io::read(&watch, &mut [0; 64]), Err(Errno::AGAIN), "doctor opened the port");
     drop(std::fs::File::open(&device).unwrap());

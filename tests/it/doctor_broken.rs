@@ -1,5 +1,6 @@
-//! Setups with faults between scanner and configuration: `scanhub doctor` finds each fault and names the remedy.
-//! `--nocapture` prints the faults as a table. Faults of the machine are in `doctor_machine.rs`.
+//! Setups in which the scanner, the line, the port or the configuration has a fault. `scanhub doctor` finds each fault
+//! and names the remedy. With `--nocapture`, the tests print the faults as a table. Faults of the machine are in
+//! `doctor_machine.rs`.
 
 use std::fs::{self, File};
 use std::net::TcpListener;
@@ -11,8 +12,8 @@ use crate::testkit::{
     Findings, Program, TestEnv, TestLine, open_line, run_concurrently, skip, succeeds, wait_until,
 };
 
-/// Description of each fault, flags of the simulator, and the check, state and part of the remedy that `doctor` must
-/// report.
+/// Faults. Each row has a description of the fault, the flags of the simulator, and what `doctor` must report: the
+/// check, its state and a part of the remedy.
 const BROKEN_SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
     ("the window is dirty", &["--type=lms291", "--pollution=60"], "health", "warning", "clean its window"),
     (
@@ -68,7 +69,7 @@ fn doctor_finds_sensor_faults() {
             let expected = [of("unit=mm"), of("type=lms200")];
             let examine = || Findings::of(&env, &[&link, "--set", &expected[0], "--set", &expected[1]]);
             let mut findings = examine();
-            // On a busy machine, the simulated scanner may reply too late.
+            // On a busy machine, the simulated scanner may reply too late. `doctor` is then run again.
             wait_until("the simulated scanner replies in time", || {
                 let has_replied = name == "sensor" || findings.state_and_text("sensor").0 != "failed";
                 if !has_replied {
@@ -85,7 +86,7 @@ fn doctor_finds_sensor_faults() {
 fn doctor_finds_port_faults() {
     let env = TestEnv::new();
     let port = |name: &str| Findings::of(&env, &[&env.path_argument(name)]);
-    // The ports in the remedy depend on this machine.
+    // The remedy lists the ports of the machine on which the test runs, so its text differs between machines.
     let instead =
         |finding: &Findings| if finding.state_and_text("port").1.is_empty() { "there are" } else { "" };
     let absent = port("absent");

@@ -1,6 +1,6 @@
-//! Machines with faults, and a healthy one: `scanhub doctor` finds each fault and names the remedy, and reports no
-//! problem on the healthy machine. `--nocapture` prints the faults as a table. System files that an administrator may
-//! have written are in a directory of the test.
+//! Machines with faults, and a healthy machine. `scanhub doctor` finds each fault and names the remedy, and reports no
+//! problem on the healthy machine. With `--nocapture`, the tests print the faults as a table. The tests write the
+//! system files that an administrator may have written into their own directory.
 
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -16,7 +16,7 @@ use scanhub_config::Gateway;
 use scanhub_shm::Domain;
 use scanhub_tools::doctor::{Bridge, CheckTargets, System, run_checks};
 
-/// Returns a command that runs `doctor` in `sh` after the words `words`, such as `ulimit -f 100; exec`.
+/// Returns a command in which `sh` runs `doctor` after the words `words`, such as `ulimit -f 100; exec`.
 fn command_under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
     let inner = env.command(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
     let mut command = Command::new("sh");
@@ -36,7 +36,7 @@ fn doctor_has_no_findings_on_a_healthy_machine() {
     let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
     let examine = || {
         let findings = Findings::of(&env, &flags);
-        // The test cannot control how this machine itself is set up.
+        // Leave out the checks whose result depends on the setup of the machine on which the test runs.
         let not_of_the_machine = ["service", "udev", "logout"];
         assert!(not_of_the_machine.iter().all(|name| !findings.state_and_text(name).1.is_empty()));
         findings.without(&not_of_the_machine).assert_no_problem();
@@ -56,7 +56,8 @@ fn doctor_has_no_findings_on_a_healthy_machine() {
     healthy_machine(&env).assert_no_problem();
 }
 
-/// Creates a machine on which everything is installed, and returns the findings for an ordinary user.
+/// Creates the system files of a machine on which everything is installed, and returns the findings for an ordinary
+/// user.
 fn healthy_machine(env: &TestEnv) -> Findings {
     let machine = env.path("machine");
     let put = |path: &str, text: &str| {
@@ -82,11 +83,11 @@ fn healthy_machine(env: &TestEnv) -> Findings {
 
 /// Returns the findings for user 1000 on the machine in the environment's directory `machine`.
 fn healthy_layout(env: &TestEnv) -> Findings {
-    // The ports of this machine differ from test to test.
+    // Leave out findings about the ports of the machine on which the test runs. Tests differ in these ports.
     port_findings(env).without_ports().without(&["ports", "multicast"])
 }
 
-/// Returns all findings, including the ports of this machine and the adapters of the simulated machine.
+/// Returns all findings, including those about ports of the real machine and about adapters of the simulated machine.
 fn port_findings(env: &TestEnv) -> Findings {
     let targets = CheckTargets {
         ports: Vec::new(),
@@ -118,7 +119,7 @@ fn reports_missing_module_and_brltty_for_an_adapter() {
     put("sys/bus/usb/devices/1-1/idProduct", "7523\n");
     let ports = || {
         let findings = port_findings(&env);
-        // The check fails only if this machine has no port to examine.
+        // The state is `failed` only if the real machine has no port to examine, and `warning` otherwise.
         let (state, finding) = findings.state_and_text("ports");
         assert!(["warning", "failed"].contains(&state), "{state}");
         (state.to_owned(), finding.to_owned(), findings)
@@ -260,7 +261,8 @@ fn clean_removes_files_of_killed_hubs_only() {
     assert!(before.iter().all(|path| path.exists()), "{before:?}");
     hub.end(KILL);
     Findings::of(&env, &[]).assert_problem("a hub was killed", "leftovers", "warning", "doctor --clean");
-    // A domain with a similar name, and a domain with the same name in another location. Each has a running hub.
+    // A domain with a similar name, and a domain with the same name in another location. A hub runs in each of them, so
+    // `--clean` must not change either domain.
     let (neighbour, other) = (TestEnv::new(), env.path("other"));
     let other_hub = Program::start(env.command_at(&other, &["run", "--json", &link])).ready();
     let held = env.leftover_files().len();
@@ -277,7 +279,7 @@ fn clean_removes_files_of_killed_hubs_only() {
     let left = env.leftover_files();
     assert!(left.len() < held && !left.is_empty(), "{left:?}");
     assert_eq!(neighbour.leftover_files(), neighbours);
-    // The other hub is unchanged, and clients still find it.
+    // The hub in the other location still runs, and it removes its own files when it exits.
     assert_eq!(other_hub.end(TERM).exit_code, Some(0));
     assert_eq!((env.leftover_files().len(), hub.end(TERM).exit_code), (0, Some(0)));
 }
@@ -306,7 +308,7 @@ fn clean_removes_files_of_a_deleted_domain() {
     fs::remove_dir_all(env.domain().root()).expect("the file belongs to this user");
     let findings = Findings::of(&env, &[]);
     findings.assert_problem("files of a deleted domain", "leftovers", "warning", "doctor --clean");
-    // A process still reads one of the files.
+    // A process still reads one of the files, so `--clean` must not remove that file.
     let files = env.leftover_files();
     let held = fs::File::open(&files[0]).expect("the file belongs to this user");
     Findings::of(&env, &["--clean"]);
@@ -322,7 +324,7 @@ fn finds_two_hubs_and_a_replaced_program() {
     let env = TestEnv::new();
     let link = env.link("absent");
     let program = env.path("scanhub");
-    // Another process writes the program, for the reason that `write_program` gives.
+    // Another process must write the program. The doc of `write_program` gives the reason.
     let mut copy = Command::new("sh");
     copy.args(["-c", "cp \"$1\" \"$0\" && echo another build >> \"$0\""]).arg(&program);
     assert!(succeeds(copy.arg(env!("CARGO_BIN_EXE_scanhub"))), "can be copied");
@@ -355,7 +357,7 @@ fn finds_two_hubs_and_a_replaced_program() {
 fn finds_missing_gateway_interface() {
     in_a_network("doctor_machine::finds_missing_gateway_interface", || {
         let env = TestEnv::new();
-        // No interface is configured, so nothing is sent to a network.
+        // No interface is configured, so `doctor` sends nothing to a network.
         assert_eq!(Findings::of(&env, &[]).state_and_text("multicast").0, "skipped");
         let interface = Findings::of(&env, &["--set", "gateway.interface=eth7"]);
         interface.assert_problem(

@@ -7,12 +7,12 @@ use std::cell::RefCell;
 use crate::testkit::{INT, Program, TERM, TestEnv, checked_topic_seqs, is_class, number};
 use serde_json::Value;
 
-/// World with a post in the smaller zone, to the right and a little ahead. The post is in the first third of each
-/// telegram and of each revolution.
+/// World with a post in the smaller zone, to the right of the sensor and a little ahead of it. The post is in the first
+/// third of each telegram and of each revolution.
 pub(crate) const POST_WORLD: &str = "[noise]\nerrors = 0\n[[thing]]\nradius_mm = 60\npose = [460, 200]\n\
     [[thing]]\nline = [[-3000, -1000], [3000, -1000], [3000, 4000], [-3000, 4000], [-3000, -1000]]\n";
 
-/// Scanner: flags of the simulator, keys of the link, and a number of beams slightly above a third of a scan.
+/// A scanner: flags of its simulator, keys of its link, and a number of beams slightly above a third of a scan.
 struct Scanner {
     flags: &'static [&'static str],
     keys: &'static [&'static str],
@@ -39,8 +39,8 @@ impl Scanner {
     }
 }
 
-/// Receives `front/early` and `front/zones` from a line with `faults`. Ends when `is_enough` returns true for the fates
-/// of the warnings. Asserts that no warning is wrong.
+/// Receives `front/early` and `front/zones` from a scanner on a line with `faults`. Stops when `is_enough` returns true
+/// for the numbers of warnings by fate. Asserts that no warning is wrong.
 fn check_warnings(
     env: &TestEnv,
     scanner: &Scanner,
@@ -53,35 +53,36 @@ fn check_warnings(
     echo.await_line("warnings with all expected fates", |line| {
         let mut lines = lines.borrow_mut();
         lines.push(line.clone());
-        // Checking after every line would make this test read slowly, and then the client misses samples.
+        // Check only after every 16th line. Checking after each line would make this test read so slowly that the
+        // client misses samples.
         lines.len().is_multiple_of(16) && is_enough(&count_fates(&lines, scanner.first_third))
     });
     let outcome = echo.end(INT);
     assert_eq!(number(&env.info("front")["counters"], "loan_failed"), 0);
     assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
-    // Samples count as missed only if the client reported the gap.
+    // Assert that the client reported every gap. Samples in such a gap count as missed.
     checked_topic_seqs(&outcome, "early");
     checked_topic_seqs(&outcome, "zones");
     let counts = count_fates(&outcome.lines(), scanner.first_third);
     assert_eq!(counts.wrong, [""; 0], "{counts:?}");
 }
 
-/// Numbers of warnings by fate. Each warning is counted in one of the fields, except that `confirmed` includes
-/// `confirmed_early`.
+/// Numbers of warnings by fate. Each warning is counted in one field. A warning in `confirmed_early` is also counted in
+/// `confirmed`.
 #[derive(Debug, Default)]
 struct WarningFates {
-    /// Warnings for which the zones of the scan were at least as bad.
+    /// Warnings that the zones of the scan confirmed: their verdict is at least as bad as that of the warning.
     confirmed: usize,
     /// Confirmed warnings that were sent when at most a third of the scan had arrived.
     confirmed_early: usize,
     /// Warnings that the hub withdrew.
     withdrawn: usize,
-    /// Warnings that a worse one of the same scan replaced.
+    /// Warnings that a worse warning of the same scan replaced.
     worsened: usize,
-    /// Warnings with an unknown fate. The client reported that it missed the sample with the result, or it received
-    /// that sample too late, or the test has not received it yet.
+    /// Warnings with an unknown fate. The client reported that it missed the sample that decides the fate, or that it
+    /// received this sample too late. Or the test has not received the sample yet.
     unknown: usize,
-    /// Descriptions of all other warnings. They are errors.
+    /// Descriptions of all other warnings. Each of them is an error.
     wrong: Vec<String>,
 }
 
@@ -102,9 +103,9 @@ fn numbered_samples<'a>(lines: &'a [Value], class: &str) -> Vec<NumberedSample<'
     samples.iter().enumerate().map(|(at, &line)| NumberedSample { line, missed: missed(at) }).collect()
 }
 
-/// Determines the fate of each warning in `lines` by its sequence number: the next sample of the topic withdraws or
-/// replaces it, or the zones of its scan confirm it. The order in which lines of different topics were printed does not
-/// matter. `third` is the number of beams in the first third of a scan.
+/// Determines the fate of each warning in `lines` by its sequence number. The next sample of topic `early` withdraws or
+/// replaces the warning, or the zones of the same scan confirm it. The order in which lines of different topics were
+/// printed does not matter. `third` is the number of beams in the first third of a scan.
 fn count_fates(lines: &[Value], third: u64) -> WarningFates {
     let (warnings, zones) = (numbered_samples(lines, "early"), numbered_samples(lines, "zones"));
     let mut counts = WarningFates::default();
@@ -121,8 +122,8 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
         if is_withdrawn(line) {
             let stood = at.checked_sub(1).map(|before| warnings[before].line);
             let is_its = stood.is_some_and(|stood| !is_withdrawn(stood) && is_of_same(stood));
-            // The first sample that the client receives may withdraw a warning that the hub sent before the client
-            // attached.
+            // A sample without a preceding warning is wrong, except for the first one that the client receives. The
+            // first sample may withdraw a warning that the hub sent before the client attached.
             if !is_its && *missed == 0 && at > 0 {
                 counts.wrong.push(format!("nothing to withdraw: {line}"));
             }
@@ -141,7 +142,7 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
                 continue;
             }
             Some(next) if next.missed > 0 => {
-                // The sample that withdraws the warning may be among the missed ones.
+                // The sample that withdraws or replaces the warning may be among the missed ones.
                 counts.unknown += 1;
                 continue;
             }
@@ -169,8 +170,8 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
             continue;
         }
         let holds = of_scan["verdict"] == "stop" || of_scan["verdict"] == line["verdict"];
-        // The zones of a revolution with gaps may be worse than the warning. A scan that waited for a busy hub is too
-        // old for a verdict.
+        // The zones of a revolution with gaps may be worse than the warning. A scan that waited for a busy hub has the
+        // verdict `unknown`, because it is too old for another verdict.
         let waited = of_scan["flags"].to_string().contains("stamp_estimated");
         let is_unsure =
             of_scan["verdict"] == "unknown" && (waited || line["verdict"] == "slow" && !is_telegram);
@@ -186,7 +187,8 @@ fn count_fates(lines: &[Value], third: u64) -> WarningFates {
 #[test]
 fn zones_confirm_warnings_of_incomplete_telegrams() {
     let env = TestEnv::new();
-    // The post is in the first third, and the hub reads a telegram in three parts. A busy hub sometimes reads later.
+    // The hub reads a telegram in three parts, and the post is in the first one. Not every warning is early, because a
+    // busy hub sometimes reads later.
     check_warnings(&env, &LMS_SCANNER, &[], |counts| counts.confirmed >= 20 && counts.confirmed_early >= 10);
 }
 
@@ -207,7 +209,7 @@ fn warning_of_a_damaged_telegram_is_withdrawn() {
 }
 
 /// Flag for a line that loses most of some revolutions. The hub counts these revolutions as lost and publishes no scan
-/// of them.
+/// for them.
 const GAPS: &str = "--fault=silence=0.07,silence_at=3,silence_every=0.3";
 
 #[test]
@@ -226,7 +228,8 @@ fn warnings_are_computed_only_for_subscribers() {
         let mut zones = env.echo(&["front/zones"]);
         zones.await_lines(10, "a post", |line| line["verdict"] == "stop");
         let first = env.echo(&["front/early"]).await_line("a warning", is_class("early"));
-        // The hub numbers every warning that it computes. The number 0 shows that it has computed none before.
+        // The hub numbers every warning that it computes. The number 0 of the first warning shows that the hub computed
+        // none before the topic had a subscriber.
         assert_eq!(number(&first, "topic_seq"), 0, "{first}");
     }
 }

@@ -1,5 +1,5 @@
-//! Combined verdict of a robot with and without early warnings. Rust, Python, C and `leds` use the same warnings, and
-//! only on request.
+//! Combined verdict of a robot with and without early warnings. Programs in Rust, Python and C and the command `leds`
+//! use the same warnings, and they use them only on request.
 
 use std::process::Command;
 
@@ -28,7 +28,7 @@ fn python_robot_subscribes_to_warnings_until_exit() {
     assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
 }
 
-/// Sensor whose zones and warnings the test publishes.
+/// Sensor whose zones and warnings the test publishes itself.
 struct SimulatedSensor {
     zones: Publication<Zones>,
     early: Publication<Early>,
@@ -49,7 +49,8 @@ impl SimulatedSensor {
         SimulatedSensor { zones, early, sensor }
     }
 
-    /// Returns a header for results of scan `seq`. Its period is so long that the zones remain valid during the test.
+    /// Returns a header for results of the scan with the number `seq`. The period in the header is so long that the
+    /// zones remain valid during the test.
     fn header_of_scan(&self, seq: u64) -> Header {
         Header { seq, period_us: 1_000_000_000, ..self.zones.header() }
     }
@@ -69,8 +70,8 @@ impl SimulatedSensor {
     }
 }
 
-/// Starts programs that print the verdict of `robot1.front`: each program once with warnings and once without them. The
-/// flag is true for a program that uses warnings.
+/// Starts programs that print the verdict of `robot1.front`. Each program is started twice, with and without early
+/// warnings. The flag in the result is true for a program that uses warnings.
 fn start_robots(env: &TestEnv) -> Vec<(bool, Program)> {
     let mut commands = Vec::new();
     for early in [false, true] {
@@ -93,7 +94,7 @@ fn start_robots(env: &TestEnv) -> Vec<(bool, Program)> {
     commands.into_iter().map(|(early, command)| (early, Program::start(command))).collect()
 }
 
-/// Returns the verdict in a line. Programs in C print its number.
+/// Returns the verdict in a line. Programs in C print the number of the verdict instead of its name.
 fn verdict(line: &Value) -> Option<Verdict> {
     let is_reported =
         |verdict: &Verdict| line["verdict"] == verdict.name() || line["verdict"] == *verdict as u64;

@@ -1,5 +1,5 @@
-//! Tests how programs exit after a signal, after the reader of a pipe has closed it, and after SIGKILL, and which files
-//! remain.
+//! Ends of programs: how they exit after a signal, after SIGKILL and after the reader of a pipe has closed it, and
+//! which files they leave.
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
@@ -11,7 +11,7 @@ use crate::testkit::{INT, KILL, Program, TERM, TestEnv, exists_or_is_symlink, is
 use rustix::pipe::{PipeFlags, pipe_with};
 use serde_json::Value;
 
-/// Starts a hub whose sensor is a recording of some minutes that is played in real time.
+/// Starts a hub with one sensor, which plays a recording of 4000 scans in real time.
 fn hub(env: &TestEnv) -> Program {
     let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
     let file = env.file("scans", scans);
@@ -28,7 +28,7 @@ fn hub_exits_on_sigint_and_sigterm_without_leftovers() {
         subscriber.await_lines(3, "a scan", is_class("scan"));
         assert!(!env.leftover_files().is_empty(), "the hub should have files in shared memory");
         assert_eq!(hub.end(signal).exit_code, Some(0), "{signal:?}");
-        // Shared memory is freed once the subscriber has exited, too.
+        // Shared memory stays allocated until the subscriber has exited, too.
         assert_eq!(subscriber.end(INT).exit_code, Some(0));
         wait_until("shared memory is freed", || env.leftover_files().is_empty());
         assert_eq!(simulator.end(signal).exit_code, Some(0));
@@ -81,7 +81,8 @@ fn closed_output_pipe_is_no_failure() {
 fn every_line_is_one_write() {
     let env = TestEnv::new();
     let _hub = hub(&env);
-    // A packet pipe preserves the boundaries of writes, so that each read returns the bytes of one write.
+    // The pipe is in packet mode (`O_DIRECT`). It preserves the boundaries of writes, so each read returns the bytes of
+    // one write.
     let (read, write) = pipe_with(PipeFlags::DIRECT | PipeFlags::CLOEXEC).expect("a pipe");
     let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram", "front/status"]);
     command.stdin(Stdio::null()).stdout(write).stderr(Stdio::null());
@@ -122,7 +123,7 @@ fn killed_echo_leaves_complete_lines() {
 fn simulator_replaces_only_its_own_symlinks() {
     let env = TestEnv::new();
     let (port, mine) = (env.path("front"), env.file("mine", "mine"));
-    // A new simulator replaces the symlink that a killed one left.
+    // A new simulator replaces the symlink that a killed simulator left.
     let simulator = env.simulator(&["front"], &[] as &[&str]);
     let old = fs::read_link(&port).expect("a symlink");
     assert_eq!(simulator.end(KILL).exit_code, None);
@@ -131,7 +132,7 @@ fn simulator_replaces_only_its_own_symlinks() {
     assert!(fs::metadata(&port).is_ok(), "the port has no target");
     assert_eq!(simulator.end(INT).exit_code, Some(0));
     assert!(!exists_or_is_symlink(&port));
-    // A simulator never replaces other files or symlinks.
+    // A simulator never replaces other files, or symlinks that no simulator created.
     symlink(&mine, &port).expect("a symlink");
     let link = env.path_argument("front");
     for place in [&mine, &link] {

@@ -1,5 +1,5 @@
 //! Exit codes for files that a user names: 66 for an input that cannot be read, 73 for an output that cannot be
-//! created, and 78 for wrong values in a readable file.
+//! created, and 78 for wrong values in a file that can be read.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -11,8 +11,9 @@ use crate::foreign_user::{OTHER_UID, scanhub, with_another_user};
 use crate::testkit::{Outcome, Program, TestEnv};
 
 /// Command lines in which `FILE` stands for an input file. The flag is true if the file is a recording, which may have
-/// any size. `doctor` is not in this list, because it reports an unreadable file as a failed check. A file that a
-/// configuration names is not in it either, because the file name is a value of the configuration (78).
+/// any size. `doctor` is not in this list, because it reports an unreadable file as a failed check. Files that a
+/// configuration names are not in this list, because their names are values of the configuration. An unreadable one
+/// leads to exit code 78.
 const INPUT_COMMANDS: [(&str, bool); 20] = [
     ("run --no-system-config --config FILE", false),
     ("run --no-system-config --link=a=file:FILE", true),
@@ -49,7 +50,7 @@ const OUTPUT_COMMANDS: [&str; 6] = [
 const SITE_FILE: &str = "[[sensor]]\nname = \"front\"\npose = { x = 0, y = 0, yaw = 0 }\n[[room]]\nname = \"a\\u0007<b>\"\npolygon = \
                     [[0, 0], [4, 0], [4, 3]]\n";
 
-/// Runs the program with the words of `line`, and replaces `FILE` by `file`.
+/// Runs the program with the words of `line` as arguments, in which `file` replaces `FILE`.
 fn run(env: &TestEnv, line: &str, file: &str) -> Outcome {
     let words: Vec<String> = line
         .split(' ')
@@ -66,7 +67,7 @@ fn run(env: &TestEnv, line: &str, file: &str) -> Outcome {
 fn unreadable_input_file_exits_with_66() {
     let env = TestEnv::new();
     let long = env.file("long", "# long\n".repeat(100_000));
-    // A file with a key must not be readable by other users.
+    // The programs refuse a file with a key if other users can read it, so make this file private.
     fs::set_permissions(&long, Permissions::from_mode(0o600)).expect("the file belongs to this user");
     let [directory, pipe, socket] = ["directory", "pipe", "socket"].map(|name| env.path(name));
     fs::create_dir(&directory).expect("a directory");
@@ -83,7 +84,7 @@ fn unreadable_input_file_exits_with_66() {
             assert_eq!(run(&env, line, file).exit_code, Some(66), "{line} {file}");
         }
     }
-    // `telegram decode` itself reports bytes without a telegram, and exits with 5.
+    // `telegram decode` accepts any bytes. It reports bytes that are not part of a telegram, and exits with 5.
     let is_checked = |line: &str| !line.contains("--config") && !line.starts_with("telegram");
     let mut random = fastrand::Rng::with_seed(43);
     let junk = env.file("junk", std::iter::repeat_with(|| random.u8(..)).take(50_000).collect::<Vec<u8>>());
@@ -168,7 +169,7 @@ fn output_that_cannot_be_created_exits_with_73() {
         refused(&env.path_argument("link.mcap"), &format!("it is a link to {file}"));
         refused(&env.path_argument("dangling.mcap"), "it is a link to absent");
         refused(&env.path_argument("nowhere/new.mcap"), "No such file or directory");
-        // `convert` has no format for this name.
+        // `convert` is left out here, because it fails earlier: it has no format for this name.
         if !line.starts_with("convert") {
             refused("/dev/null", "it is a device");
         }
@@ -200,7 +201,7 @@ fn force_replaces_existing_output() {
     ]);
     drop(simulator.ready());
     assert!(!fs::read_to_string(&truth).expect("a file").starts_with("old"));
-    // `man` checks each page before it writes one.
+    // `man` checks the paths of all pages before it writes any page.
     let pages = env.path_argument("man");
     fs::create_dir(&pages).expect("a directory");
     let page = env.path("man/scanhub-run.1");

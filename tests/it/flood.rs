@@ -1,6 +1,6 @@
-//! Floods of garbage. Ten megabytes arrive as fast as the hub reads, with a telegram now and then: the hub publishes
-//! each telegram, and its memory does not grow. From a serial server, the hub reads at most twice what the line can
-//! carry, with little CPU time.
+//! Floods of garbage. Ten megabytes arrive as fast as the hub reads, with a few telegrams among them. The hub publishes
+//! each telegram, and its memory does not grow. From a serial server, the hub reads at most twice as many bytes as the
+//! line can carry, and it uses little CPU time.
 
 use std::io::Write;
 use std::net::TcpListener;
@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use crate::testkit::{INT, Program, TERM, TestEnv, TestLine, bytes_of, is_class, number, scan, wait_until};
 use fastrand::Rng;
 
-/// Returns garbage that is expensive for a framer: noise, start bytes, and heads of telegrams that never end.
+/// Returns garbage that is expensive for a framer: noise, start bytes, and heads of telegrams whose end never arrives.
 fn garbage(random: &mut Rng, len: usize) -> Vec<u8> {
     let head = &scan(0)[..7];
     let mut bytes = Vec::with_capacity(len + 64);
@@ -23,7 +23,7 @@ fn garbage(random: &mut Rng, len: usize) -> Vec<u8> {
         }
     }
     bytes.truncate(len);
-    // The end must not look like the start of the bytes that follow.
+    // End with zeros, so that the framer does not take the last bytes and the next telegram for one telegram.
     bytes.extend([0; 8]);
     bytes
 }
@@ -35,9 +35,9 @@ fn resident_kb(pid: u32) -> u64 {
     line.split_whitespace().nth(1).and_then(|number| number.parse().ok()).expect("a number")
 }
 
-/// Waits for all telegrams in `sent`, in order and with the same bytes. One in 65,536 random frames has a right
-/// checksum by chance. The hub must mark each telegram from random bytes as suspect. Returns the number of these
-/// telegrams.
+/// Waits for all telegrams in `sent`, in order and with the same bytes. Random bytes can form a telegram, too, because
+/// one in 65,536 random checksums is right by chance. The hub must mark each telegram of this kind as suspect. Returns
+/// their number.
 fn receive(subscriber: &mut Program, sent: &[Vec<u8>]) -> u64 {
     let mut wrong = 0;
     for sent in sent {
@@ -67,8 +67,8 @@ fn hub_finds_telegrams_in_a_flood_of_garbage() {
             line.send(&sent[sent.len() - 1]);
         }
     };
-    // Send a stream until the hub has adopted it and no longer requests the scanner's mode. This test does not reply to
-    // requests. The first flood then makes the hub touch all memory that it will ever use.
+    // Send two scans, so that the hub adopts the stream and no longer requests the scanner's mode. (This test does not
+    // reply to requests.) During the first flood, the hub touches all memory that it will ever use.
     let steady = scan(0);
     line.send(&[&steady[..], &steady].concat());
     subscriber.await_lines(2, "the stream", is_class("telegram"));
@@ -88,7 +88,7 @@ fn hub_finds_telegrams_in_a_flood_of_garbage() {
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// Returns the CPU time that a process has used.
+/// Returns the CPU time that all threads of a process have used so far.
 fn cpu_time(pid: u32) -> Duration {
     let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("the hub runs").flatten();
     let of_task = |task: std::fs::DirEntry| {
@@ -109,7 +109,8 @@ fn garbage_from_a_serial_server_is_throttled() {
     let hub = env.hub(&[link]);
     let mut subscriber = env.echo(&["front/telegram"]);
     let (mut server, _) = listener.accept().expect("the hub connects");
-    // Send more bytes than the hub accepts at once, with telegrams among them. Then send garbage without end.
+    // Send telegrams with much garbage between them, so that the hub does not accept all bytes at once. Then send
+    // garbage without end.
     let mut random = Rng::with_seed(5);
     let sent: Vec<Vec<u8>> = (0..20).map(|number| scan(1000 + number)).collect();
     let steady = scan(0);
@@ -129,7 +130,7 @@ fn garbage_from_a_serial_server_is_throttled() {
     let says = "the server sends more than a line of 500000 baud carries";
     env.await_info("front", |info| info["last_error"].as_str().is_some_and(|error| error.starts_with(says)));
     let bytes = || number(&env.info("front")["counters"], "bytes_read");
-    // The counters come from the last status, so they are up to a second old.
+    // The counters come from the last status, which is up to a second old. The limit below allows for this.
     let (before, since, idle) = (bytes(), Instant::now(), cpu_time(hub.pid()));
     wait_until("the hub reads a part of the garbage", || bytes() > before + 300_000);
     let worked = cpu_time(hub.pid()).saturating_sub(idle);

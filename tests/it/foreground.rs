@@ -1,6 +1,6 @@
-//! Quality of the background method `multi`: it separates people from a room, and does so better than the paper's
-//! method. This test runs each scene that has a target once. `benches/perception` runs each scene ten times. Changes of
-//! the simulated world or of a method show here first.
+//! Quality of the background method `multi`: it separates people from a room, and does this better than the paper's
+//! method. This file runs each scene once, with limits for its quality. `benches/perception` runs each scene ten times.
+//! Changes of the simulated world or of a method show here first.
 
 #[path = "../testkit/foreground.rs"]
 mod scenes;
@@ -11,7 +11,7 @@ use scanhub_schema::{Background, Foreground};
 
 use scenes::{Boxes, Detector, ExpectedAnswer, HubDetector, LabeledScan, Scene, Score, play};
 
-/// Seed for which no parameter was tuned.
+/// Seed of the scenes. No parameter of a method was tuned with this seed.
 const SCENE_SEED: u64 = 20;
 
 fn hub_detector(method: Kind) -> Box<dyn Detector> {
@@ -24,7 +24,7 @@ fn scores(frames: &[LabeledScan]) -> (Score, Score) {
 
 #[test]
 fn multi_method_separates_people_from_rooms() {
-    // The limits are slightly below the average of ten runs, because a single run varies.
+    // The limits are slightly below the average of ten runs, because the result of a single run varies.
     for (name, world, unit, recall, precision, wrong_per_scan) in [
         ("the room of Fig. 8", "fig8", Unit::Mm, 0.98, 0.95, 0.1),
         ("a corridor", "corridor", Unit::Cm, 0.9, 0.95, 0.1),
@@ -53,13 +53,13 @@ fn placed_and_removed_boxes_become_background() {
     );
 }
 
-/// A saved background has one range per beam. A model that starts with it reports no more wrong beams than a model that
-/// was not interrupted.
+/// A saved background has only one range per beam, less than the model in memory. A model that starts with the saved
+/// background reports no more wrong beams than a model that was not interrupted.
 #[test]
 fn reloaded_background_is_right_at_once() {
     for world in ["fig8", "faint"] {
         let frames = play(&Scene { name: world, world, unit: Unit::Mm, mixed: true }, SCENE_SEED);
-        // Switch before a person enters, and while a person is present.
+        // Replace the model once before a person enters, and once while a person is present.
         for at in [LEARNING_SCANS, 800] {
             let mut model = BackgroundModel::new(Settings::default(), BEAM_COUNT);
             let mut out = Foreground::of(BEAM_COUNT);

@@ -1,6 +1,6 @@
-//! Attacks by another user of the same machine. The hub and its clients may refuse to run and then name that user, but
-//! the attacks do no other harm. Each test has its own /tmp and /dev/shm. The programs run as root, so no permission
-//! stops them. The attacker is another user.
+//! Attacks by another user of the same machine. An attack may make the hub and its clients refuse to run, with a
+//! message that names the attacker, but it does no other harm. Each test has its own /tmp and /dev/shm. The hub and its
+//! clients run as root, so no file permission would stop them from changing a wrong file. The attacker is not root.
 
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt, symlink};
@@ -14,16 +14,16 @@ use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class, succe
 /// Variable that is set in the process that runs in the new namespace.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_STRANGERS";
 pub(crate) const OTHER_UID: u32 = 65533;
-/// Content of root's file that no program may change.
+/// Content of a file of root, which no program may change.
 const CONTENT: &str = "not a lock";
 
-/// Runs `test`, whose name is `name`, in a namespace with its own /tmp and /dev/shm. Skips it if the system does not
-/// allow that.
+/// Runs `test`, whose name is `name`, in a namespace with its own /tmp and /dev/shm. Skips the test if the system does
+/// not allow namespaces.
 pub(crate) fn with_another_user(name: &str, test: impl FnOnce()) {
     if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
     }
-    // The programs may be in the directory that the new /tmp hides, so copy them.
+    // The programs may be in a directory below /tmp, which the new /tmp hides. Copy them to /mnt first.
     let script = "mount -t tmpfs -o mode=755 none /mnt && cp \"$1\" /mnt/test && cp \"$2\" /mnt/scanhub \
                   && mount -t tmpfs -o mode=1777 none /tmp && mount -t tmpfs -o mode=1777 none /dev/shm";
     let unshare = |then: &str| {
@@ -42,7 +42,7 @@ pub(crate) fn with_another_user(name: &str, test: impl FnOnce()) {
     testkit::rerun_test(name, inside);
 }
 
-/// Returns a command that runs the program with only these arguments, as this user.
+/// Returns a command that runs the program with only these arguments and a minimal environment, as this user.
 pub(crate) fn scanhub(user: u32, arguments: &[&str]) -> Command {
     let mut command = Command::new("/mnt/scanhub");
     command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").uid(user).gid(user);
@@ -53,7 +53,7 @@ fn run(user: u32, arguments: &[&str]) -> Outcome {
     Program::start(scanhub(user, arguments)).wait()
 }
 
-/// Runs a line of shell as the other user. It must succeed.
+/// Runs a line of shell as the other user. The line must succeed.
 pub(crate) fn run_as_other_user(script: &str) {
     assert!(succeeds_as_other_user(script), "{script}");
 }
@@ -88,8 +88,8 @@ fn check_untouched(target: &Path) {
     }
 }
 
-/// Asserts that hub, clients and doctor fail with a message that contains all of `words`, and that `target` is
-/// unchanged.
+/// Asserts that hub, clients and `doctor` fail with a message that contains all of `words`, and that they do not change
+/// the files in `target`.
 fn check_all_refuse(target: &Path, base: &[&str], words: &[&str]) {
     for verb in [
         &["run", "--no-system-config", "--link=front=/tmp/no-port"][..],
@@ -115,7 +115,7 @@ fn fallback_directory_of_another_user_is_refused() {
         check_all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
         run_as_other_user("rm -r /tmp/scanhub-0 && ln -s /tmp/prey /tmp/scanhub-0");
         check_all_refuse(&prey, &[], &["/tmp/scanhub-0", "is a link"]);
-        // The domain itself belongs to root, but the owner of the directory above could replace it.
+        // The domain itself belongs to root, but the owner of the parent directory could replace it.
         run_as_other_user("rm /tmp/scanhub-0 && mkdir -m 777 /tmp/scanhub-0");
         fs::DirBuilder::new().mode(0o700).create("/tmp/scanhub-0/scanhub").expect("a domain");
         check_all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
@@ -139,8 +139,8 @@ fn links_in_a_domain_and_its_parents_are_refused() {
         mode(&base.join("scanhub"), 0o700);
         check_all_refuse(&prey, &["--root=/tmp/base"], &["/tmp/base/scanhub/hub.lock", "is a link"]);
         fs::remove_file(base.join("scanhub/hub.lock")).expect("root can remove the file");
-        // Above the base, a link of root is followed if only root can write to its directory. In /tmp, no link is
-        // followed.
+        // A symlink above the base directory is followed only if it belongs to root and only root can write to its
+        // directory. In /tmp, no symlink is followed.
         run_as_other_user("ln -s /tmp/base /tmp/way");
         check_all_refuse(&prey, &["--root=/tmp/way/b"], &["/tmp/way", "is a link of user 65533"]);
         symlink(base, "/mnt/way").expect("root can create a link");
@@ -152,15 +152,15 @@ fn links_in_a_domain_and_its_parents_are_refused() {
     });
 }
 
-/// Returns the files of the shared memory of `env`, sorted.
+/// Returns the shared-memory segments of the domain of `env`, sorted by path.
 fn segments(env: &TestEnv) -> Vec<PathBuf> {
     let mut paths = testkit::shared_memory(&env.domain().prefix());
     paths.sort();
     paths
 }
 
-/// Returns what another user may do with `path`: the mode of `path` if it is not private, and each attack that
-/// succeeded.
+/// Returns everything that another user may do with `path` but should not. This is the mode of `path` if it is not
+/// private, and each attack that succeeded.
 fn allowed_attacks(path: &Path) -> Vec<String> {
     let mode = fs::metadata(path).map_or(0, |metadata| metadata.mode() & 0o077);
     let path = path.display();
@@ -179,15 +179,15 @@ fn allowed_attacks(path: &Path) -> Vec<String> {
 #[test]
 fn foreign_shared_memory_does_not_disturb_the_hub() {
     with_another_user("foreign_user::foreign_shared_memory_does_not_disturb_the_hub", || {
-        // A domain without a random prefix would use this name.
+        // Without a random prefix, the domain would use this name for its doorbell.
         run_as_other_user("touch /dev/shm/sh_scanhub_front.bell");
         let env = TestEnv::new();
         let simulator = env.simulator(&["front"], &["--baud=500000"]);
         let hub = env.hub(&[env.link("front")]);
         let mut subscriber = env.echo(&["front/scan"]);
         let mut allowed = Vec::new();
-        // With its next scans, the hub removes the segments of a subscriber that has exited. It may do so during the
-        // attacks.
+        // The hub removes the segments of an exited subscriber while it publishes the next scans. This may change the
+        // list of segments during the attacks, so they are repeated.
         wait_until("the attacks change nothing", || {
             let own = segments(&env);
             subscriber.await_lines(10, "a scan", is_class("scan"));
@@ -196,7 +196,8 @@ fn foreign_shared_memory_does_not_disturb_the_hub() {
             own == segments(&env)
         });
         assert!(allowed.is_empty(), "{allowed:?}");
-        // Every user can see the prefix now. Useless files with this prefix do no harm.
+        // The prefix is not secret, because every user can see the names of the segments. Useless files with this
+        // prefix do no harm.
         let prefix =
             fs::read_to_string(env.domain().root().join("prefix")).expect("the hub has written its prefix");
         let prefix = prefix.trim_end();
@@ -213,7 +214,7 @@ fn foreign_shared_memory_does_not_disturb_the_hub() {
         assert!(text.contains(&format!("{prefix}anything")) && text.contains("65533"), "{text}");
 
         // The hub removes its doorbell when it exits. The waiting subscriber keeps the prefix in use, so another user
-        // can occupy the name of the doorbell.
+        // can create a file with the name of the next hub's doorbell.
         assert_eq!(hub.end(TERM).exit_code, Some(0));
         run_as_other_user(&format!("mkfifo /dev/shm/{prefix}front.bell"));
         let refused = env.run(&["run", "--no-system-config", &env.link("front")]);
@@ -225,7 +226,7 @@ fn foreign_shared_memory_does_not_disturb_the_hub() {
         let hub = env.hub(&[env.link("front")]);
         subscriber.await_line("the next hub", |line| line["kind"] == "hub_back");
         subscriber.await_line("a scan", is_class("scan"));
-        // A killed hub leaves all of its files.
+        // A killed hub leaves all of its files. The next hub must start in spite of them.
         assert_eq!(hub.end(KILL).exit_code, None);
         let hub = env.hub(&[env.link("front")]);
         subscriber.await_line("the third hub", |line| line["kind"] == "hub_back");

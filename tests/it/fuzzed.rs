@@ -1,7 +1,7 @@
-//! Targets of the fuzzer, run without the fuzzer on the inputs of the corpora, on mutations of them, and on noise from
-//! fixed seeds. `tests/fuzz/README.md` describes how to search for more inputs.
+//! Targets of the fuzzer, which run here without the fuzzer. Their inputs are the corpora, mutations of these inputs,
+//! and noise from fixed seeds. `tests/fuzz/README.md` describes how to search for more inputs.
 
-// Public because `cargo fuzz` uses the same file as a crate.
+// The module is public because `cargo fuzz` uses the same file as a crate.
 #[allow(unreachable_pub)]
 #[path = "../fuzz/targets.rs"]
 mod targets;
@@ -11,8 +11,8 @@ use std::path::Path;
 
 use fastrand::Rng;
 
-/// Returns the inputs in the corpus of `target`. Each line has the bytes of an input in hexadecimal, and a name after a
-/// space if the input was written by hand.
+/// Returns the inputs in the corpus of `target`. Each line of the file has the bytes of an input in hexadecimal. If a
+/// person wrote the input, a space and its name follow.
 fn corpus(target: &str) -> Vec<Vec<u8>> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/fuzz/corpus/{target}.txt"));
     let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));

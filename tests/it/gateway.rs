@@ -24,7 +24,7 @@ fn is_from(sensor: u8, topic: Topic) -> impl Fn(&Datagram<'_>) -> bool {
     move |datagram| (datagram.head.sensor, datagram.head.topic) == (sensor, topic.number())
 }
 
-/// Returns the final statistics of the gateway: the lines after the last notice.
+/// Returns the final statistics of the gateway, which are the lines after its last notice.
 fn last_statistics(outcome: &Outcome) -> Vec<Value> {
     let lines = outcome.lines();
     let mut last: Vec<Value> = lines.into_iter().rev().take_while(|line| line["class"] != "notice").collect();
@@ -39,7 +39,8 @@ fn last_statistics(outcome: &Outcome) -> Vec<Value> {
     last
 }
 
-/// Asserts that the received datagrams match the counters of the gateway, topic by topic, and its last announcement.
+/// Asserts that the received datagrams match two counts for each topic: the counters of the gateway, and the numbers in
+/// its last announcement.
 fn check_counters(received: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
@@ -88,7 +89,7 @@ fn gateway_sends_all_samples_of_two_sensors() {
         for topic in ["announce", "scan", "marks", "zones", "foreground", "background", "status"] {
             assert_eq!(sensors.iter().filter(|it| *it == topic).count(), 2, "{topic}");
         }
-        // A scan that a local subscriber received has the same content in its datagram.
+        // If a local subscriber received a scan, the datagram of this scan has the same content.
         let scans: Vec<_> =
             received.iter().map(|bytes| decode_datagram(bytes)).filter(is_from(0, Topic::Scan)).collect();
         let mut same = 0;
@@ -108,7 +109,8 @@ fn gateway_sends_all_samples_of_two_sensors() {
             "missed",
         );
         assert!(same > 0 && same + missed >= 40, "{same} scans were sent, {missed} missed");
-        // The last datagram of each sensor is an announcement with the number of datagrams that were sent.
+        // The last datagram of each sensor is an announcement, which has the number of datagrams that were sent for
+        // each topic.
         let last: Vec<_> = received.iter().rev().take(2).map(|bytes| decode_datagram(bytes)).collect();
         for datagram in &last {
             let announce = Announce::unpack(datagram.payload).expect("an announcement");
@@ -259,7 +261,7 @@ fn replaced_hub_and_gateway_change_boot_and_epoch() {
         first.await_line("the hub", |line| line["kind"] == "hub_back");
         receiver.wait_for_datagrams(10, has_topic(Topic::Scan));
         hub.end(KILL);
-        // A listener receives the zones `unknown`.
+        // In place of the missing zones, the gateway sends zones with the verdict `unknown` to its listeners.
         wait_until("the gateway sends unknown zones", || {
             let received = receiver.datagrams();
             let last = received.iter().map(|bytes| decode_datagram(bytes)).rfind(has_topic(Topic::Zones));
@@ -298,8 +300,8 @@ fn oversized_telegrams_are_reported_and_counted() {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
-        // Datagrams with bare telegrams cannot be split into parts. Telegrams of scans have 732 bytes; replies are
-        // shorter.
+        // With `--bare`, a datagram is a telegram without a header, so it cannot be split into parts. Telegrams of
+        // scans have 732 bytes; replies are shorter.
         let mut gateway = env.gateway(&["--interface=lo", "--mtu=700", "--bare"]);
         let report = gateway.await_line("the report of samples that are too long", is_class("lan_link"));
         assert_eq!((&report["to"], &report["state"]), (&"front/telegram".into(), &"failing".into()));
@@ -347,7 +349,7 @@ fn samples_sent_in_parts_are_reassembled() {
             "{remote}"
         );
         assert!(remote.of_class("lan_refused").iter().all(|line| line["payload"] == 0), "{remote}");
-        // The scans of the room have intensities, so that their payload has 1095 bytes.
+        // The scans of the room have intensities, so their payload has 1095 bytes and must be sent in parts.
         let received = receiver.finish();
         assert!(received.iter().all(|bytes| bytes.len() <= 576));
         let parts = |topic: Topic| {

@@ -18,7 +18,7 @@ use serde_json::Value;
 const STREAM_FLAGS: [&str; 2] = ["--seed=62", "--baud=500000"];
 const OWN_ADDRESS: Ipv4Addr = Ipv4Addr::new(10, 76, 0, 1);
 
-/// Creates the interface `ours` with another one at the end of its cable.
+/// Creates the interface `ours` with a cable (a veth pair) to the interface `theirs`.
 fn create_interface() {
     ip("link add ours type veth peer name theirs");
     ip("addr add 10.76.0.1/24 dev ours");
@@ -26,12 +26,12 @@ fn create_interface() {
     ip("link set theirs up");
 }
 
-/// Waits until a destination has this state.
+/// Waits until the gateway reports that a destination has this state.
 fn await_state(gateway: &mut Program, state: &str) -> Value {
     gateway.await_line(state, |line| line["class"] == "lan_link" && line["state"] == state)
 }
 
-/// Waits until the counter `key` of the scans is higher than now.
+/// Waits until the counter `key` of topic `scan` has increased by more than 3.
 fn await_growth(gateway: &mut Program, key: &str) {
     let mut current = || {
         gateway.signal(USR1);
@@ -41,8 +41,8 @@ fn await_growth(gateway: &mut Program, key: &str) {
     wait_until(key, || current() > now + 3);
 }
 
-/// Returns the first sequence number that the counters of `row` include: the number of the first datagram, or the next
-/// number in an announcement that arrived earlier.
+/// Returns the sequence number at which the counters of `row` start. This is the number of the first datagram, or the
+/// next number in an announcement that arrived earlier.
 fn first_sequence(received: &[Vec<u8>], row: &StreamCounters) -> u64 {
     let found = received.iter().find_map(|bytes| {
         let Datagram { head, payload, .. } = decode_datagram(bytes);
@@ -59,8 +59,8 @@ fn first_sequence(received: &[Vec<u8>], row: &StreamCounters) -> u64 {
     u64::from(found.expect("a datagram of the row was received"))
 }
 
-/// Asserts that each sequence number from [`first_sequence`] on was used once: the datagram was received, or the
-/// gateway counted it as failed.
+/// Asserts that the gateway used each sequence number from [`first_sequence`] on once. The received and the lost
+/// datagrams together must be as many as the gateway sent or counted as failed.
 fn check_gap_free(received: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
@@ -85,8 +85,8 @@ fn gateway_survives_link_down_and_up() {
         let receiver = Receiver::new(OWN_ADDRESS);
         receiver.wait_for_datagrams(10, |datagram| datagram.head.topic == Topic::Scan.number());
         await_growth(&mut gateway, "sent");
-        // Unplug the cable, switch the interface off, and take its address away. Below, another interface gets the same
-        // name.
+        // In turn, unplug the cable, switch the interface off, and remove its address. After this loop, another
+        // interface gets the same name.
         for (away, back) in [
             ("link set theirs down", "link set theirs up"),
             ("link set ours down", "link set ours up"),
@@ -107,7 +107,8 @@ fn gateway_survives_link_down_and_up() {
         create_interface();
         await_state(&mut gateway, "up");
         await_growth(&mut gateway, "sent");
-        // The receiver must join the groups again on the new interface.
+        // Membership in a group ends with the interface, so the receiver must join the groups again on the new
+        // interface.
         let again = Receiver::new(OWN_ADDRESS);
         again.wait_for_datagrams(10, |datagram| datagram.head.topic == Topic::Scan.number());
         let outcome = gateway.end(TERM);
@@ -149,7 +150,7 @@ fn unread_output_does_not_delay_the_gateway() {
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
         let _simulator = env.simulator(&["front"], &STREAM_FLAGS);
         let _hub = env.hub(&[env.link("front")]);
-        // The pipe stays open, but nothing reads it, so it is soon full.
+        // The pipe for the gateway's stdout stays open, but nothing reads from it, so it is soon full.
         let (_reader, writer) = std::io::pipe().expect("a pipe");
         fcntl_setpipe_size(&writer, 8192).expect("the pipe can be made smaller");
         let mut command = env.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
@@ -164,7 +165,8 @@ fn unread_output_does_not_delay_the_gateway() {
             signal(USR1);
             poll(&mut [PollFd::new(&writer, PollFlags::OUT)], Some(&now)) == Ok(0)
         });
-        // The gateway continues although it cannot write its statistics for several seconds.
+        // Wait for the announcements of several seconds. The gateway sends them although it cannot write its
+        // statistics.
         let is_announce =
             |datagram: &scanhub_schema::datagram::Datagram<'_>| datagram.head.topic == Announce::NUMBER;
         receiver.wait_for_datagrams(3, is_announce);
@@ -198,7 +200,7 @@ fn prints_statistics_on_sigusr1() {
         gateway.signal(USR1);
         gateway.wait_for_text("front/background: ");
         gateway.wait_for_text("to lo: ");
-        // A new background is sent at once, between the repetitions.
+        // The gateway sends a new background at once, between the repetitions of the old one.
         let generation = |bytes: &[u8]| {
             let datagram = decode_datagram(bytes);
             let is_one = is_background(&datagram);
@@ -264,7 +266,7 @@ fn rejects_impossible_settings_with_a_hint() {
             Program::start(command).wait()
         };
         assert_eq!(unwritable.exit_code, Some(73), "{unwritable}");
-        // The gateway uses the values of the configuration, but flags take precedence.
+        // The gateway uses the values of the configuration file, but command-line flags take precedence.
         let configured = config("[gateway]\ninterface = \"eth8\"\ntopics = [\"front/status\"]\nmtu = 1400\n");
         let mut gateway = env.start_gateway(&["--interface=lo", &configured]);
         let begin = gateway.await_line("line of class gateway", is_class("gateway"));

@@ -1,4 +1,5 @@
-//! Files in which a hub saves state for the next one: their location and mode, and that the hub works without them.
+//! Files in which a hub saves state for the next hub. The tests check the location and the mode of these files, and
+//! that a hub also works without them.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -22,13 +23,13 @@ fn next_hub_begins_its_search_at_the_saved_rate() {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     assert_eq!(env.simulator_totals("front").1, 0);
 
-    // No scanner streams on this line, so the next hub starts its search at the saved rate.
+    // No scanner streams on this line, so the next hub has to search for one. It starts at the saved rate.
     let line = TestLine::create(&env.path("front"));
     let outcome = search(&env, &line, env.lms_link("front"));
     assert!(outcome.stderr.contains("the search begins at 19200 baud"), "{outcome}");
 
-    // The hub ignores the saved rate for a link with the same name at another port, and if other users can write the
-    // file.
+    // The hub ignores the saved rate in two cases: if the link with the same name has another port, and if other users
+    // can write to the file.
     let other = TestLine::create(&env.path("other"));
     let outcome = search(&env, &other, format!("--link=front={},family=lms", env.path_argument("other")));
     assert!(!outcome.stderr.contains("the search begins at"), "{outcome}");
@@ -42,8 +43,8 @@ fn next_hub_begins_its_search_at_the_saved_rate() {
 }
 
 /// Runs a hub until it has sent a request on `line`, and returns its outcome with the log. The log shows at which rate
-/// the search started. The rate of the line does not show this, because the test may read a later rate on a busy
-/// machine.
+/// the search started. The current rate of the line would not show it, because the hub may already have tried the next
+/// rate on a busy machine.
 fn search(env: &TestEnv, line: &TestLine, link: String) -> Outcome {
     let mut command = env.command(&["run", "--json", &link]);
     command.env("SCANHUB_LOG", "debug");

@@ -1,4 +1,4 @@
-//! Datagrams with a key: a listener with the key accepts each datagram of its gateway once, and no others.
+//! Datagrams with a key: a listener with the key accepts each datagram of its gateway once, and no other datagrams.
 
 use std::net::UdpSocket;
 use std::os::unix::fs::PermissionsExt;
@@ -12,7 +12,7 @@ use serde_json::Value;
 
 const STREAM_FLAGS: [&str; 2] = ["--seed=61", "--baud=500000"];
 
-/// Creates a key file, and returns the flag that names it.
+/// Creates a key file, and returns the command-line flag that names the file.
 fn key(env: &TestEnv, name: &str) -> String {
     let made = env.run(&["key", "new", &env.path_argument(name), "--json"]);
     assert_eq!(made.exit_code, Some(0), "{made}");
@@ -23,12 +23,12 @@ fn listener(env: &TestEnv, key: &str) -> Program {
     env.start(&["listen", "--json", "--topic=zones", "--topic=scan", key]).ready()
 }
 
-/// Returns the number of datagrams that were refused for this reason.
+/// Returns the number of datagrams that the listener refused for this reason.
 fn refusal_count(outcome: &Outcome, reason: &str) -> u64 {
     number(outcome.of_class("lan_refused").last().expect("the statistics have a line of refusals"), reason)
 }
 
-/// Requests statistics from `program`, and returns the line of this class.
+/// Requests statistics from `program`, and returns the line of class `class`.
 fn request_statistics(program: &mut Program, class: &str) -> Value {
     program.signal(USR1);
     program.await_line(class, is_class(class))
@@ -53,7 +53,7 @@ fn listener_with_key_accepts_only_its_gateway() {
         let with_other_key = listener(&env, &other);
         let gateway = env.gateway(&["--interface=lo", "--to=127.0.0.1:22299", &ours]);
         let scans = with_key.await_lines(20, "a scan", is_class("scan"));
-        // Another sender has no key.
+        // Another sender has no key, so the listener must refuse its datagrams.
         let mut sender = TestGateway::new(5, 7, 0, "front");
         sender.announce(&Topic::ALL);
         sender.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
@@ -68,14 +68,15 @@ fn listener_with_key_accepts_only_its_gateway() {
         assert!(
             recorded.iter().all(|bytes| decode_datagram(bytes).head.flags & LanFlags::AUTHENTICATED != 0)
         );
-        // Send the recorded datagrams again, to the listener that received them and to a new one.
+        // Send the recorded datagrams again. They go to the listener that has already received them, and to a new
+        // listener.
         let replay = |mut program: Program| {
             for bytes in &recorded {
                 let topic = Topic::of_number(decode_datagram(bytes).head.topic);
                 sender.send_to_group(topic.map_or(Announce::GROUP, group), bytes);
             }
-            // A short datagram in each group that the listener has joined marks the end. Once the listener has counted
-            // these, it has processed all datagrams before them.
+            // A datagram that is too short, sent to each group that the listener has joined, marks the end. As soon as
+            // the listener has counted these short datagrams, it has processed all earlier ones.
             let groups = [Announce::GROUP, group(Topic::Zones), group(Topic::Scan)];
             groups.iter().for_each(|&group| sender.send_to_group(group, b"the end"));
             while number(&request_statistics(&mut program, "lan_refused"), "short") < groups.len() as u64 {}
@@ -83,7 +84,7 @@ fn listener_with_key_accepts_only_its_gateway() {
         };
         let replayed = replay(with_key);
         assert_eq!(refusal_count(&replayed, "unauthenticated"), 2, "{replayed}");
-        // The listener has seen a later epoch, so it refuses all of these.
+        // The gateway has restarted since, so the listener has seen a later epoch. It refuses all of these datagrams.
         assert_eq!(refusal_count(&replayed, "epoch"), recorded.len() as u64, "{replayed}");
         let late_joiner = replay(listener(&env, &ours));
         assert!(

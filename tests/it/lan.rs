@@ -1,4 +1,4 @@
-//! Datagrams in other languages and tools, and gateways on networks with faults.
+//! Tests of datagrams: readers in other languages, tools that show datagrams, and gateways on networks with faults.
 
 mod c;
 mod capture;

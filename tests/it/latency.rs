@@ -1,5 +1,5 @@
-//! `scanhub latency` with a streaming hub: the parts of an age add up, and the verb exits with 5 if a limit is
-//! exceeded. For remote sensors, it reports the parts that this machine can measure.
+//! `scanhub latency` with a streaming hub: the parts of a sample's age add up to the age, and the verb exits with 5 if
+//! a limit is exceeded. For a remote sensor, the verb reports the parts that this machine can measure.
 
 use std::collections::BTreeSet;
 
@@ -10,12 +10,12 @@ use serde_json::{Value, json};
 
 const PERCENTILE_KEYS: [&str; 6] = ["min_ns", "p50_ns", "p90_ns", "p99_ns", "p999_ns", "max_ns"];
 
-/// Returns the last result line.
+/// Returns the last line of class `latency`, which has the results.
 fn latency_line(outcome: &Outcome) -> Value {
     outcome.of_class("latency").pop().unwrap_or_else(|| panic!("no result: {outcome}"))
 }
 
-/// Returns the number of measurements of `span`, and asserts that its percentiles are in order.
+/// Returns the number of measurements of `span`, and asserts that the percentiles of these measurements are in order.
 fn count(line: &Value, span: &str) -> u64 {
     let of = &line[span];
     if *of == Value::Null {
@@ -49,10 +49,12 @@ fn splits_ages_of_a_stream_and_checks_the_limit() {
         assert_eq!((number(&line, "received"), number(&line, "in_future")), (20, 0), "{line}");
         assert_eq!(line["flags"][0], "simulated");
         assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
-        // On a busy machine, a sample may spend more time in the hub than a header can hold.
+        // On a busy machine, a sample may spend more time in the hub than its header can hold. The sample then does not
+        // count in `hub`.
         let in_hub = count(&line, "hub");
         assert!(in_hub == count(&line, "wake") && in_hub <= count(&line, "age"), "{line}");
-        // If the stamps of a telegram were estimated on a busy machine, its time on the line is unknown.
+        // On a busy machine, the stamps of a telegram may be estimated. The time that the telegram took on the line is
+        // then unknown.
         assert!(count(&line, "line") <= 20 && count(&line, "line") == count(&line, "total"), "{line}");
         for part in ["hub", "wake"].into_iter().filter(|_| in_hub > 0) {
             assert!(number(&line[part], "max_ns") <= number(&line["age"], "max_ns"), "{line}");
@@ -67,17 +69,17 @@ fn splits_ages_of_a_stream_and_checks_the_limit() {
         (Some(5), &json!("check")),
         "{outcome}"
     );
-    // A result line is also printed every second for each topic.
+    // The verb also prints a result line every second for each topic.
     let results = outcome.of_class("latency");
     let topics: BTreeSet<_> = results.iter().map(|line| line["topic"].to_string()).collect();
     assert_eq!(topics.len(), 2, "{outcome}");
     let mut latency = env.start(&["latency", "front/scan", "--json"]);
     let line = latency.await_line("a time on the line", |line| count(line, "line") > 0);
-    // 732 bytes with ten bits each.
+    // A telegram has 732 bytes with ten bits each, which take 14.6 ms at 500,000 baud.
     assert!(number(&line["line"], "max_ns") > 14_000_000, "{line}");
     assert!(number(&line["total"], "min_ns") > number(&line["line"], "min_ns"), "{line}");
     assert_eq!(latency.end(INT).exit_code, Some(0));
-    // A status does not belong to a telegram: it has an age, but no other part.
+    // A status does not belong to a telegram: it has an age, but the age has no parts.
     let mut latency = env.start(&["latency", "front/status", "--json", "--no-realtime"]);
     let line = latency.await_line("a status", |line| line["age"] != Value::Null);
     assert_eq!((&line["line"], &line["hub"], &line["total"]), (&Value::Null, &Value::Null, &Value::Null));
@@ -121,10 +123,10 @@ fn splits_remote_age_into_network_and_local_part() {
         assert_eq!(line["flags"], json!(["simulated", "remote"]), "{line}");
         assert!(number(&line["network"], "min_ns") > 49_000_000, "{line}");
         assert_eq!((&line["line"], &line["hub"]), (&Value::Null, &Value::Null));
-        // Zones that the listener publishes itself have not passed the network.
+        // The listener itself also publishes zones, when datagrams are missing. These have not passed the network.
         assert!((1..=count(&line, "age")).contains(&count(&line, "network")), "{line}");
         assert_eq!(number(&line, "in_future"), 0, "{line}");
-        // The clock of the gateway is ahead.
+        // Now the clock of the gateway is ahead by an hour.
         sender.stamp_ns = testkit::wall_ns() + 3_600_000_000_000;
         sender.send(Topic::Zones, &zones);
         let line = latency.await_line("a stamp in the future", |line| line["in_future"] == 1);

@@ -1,5 +1,5 @@
-//! Hub with simulated LDROBOT scanners: it publishes their points as scans with an even grid, and their unchanged
-//! packets. These scanners have no EEPROM and receive no bytes.
+//! Hub with simulated LDROBOT scanners. It publishes their points as scans with an even grid, and it publishes their
+//! packets unchanged. These scanners have no EEPROM, and the hub sends them no bytes.
 
 use serde_json::Value;
 
@@ -37,7 +37,7 @@ fn check_scan(scan: &Value, beams: usize) {
     for (beam, (angle, range)) in angles.iter().zip(ranges).enumerate() {
         assert_eq!(angle.is_null(), range.is_null(), "beam {beam}");
         let Some(angle) = angle.as_f64() else { continue };
-        // Each angle lies within its own beam. Beam 0 is centered at the scanner's zero.
+        // Each angle lies within the width of its beam. The center of beam 0 is the scanner's zero angle.
         let off = (angle - step * beam as f64 + 180.0).rem_euclid(360.0) - 180.0;
         assert!(off.abs() <= step.abs() / 2.0 + 1e-3, "beam {beam} at {angle}");
         exact += usize::from(off.abs() > 1e-3);
@@ -128,7 +128,7 @@ fn reconnects_to_a_returning_ld19() {
     }
     let info = env.info("front");
     assert_eq!((number(&info["counters"], "reconnects"), &info["last_error"]), (1, &"".into()), "{info}");
-    // Within one run of a hub, numbers continue without a gap.
+    // During one run of a hub, `topic_seq` has no gap, even if the scanner was disconnected.
     contiguous_numbers(&subscriber.end(INT).of_class("scan"), "topic_seq");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

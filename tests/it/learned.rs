@@ -1,6 +1,6 @@
-//! Saved backgrounds: a hub starts with the background that the previous hub learned, even if that hub was killed. It
-//! does not use the background if this would be wrong: at another pose, after a reset, with other settings, or in a
-//! recording.
+//! Saved backgrounds: a hub starts with the background that the previous hub learned, even if that hub was killed. The
+//! hub does not use a saved background that would be wrong: at another pose, after a reset, with other settings, or for
+//! a recording.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -19,7 +19,7 @@ const SLOW_LEARNING: &str = "--set=background.scans=8191";
 /// World with a wall around the sensor, 3 m ahead.
 const ROOM_WORLD: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
      [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
-/// Post in that world, 1.5 m ahead of the sensor.
+/// Post in the world of [`ROOM_WORLD`], 1.5 m ahead of the sensor.
 const POST: &str = "\n[[thing]]\nradius_mm = 150\npose = [0, 1500]\n";
 
 fn simulator(env: &TestEnv, world: &str) -> Program {
@@ -54,7 +54,7 @@ fn with_streaming_hub(env: &TestEnv, flags: &[&str], action: impl FnOnce()) -> O
     outcome
 }
 
-/// Lets a first hub learn and save the background of the room.
+/// Runs a first hub that learns the background of the room and saves it.
 fn save_background_of_room(env: &TestEnv) {
     with_streaming_hub(env, &[QUICK_LEARNING], || {
         testkit::wait_until("the room is learned", || known_beams(env) > 350)
@@ -83,7 +83,8 @@ fn post_placed_between_hub_runs_is_foreground_at_once() {
         let hub = env.hub(&[&env.link("front"), SLOW_LEARNING]);
         let mut subscriber = env.echo(&["front/foreground"]);
         let first = subscriber.await_line("foreground", is_class("foreground"));
-        // The post is 11 degrees wide. In a first scan, two of its beams may not be foreground yet.
+        // The post is 11 degrees wide. In the first scan, two of the beams that meet the post may not be foreground
+        // yet.
         let (beams, generation) =
             (first["beams"].as_array().map_or(0, Vec::len), number(&first, "generation"));
         assert!((18..=26).contains(&beams) && generation == 1, "{first}");
@@ -119,7 +120,7 @@ fn unusable_or_unwanted_background_is_not_loaded() {
     );
     empty(&["--set=background.keep=false"], "");
     empty(&["--set=background.start=empty"], "");
-    // Files that are damaged, truncated, from another sensor, or writable by other users.
+    // Files that are truncated, of another sensor, or damaged. After the loop, other users can write to the file.
     let text = String::from_utf8(kept.clone()).expect("text");
     for (wrong, why) in [
         (text[..text.len() / 2].to_owned(), "cut short"),
@@ -138,10 +139,10 @@ fn unusable_or_unwanted_background_is_not_loaded() {
     // The unchanged file with the right mode is accepted.
     fs::set_permissions(file(&env), fs::Permissions::from_mode(0o600)).expect("the mode can be set");
     with_streaming_hub(&env, &[SLOW_LEARNING], || assert!(known_beams(&env) > 350));
-    // After a reset, the background is not loaded again.
+    // A reset deletes the saved background, so that no hub loads it again.
     for (flags, content) in [
         (vec![SLOW_LEARNING], &kept[..]),
-        // A reset also removes a file that the hub has rejected.
+        // A reset also deletes a file that the hub has rejected.
         (vec![SLOW_LEARNING, "--set=link.front.pose.x=0.2"], &kept),
         (vec![SLOW_LEARNING], b"cut short"),
     ] {

@@ -1,4 +1,5 @@
-//! `scanhub leds`: shows zones and marks of a robot in a terminal and on LEDs, for which a directory stands in.
+//! `scanhub leds`: shows the zones and marks of a robot in a terminal and on LEDs. A directory of files stands in for
+//! the real LEDs.
 
 use std::fs;
 use std::io::Read;
@@ -14,7 +15,7 @@ use rustix::time::{ClockId, clock_gettime};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
-/// Returns the flag for a world with the walls of a room, far from the sensor, and the object `thing` in it.
+/// Returns the flag for a world that has the walls of a room, far from the sensor, and the object `thing`.
 fn world(env: &TestEnv, name: &str, thing: &str) -> String {
     let room = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n";
     format!("--world={}", env.file(name, format!("{room}\n{thing}")))
@@ -40,7 +41,8 @@ impl FakeLeds {
         diodes
     }
 
-    /// Creates an LED with all its files in one step, as the kernel does.
+    /// Creates an LED with all its files in one step, by renaming a directory, because the kernel creates an LED in one
+    /// step, too.
     fn create_led(&self, name: &str) {
         let aside = self.0.with_extension(name);
         fs::create_dir(&aside).unwrap();
@@ -56,7 +58,7 @@ impl FakeLeds {
         fs::remove_dir_all(self.0.join(name)).unwrap();
     }
 
-    /// Returns the names of the LEDs that are lit, or `None` while one is neither on nor off.
+    /// Returns the names of the LEDs that are lit, or `None` if an LED is neither on nor off, or is missing.
     fn lit_names(&self) -> Option<String> {
         let mut lit = Vec::new();
         for name in LED_NAMES {
@@ -84,14 +86,14 @@ fn leds_show_the_verdict_and_red_without_one() {
     let env = TestEnv::new();
     let diodes = FakeLeds::new(&env);
     let [root, led] = diodes.flags();
-    // No hub is running yet.
+    // At first, no hub runs.
     let leds = env.start(&["leds", "front", "--json", &root, &led]);
     diodes.wait_until_lit("rd");
     let open = world(&env, "open", STRIP_WORLD);
     let sensor = simulator(&env, &open);
     let hub = env.hub(&[env.link("front")]);
     diodes.wait_until_lit("gn mk");
-    // First the sensor stops sending, and then the hub exits.
+    // First the scanner stops sending. Later, the hub is killed.
     assert_eq!(sensor.end(TERM).exit_code, Some(0));
     diodes.wait_until_lit("rd");
     let _sensor = simulator(&env, &open);
@@ -100,7 +102,7 @@ fn leds_show_the_verdict_and_red_without_one() {
     diodes.wait_until_lit("rd");
     let hub = env.hub(&[env.link("front")]);
     diodes.wait_until_lit("gn mk");
-    // When `leds` exits, it switches to red, because no program monitors the verdict any more.
+    // When `leds` exits, it switches to red, because it no longer monitors the verdict.
     let outcome = leds.end(INT);
     assert_eq!((outcome.exit_code, diodes.lit_names().as_deref()), (Some(0), Some("rd")), "{outcome}");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
@@ -114,7 +116,7 @@ fn leds_show_the_verdict_and_red_without_one() {
         assert_eq!(line["mark"], line["marks"].as_u64().is_some_and(|marks| marks > 0), "{line}");
     }
     for pair in lines.windows(2) {
-        // On a busy machine, scans may be lost. `leds` then prints a line because the reason has changed.
+        // On a busy machine, scans may be lost. `leds` then prints a line in which only the reason has changed.
         let shown = |line: &Value| ["verdict", "marks", "reason"].map(|key| line[key].clone());
         assert!(shown(&pair[0]) != shown(&pair[1]), "no change: {pair:#?}");
     }
@@ -129,7 +131,8 @@ fn mark_led_turns_off_when_scans_end() {
     let hub = env.hub(&[env.link("front")]);
     let leds = env.start(&["leds", "front", "--json", &root, &led]);
     diodes.wait_until_lit("gn mk");
-    // While `leds` is stopped, the last marks and the zones that report missing scans queue up together.
+    // While `leds` is stopped, both the last marks and the zones that report missing scans queue up. `leds` must not
+    // show the old marks after these zones.
     leds.signal(Signal::STOP);
     assert_eq!(env.run(&["echo", "front/marks", "-n", "5"]).exit_code, Some(0));
     assert_eq!(sensor.end(TERM).exit_code, Some(0));
@@ -197,7 +200,8 @@ fn leds_of_a_robot_show_its_worst_sensor() {
     let mut leds = env.start(&["leds", "robot", "--json"]);
     leds.await_line("clear", |line| line["verdict"] == "clear" && line["green"] == true);
     assert_eq!(rear.end(TERM).exit_code, Some(0));
-    // Any sensor may be late for a moment, but `rear` remains absent.
+    // On a busy machine, the scans of `front` may be late for a short time. Wait for the line about `rear`, which
+    // remains absent.
     let lost = leds.await_line("unknown", |line| line["verdict"] == "unknown" && line["worst"] == "rear");
     assert_eq!(
         (&lost["sensor"], &lost["worst"], &lost["red"]),
@@ -211,7 +215,7 @@ fn now_ns() -> u64 {
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
-/// The test sends each verdict itself, so it knows how long a verdict was valid.
+/// The test sends each verdict itself, so the test can measure how long a verdict was valid before it was shown.
 #[test]
 fn only_a_better_verdict_waits_for_the_hold_time() {
     in_a_network("leds::only_a_better_verdict_waits_for_the_hold_time", || {
@@ -223,7 +227,7 @@ fn only_a_better_verdict_waits_for_the_hold_time() {
         let mut send_verdict = |verdict: Verdict| {
             front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
         };
-        // Each of these programs shows the same verdicts with a different hold time.
+        // Starts `leds` with a hold time. All of these programs receive the same verdicts.
         let leds = |hold: &[&str]| {
             let before = env.subscribers("robot1.front/zones");
             let program = env.start(&[&["leds", "robot1.front", "--json"], hold].concat());
@@ -239,7 +243,7 @@ fn only_a_better_verdict_waits_for_the_hold_time() {
         }
         let sent_ns = now_ns();
         let mut shown = Value::Null;
-        // The verdict is only valid while it is repeated.
+        // Send the verdict again and again, because it is valid only for a short time.
         wait_until("clear is shown after the hold time", || {
             send_verdict(Verdict::Clear);
             usual.printed(is("clear")).map(|line| shown = line).is_some()
@@ -279,9 +283,10 @@ fn rejects_unknown_leds_and_sensors() {
         hint.as_str().is_some_and(|hint| hint.starts_with("no light \"gren\": green=NAME")),
         "{misspelt}"
     );
-    // An LED that was opened before another one was refused shows red.
+    // `leds` opened this LED before it refused another one, so the LED shows red.
     assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n");
-    // As for all subscribers: a run with a time limit needs a running hub, and an unknown sensor is an error.
+    // `leds` exits like all subscribers: a run with a time limit fails without a running hub, and an unknown sensor is
+    // an error.
     assert_eq!(env.run(&["leds", "front", "--for=1s"]).exit_code, Some(3));
     let _hub = env.hub(&[env.link("front")]);
     let unknown = env.run(&["leds", "side", "--json"]);
@@ -301,7 +306,7 @@ fn leds_update_a_single_line_on_a_terminal() {
         command.stdin(Stdio::null()).stderr(Stdio::null()).stdout(Stdio::from(screen));
         let mut process = spawn(command).unwrap();
         let mut printed = Vec::new();
-        // Once no program has the terminal open, reading from it fails with an error.
+        // Reading fails as soon as no program has the terminal open.
         let _ = keys.read_to_end(&mut printed);
         assert_eq!(process.wait().unwrap().code(), Some(3));
         let text = String::from_utf8(printed).unwrap();

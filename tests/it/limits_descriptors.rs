@@ -1,5 +1,6 @@
-//! Shortage of descriptors: a program that cannot work reports it and exits with 75. A hub that runs out of descriptors
-//! continues to serve its subscribers, and reports that new subscribers receive nothing.
+//! Shortage of file descriptors. A program that needs more descriptors than it may have reports this and exits with 75.
+//! A hub that runs out of descriptors continues to serve its subscribers, and reports that new subscribers receive
+//! nothing.
 
 use std::process::Command;
 
@@ -13,7 +14,8 @@ use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 fn start_limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
     let inner = env.command(arguments);
     let mut command = Command::new("sh");
-    // The process that runs the tests may have left some open. A shell can close only descriptors with one digit.
+    // Close descriptors that the test process may have left open. A shell can close only descriptors with one digit, so
+    // the others are added to the limit.
     let closed = "exec 3<&- 4<&- 5<&- 6<&- 7<&- 8<&- 9<&-";
     let limit = limit + inherited_descriptors();
     let script = format!("{closed} && ulimit -n \"$0\" && exec \"$@\"");
@@ -65,7 +67,7 @@ fn client_works_or_reports_the_needed_descriptors() {
         &["control", "front", "pause"],
     ];
     for limit in [5, 6, 8, 10] {
-        // A program without enough descriptors does not wait for a hub that it cannot find.
+        // A program without enough descriptors cannot search for a hub. It exits instead of waiting for one.
         assert_out_of_descriptors(&start_limited(&env, limit, &["echo", "front/status"]).wait());
     }
     run_concurrently(verbs, |verb| {
@@ -94,7 +96,7 @@ fn hub_out_of_descriptors_keeps_serving_subscribers() {
     let mut served = env.echo(&["front/scan", "front/status"]);
     served.await_lines(20, "a scan", is_class("scan"));
     let others: Vec<_> = (0..16).map(|_| env.start(&["echo", "--json", "front/scan"])).collect();
-    // An attached subscriber still exits after a signal.
+    // Wait until all subscribers are attached, because only an attached subscriber is sure to exit after a signal.
     wait_until("all are attached", || env.subscribers("front/scan") == 17);
     let reports_shortage = |line: &serde_json::Value| {
         line["class"] == "status"
@@ -109,7 +111,7 @@ fn hub_out_of_descriptors_keeps_serving_subscribers() {
     for other in others {
         assert_eq!(other.end(INT).exit_code, Some(0));
     }
-    // New subscribers are served again.
+    // The hub has descriptors again, so new subscribers receive samples.
     wait_until("the hub has free descriptors again", || env.run(&["info", "front"]).exit_code == Some(0));
     served.await_line("report that all clients are served", |line| {
         line["class"] == "status" && line["last_error"] == ""

@@ -1,6 +1,6 @@
 //! Files that could use too much memory or time: a device or a pipe instead of a file, a file that unpacks to much more
-//! than its size, and thousands of channels or links. The program refuses or reads each one within 64 MB and a second,
-//! with a suitable message and exit code.
+//! than its size, and a file with thousands of channels or links. The program refuses or reads each of these files
+//! within 64 MB of memory and a second, with a suitable message and exit code.
 
 use std::io::Write;
 use std::process::Command;
@@ -13,7 +13,7 @@ use rustix::fs::{CWD, FileType, Mode, mknodat};
 use scanhub_schema::file::ENCODING;
 
 /// Runs the program with at most 96,000 kB of address space and two seconds of CPU time. The program itself uses about
-/// 23 MB of the address space. An unoptimized build needs the two seconds for one second of work.
+/// 23 MB of the address space. Two seconds allow for one second of work, because tests run an unoptimized build.
 fn run_bounded(env: &TestEnv, arguments: &[&str]) -> Outcome {
     let own = env.command(arguments);
     let mut command = Command::new("sh");
@@ -56,7 +56,7 @@ fn text(text: &str) -> Vec<u8> {
     [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
 }
 
-/// Returns an MCAP file with these records.
+/// Returns an MCAP file that has these records between its header and its end.
 fn mcap(records: &[Vec<u8>]) -> Vec<u8> {
     const MAGIC: &[u8] = b"\x89MCAP0\r\n";
     let header = record(1, &[text(""), text("")].concat());
@@ -89,12 +89,12 @@ fn rejects_devices_pipes_and_directories_at_once() {
             &["convert", path, "x.mcap"],
             &["background", "a", "load", path],
         ] {
-            // The configuration has the name of this file as a value, so the exit code is 78.
+            // Here, the file's name is a value in the configuration, so the exit code is 78.
             let code = if arguments.contains(&model.as_str()) { 78 } else { 66 };
             assert_refused(&env, arguments, code, words);
         }
     }
-    // Stdin may be a file, but not a pipe.
+    // Standard input is accepted as an input file if it is a file, but not if it is a pipe.
     let file = env.file("links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
     let check = |stdin: std::process::Stdio| {
         let command = env.command(&["config", "check", "/dev/stdin"]);
@@ -194,7 +194,7 @@ fn rejects_surplus_links_at_the_first_one() {
     assert_refused(&env, &["config", "check", &more], 78, "more.toml:770:8: more than 256 links");
     let far_more = env.file("far-more.toml", links(20_000));
     assert_refused(&env, &["config", "check", &far_more], 66, "it is longer than 524288 bytes");
-    // The configuration stores the location of each of these values.
+    // The configuration stores the location of each value in the file, and here there are 39,000 values.
     let sectors = "{from_deg=1.0,to_deg=2.0,range=0.1},".repeat(13_000);
     let sectors = format!("{}[zones]\nbody_mask = [{sectors}]\n", links(2));
     let outcome = run_bounded(&env, &["config", "check", &env.file("sectors.toml", sectors)]);

@@ -1,6 +1,6 @@
-//! Shortage of shared memory, at the start or later: programs print a message and exit with 75, and are never ended by
-//! a signal. Programs that are already attached lose nothing. Each test has its own /dev/shm in its own mount
-//! namespace.
+//! Shortage of shared memory, when a program starts or later. Programs print a message and exit with 75, and no signal
+//! such as SIGBUS ends them. Programs that are already attached lose no samples. Each test has its own /dev/shm in its
+//! own mount namespace.
 
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
@@ -15,7 +15,7 @@ use rustix::process::Signal;
 /// Variable that is set in the process that runs in the namespace.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_INSIDE";
 
-/// Runs `test`, whose name is `name`, in a new mount namespace. Skips it if the system does not allow that.
+/// Runs `test`, whose name is `name`, in a new mount namespace. Skips the test if the system does not allow namespaces.
 fn in_a_namespace(name: &str, test: impl FnOnce()) {
     if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
@@ -35,7 +35,7 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
     rerun_test(name, unshare);
 }
 
-/// Mounts a new and empty /dev/shm of this size.
+/// Mounts a new, empty file system of `bytes` bytes at /dev/shm.
 fn mount(bytes: u64) {
     let size = format!("size={bytes}");
     let mounted = status(Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs", "/dev/shm"]));
@@ -60,7 +60,7 @@ fn fill(remaining: u64) {
     file.set_len(len.saturating_sub(remaining)).expect("the file can be truncated");
 }
 
-/// Frees the memory that [`fill`] has used. The file may have been removed with its /dev/shm.
+/// Frees the memory that [`fill`] has used. If a new /dev/shm has been mounted since, the file no longer exists.
 fn free() {
     if let Ok(file) = OpenOptions::new().write(true).open(FILL_FILE) {
         file.set_len(0).expect("the file can be truncated");
@@ -69,7 +69,7 @@ fn free() {
 
 const FILL_FILE: &str = "/dev/shm/fill";
 
-/// Asserts that a program was successful, or reported that memory is short.
+/// Asserts that a program succeeded, or that it reported a shortage of memory.
 fn assert_done_or_out_of_memory(outcome: &Outcome) {
     match outcome.exit_code {
         Some(0) => {}

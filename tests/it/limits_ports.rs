@@ -1,4 +1,4 @@
-//! Conflicts about a port: between two hubs, and between two links of one hub.
+//! Conflicts between two users of one port: two hubs, or two links of one hub.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -53,7 +53,7 @@ fn only_one_of_two_links_opens_a_shared_port() {
     for name in ["one", "two"] {
         symlink(&pty, env.path(name)).expect("a symlink");
     }
-    // The link that opens the port first has it.
+    // The link that opens the port first gets the port.
     wait_until("one link streams and the other one reports the reason", || {
         let infos = ["one", "two"].map(|name| env.info(name));
         let streams = infos.iter().filter(|info| info["state"] == "streaming").count();

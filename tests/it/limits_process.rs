@@ -1,5 +1,5 @@
-//! Limits of a process for its address space and for the length of files. A program that needs more reports it and
-//! exits with 75, before it creates anything that would remain.
+//! Limits of a process for its address space and for the length of files. A program that needs more than a limit allows
+//! reports this and exits with 75. It does so before it creates files that would remain.
 
 use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use crate::testkit::{Outcome, Program, TERM, TestEnv, spawn};
 use rustix::process::{Pid, kill_process};
 
-/// Starts the program with the limit `limit`, which is an argument of ulimit.
+/// Starts the program with the limit `limit`, which has the form of arguments of the shell's `ulimit`.
 fn start_limited<S: AsRef<str>>(env: &TestEnv, limit: &str, arguments: &[S]) -> Program {
     let inner = env.command(arguments);
     let mut command = Command::new("sh");
@@ -29,7 +29,7 @@ fn assert_out_of_resources(outcome: &Outcome, words: &str) {
 fn hub_short_of_address_space_leaves_no_segment() {
     let env = TestEnv::new();
     let (mut short, mut is_up) = (0, false);
-    // Increase the limit until the hub starts. With the first limits, not even its program can be loaded.
+    // Increase the limit until the hub starts. With the lowest limits, the kernel cannot even load the program.
     for limit in (16_000..400_000).step_by(1_000) {
         let inner = env.command(&["run", "--json", &env.link("front")]);
         let mut command = Command::new("sh");

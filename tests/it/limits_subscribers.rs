@@ -1,5 +1,6 @@
-//! Many subscribers, slow subscribers and killed subscribers: no other subscriber misses samples because of them, each
-//! one can determine exactly which samples it missed, and the hub then uses as many resources as before.
+//! Many subscribers, slow subscribers and killed subscribers: no other subscriber misses samples because of them. Each
+//! subscriber can determine exactly which samples it missed. After the subscribers have ended, the hub uses as many
+//! resources as before.
 
 use std::fs;
 use std::thread;
@@ -17,11 +18,11 @@ use scanhub_shm::Domain;
 use scanhub_shm::Payload;
 use serde_json::Value;
 
-/// Variables with the name and the location of the domain, for a process that is killed while it holds samples.
+/// Variables with the name and the location of the domain, for a child process that is killed while it holds samples.
 const HOLD_VARIABLES: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
 
-/// Starts a hub with a recording of many minutes that has a scan every `period_ms`. This is so slow that a subscriber
-/// does not miss scans just because the machine is busy.
+/// Starts a hub with a recording of many minutes that has a scan every `period_ms`. Choose a period so long that a
+/// subscriber does not miss scans just because the machine is busy.
 fn streaming(env: &TestEnv, period_ms: u32, flags: &[&str]) -> Program {
     let line = |scan: u32| {
         let (ranges, at) = (vec!["1.5"; 181].join(" "), f64::from(scan * period_ms) / 1000.0);
@@ -35,8 +36,8 @@ fn subscribe(domain: &Domain) -> Subscriber<Scan> {
     Subscriber::builder("front").in_domain(domain).timeout(Duration::from_secs(20)).open().expect("a name")
 }
 
-/// Attaches `count` subscribers, and receives until each has `sample_count` scans. Returns the number of scans that
-/// they missed in total.
+/// Attaches `count` subscribers, and receives until each of them has received `sample_count` scans. Returns the total
+/// number of scans that the subscribers missed.
 fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
     let mut subscribers: Vec<_> = (0..count).map(|_| (subscribe(domain), 0, 0)).collect();
     while subscribers.iter().any(|(_, received, _)| *received < sample_count) {
@@ -46,7 +47,7 @@ fn count_missed(domain: &Domain, count: usize, sample_count: usize) -> u64 {
                 (*received, *missed) = (*received + 1, *missed + scan.missed);
             }
         }
-        // A new scan reaches all subscribers at the same time, so waiting for one is enough.
+        // A new scan reaches all subscribers at the same time, so it is enough to wait for the first subscriber.
         let (subscriber, received, missed) = &mut subscribers[0];
         let scan = subscriber.next().expect("samples can be received").expect("a scan arrives");
         (*received, *missed) = (*received + 1, *missed + scan.missed);
@@ -92,7 +93,7 @@ fn reports_configured_limit_to_surplus_subscriber() {
         assert_eq!((outcome.exit_code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
         assert_eq!(error["message"], "scanhub/v2/front/scan has 3 subscribers, which is the maximum");
         assert!(error["hint"].to_string().contains("limits.subscribers, up to 250"), "{error}");
-        // Other topics are not affected.
+        // The limit applies to each topic, so subscribers of other topics are not affected.
         assert_eq!(env.info("front")["state"], "absent");
         drop(subscribers);
         let late = env.echo(&["front/scan"]);
@@ -161,7 +162,8 @@ fn killed_subscribers_leave_no_samples() {
     let hub_domain = env.domain();
     let segments = || testkit::shared_memory(&hub_domain.prefix()).len();
     let (open_before, segments_before) = (descriptors(), segments());
-    // If killed subscribers kept their samples, the hub would have none left.
+    // The killed subscribers hold more samples in total than the hub has. If the hub did not get these samples back, it
+    // would have none left.
     const {
         assert!(
             KILL_COUNT * SUBSCRIBERS_PER_PROCESS * limits::MAX_BORROWED_SAMPLES
@@ -178,7 +180,8 @@ fn killed_subscribers_leave_no_samples() {
         holder.wait_for_text("holding");
         assert_eq!(holder.end(KILL).exit_code, None);
     }
-    // The numbers from before may include resources of the client that counted the subscribers. It was exiting then.
+    // The numbers may also become smaller than before. The earlier numbers may include resources of the client that
+    // counted the subscribers, which may not have exited completely.
     wait_until("the hub has as many descriptors and segments as before", || {
         descriptors() <= open_before && segments() <= segments_before
     });
@@ -191,12 +194,13 @@ fn killed_subscribers_leave_no_samples() {
     assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
 }
 
-/// Borrows as many samples as it may, prints their number, and waits to be killed.
+/// Borrows as many samples as the subscribers of this process may, prints the number of samples, and waits to be
+/// killed.
 fn hold_samples(domain: &Domain) {
     let node = scanhub_shm::client_node(domain).expect("the process can join the domain");
     let topic = Scan::open(&node, "front").expect("the topic can be opened").expect("the topic exists");
     let mut subscribers = Vec::new();
-    // Killed subscribers keep their slots until the hub cleans up.
+    // Subscribers of an earlier process that was killed keep their slots until the hub cleans up.
     wait_until("all slots are free", || {
         subscribers.extend(Scan::subscriber(&node, &topic));
         subscribers.len() == SUBSCRIBERS_PER_PROCESS

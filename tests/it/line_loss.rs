@@ -1,9 +1,9 @@
-//! Line that loses bytes: hub and clients report the share of the stream that is lost, and it agrees with the
-//! simulator.
+//! Line that loses bytes. The hub and its clients report the share of the stream that is lost, and this share agrees
+//! with the log of the simulator.
 
 use crate::testkit::{INT, TERM, TestEnv, is_class, number, wait_until};
 
-/// Rate and length of the bursts that the paper measured on a line.
+/// Rate and mean length of the bursts of lost bytes that the paper measured on a line.
 const BURST_FAULTS: &str = "--fault=loss=0.00135,burst=1.89";
 
 #[test]
@@ -18,7 +18,7 @@ fn line_loss_is_reported_by_all_programs() {
     let begin = env.info("front");
     let first_sent = env.truth("front").len();
     let mut statuses = env.echo(&["front/status"]);
-    // This takes at least ten seconds on any machine.
+    // A scan is due every 26.7 ms, so 400 scans take more than ten seconds on any machine.
     for due in [200, 400] {
         let due = number(&begin["counters"], "due_on_line") + due;
         statuses.await_line("scans that were due", |line| {
@@ -26,7 +26,7 @@ fn line_loss_is_reported_by_all_programs() {
         });
     }
     let end = env.info("front");
-    // The status is from the current second, but missing scans count as lost only a second later.
+    // Scans that are missing count as lost only a second later, so the shares agree only approximately.
     let sent = &env.truth("front")[first_sent..];
     let damaged = sent.iter().filter(|sent| sent.fault.is_some()).count() as f64;
     let grown = |name: &str| number(&end["counters"], name) as f64 - number(&begin["counters"], name) as f64;
@@ -73,7 +73,7 @@ fn healthy_line_is_reported_as_lossless_at_once() {
     let outcome = env.run(&["doctor", &env.path_argument("front"), "--json"]);
     let checks = outcome.of_class("check");
     let check = checks.iter().find(|check| check["name"] == "line-loss").expect("doctor checks the line");
-    // A busy machine may stop a simulated scanner for a while. The hub then counts scans as lost.
+    // On a busy machine, a simulated scanner may not run for a while. The hub then counts scans as lost.
     let lost = number(&env.info("front")["counters"], "lost_on_line");
     assert!(check["state"] == "ok" || lost > 0, "{check}");
     assert_eq!(info["damaged"], 0.0, "{info}");
@@ -81,7 +81,7 @@ fn healthy_line_is_reported_as_lossless_at_once() {
     assert_eq!(simulator.end(INT).exit_code, Some(0));
 }
 
-/// Replies arrive now and then. Hardly any scan arrives.
+/// On this line, some replies arrive intact, because they are short, but hardly any scan does.
 #[test]
 fn line_that_damages_nearly_all_scans_is_reported() {
     let env = TestEnv::new();

@@ -1,5 +1,5 @@
-//! Topic `lines`, from the line to subscribers, for every scanner family and with the keys of a link. Lines are
-//! detected only while the topic has a subscriber.
+//! Topic `lines`, from the line to subscribers, for every scanner family and with the keys of a link. The hub detects
+//! lines only while the topic has a subscriber.
 
 use crate::testkit::{INT, TERM, TestEnv, checked_topic_seqs, is_class, number};
 use serde_json::Value;
@@ -39,7 +39,7 @@ fn lines_are_published_with_settings_of_each_link() {
             let lines = outcome.of_class(class);
             lines.iter().map(|line| number(line, "seq")).collect::<Vec<_>>()
         };
-        // The lines of each scan have the same number as the scan.
+        // The lines of a scan have the same `seq` as the scan.
         let (of_lines, of_scans) = (seqs("lines"), seqs("scan"));
         assert!(of_lines.iter().filter(|seq| of_scans.contains(seq)).count() > 10, "{outcome}");
         checked_topic_seqs(&outcome, "scan");

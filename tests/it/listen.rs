@@ -1,5 +1,5 @@
-//! `scanhub listen` with datagrams that the test sends: the lines of every topic, exact counters, and refused
-//! datagrams.
+//! `scanhub listen` with datagrams that the test sends. The tests check the printed lines of every topic, the counters,
+//! and which datagrams the listener refuses.
 
 use std::io::Read;
 use std::time::Duration;
@@ -18,7 +18,8 @@ use serde_json::{Value, json};
 
 const HUB_ID: u64 = 0x5f3a_12bc_00d1_e2f3;
 
-/// A reply with the shortest possible status. Its checksum is not checked.
+/// A reply with the shortest possible status. The listener does not check the checksum of a telegram, so this one is
+/// arbitrary.
 const TELEGRAM_BYTES: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
 fn scan() -> Box<Scan> {
@@ -33,7 +34,7 @@ fn listener(env: &TestEnv, words: &[&str]) -> Program {
     env.start(&[&["listen", "--json"], words].concat()).ready()
 }
 
-/// Returns the counters of a topic in an epoch: received, lost, duplicate and reordered.
+/// Returns the counters of a topic for one epoch of the gateway: received, lost, duplicate and reordered datagrams.
 fn counters(outcome: &Outcome, epoch: u32, topic: &str) -> [u64; 4] {
     let lines = outcome.of_class("lan");
     let found: Vec<_> = lines.iter().filter(|it| it["epoch"] == epoch && it["topic"] == topic).collect();
@@ -127,7 +128,7 @@ fn listen_prints_readable_text_without_json() {
         let words = ["listen", "--interface=lo", "--topic=zones", "--name=robot1=5f3a12bc00d1e2f3", "-n2"];
         let program = env.start(&words);
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
-        // The listener does not print when it is ready, so wait until it has joined the group.
+        // The listener does not print when it is ready, so wait until it has joined a group.
         wait_until("the group is joined", || igmp_memberships().contains("514CFFEF"));
         sender.announce(&[Topic::Zones]);
         sender.send(Topic::Marks, &Marks::default());
@@ -159,7 +160,7 @@ fn igmp_memberships() -> String {
     std::fs::read_to_string("/proc/net/igmp").expect("the kernel has multicast")
 }
 
-/// Returns the number of groups of scanhub that were joined on `interface`.
+/// Returns the number of scanhub's multicast groups that programs have joined on `interface`.
 fn joined_groups(interface: &str) -> usize {
     let text = igmp_memberships();
     let mut lines = text.lines().skip_while(|line| line.split_whitespace().nth(1) != Some(interface)).skip(1);
@@ -167,7 +168,7 @@ fn joined_groups(interface: &str) -> usize {
     groups.filter(|line| line.contains("4CFFEF")).count()
 }
 
-/// Runs `ip` with these words, and returns whether it succeeded.
+/// Runs `ip` with these arguments, and returns whether the command succeeded.
 fn ip(words: &str) -> bool {
     succeeds(std::process::Command::new("ip").args(words.split(' ')))
 }
@@ -231,8 +232,8 @@ fn counts_lost_late_and_duplicate_samples_exactly() {
         let mut program = listener(&env, &["--topic=zones", "--topic=scan"]);
         let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
         sender.announce(&[Topic::Zones, Topic::Scan, Topic::Telegram]);
-        // Send 100 zones. Numbers 10, 11 and 50 are lost, 20 and 21 are swapped, 30 arrives twice, and 40 arrives after
-        // 45.
+        // Prepare 100 samples of topic `zones`, and do not send them in order. Numbers 10, 11 and 50 are lost. Numbers
+        // 20 and 21 are swapped, 30 arrives twice, and 40 arrives after 45.
         let datagrams: Vec<_> =
             (0..100).map(|_| sender.next_datagram(Topic::Zones, &zones(Verdict::Clear))).collect();
         let mut order: Vec<usize> = (0..100).filter(|n| ![10, 11, 40, 50].contains(n)).collect();
@@ -242,7 +243,8 @@ fn counts_lost_late_and_duplicate_samples_exactly() {
         for n in order {
             sender.send_bytes(Topic::Zones, &datagrams[n]);
         }
-        // Two scans are lost, and an announcement then makes this known. Telegrams are not requested.
+        // Two scans are lost, which the next announcement shows. The announcement also shows lost telegrams, but this
+        // listener does not request telegrams.
         sender.send(Topic::Scan, &*scan());
         sender.next[usize::from(Topic::Scan.number())] += 2;
         sender.next[usize::from(Topic::Telegram.number())] += 9;
@@ -263,7 +265,7 @@ fn counts_lost_late_and_duplicate_samples_exactly() {
             let notices = outcome.of_class("notice").into_iter().filter(|line| line["topic"] == topic);
             notices.map(|line| testkit::number(&line, "missed")).sum()
         };
-        // Numbers 20 and 40 count as missed, because each of them arrived after the next number.
+        // Numbers 20 and 40 count as missed, because each of them arrived after a later number.
         assert_eq!((missed("zones"), missed("scan")), (5, 2));
     });
 }
@@ -324,7 +326,7 @@ fn counts_90_gateway_runs_in_a_bounded_table() {
         let evicted = &outcome.of_class("lan_evicted")[0];
         assert_eq!(evicted["runs"], RUNS - 64, "{outcome}");
         let sum = |key| number(evicted, key) + lines.iter().map(|line| number(line, key)).sum::<u64>();
-        // In each run, an announcement and the first and last of four zones arrive.
+        // In each run, an announcement arrives, and the first and the last of four samples of topic `zones`.
         assert_eq!((sum("received"), sum("lost")), (3 * RUNS, 2 * RUNS), "{outcome}");
         assert_eq!(refusals(&outcome)["capacity"], 0, "{outcome}");
         assert!(outcome.of_class("notice").iter().all(|line| line["kind"] == "missed"), "{outcome}");
@@ -362,7 +364,7 @@ fn each_refused_datagram_is_counted_by_reason() {
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         sender.next[number] = 5001;
         TestGateway::new(HUB_ID, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
-        // All other gateways deliver for a second.
+        // All other gateways in the table deliver for a second, so that the listener does not evict them.
         let mut others: Vec<_> = (0..63).map(|hub| TestGateway::new(hub, 7, 0, "front")).collect();
         for wait_ms in [1100, 0] {
             sender.send(Topic::Zones, &zones(Verdict::Slow));
@@ -377,7 +379,7 @@ fn each_refused_datagram_is_counted_by_reason() {
         let outcome = program.end(INT);
         let refused = refusals(&outcome);
         for reason in DatagramError::ALL {
-            // Three of the reasons need a key, which this listener does not have.
+            // Three of the reasons need a listener with a key, and this listener has none.
             const KEY_ERRORS: [DatagramError; 3] =
                 [DatagramError::Unauthenticated, DatagramError::Mac, DatagramError::Untimely];
             let expected = u64::from(!KEY_ERRORS.contains(&reason));
@@ -396,11 +398,12 @@ fn reports_two_gateways_with_one_id_once() {
     in_a_network("listen::reports_two_gateways_with_one_id_once", || {
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones", "--stats"]);
-        // The gateway with the greater epoch sends first, so all datagrams of the other one are refused.
+        // The gateway with the greater epoch sends first, so the listener refuses all datagrams of the other gateway.
         let mut gateways = [9, 7].map(|epoch| TestGateway::new(HUB_ID, epoch, 0, "front"));
         for _ in 0..80 {
             gateways.iter_mut().for_each(|gateway| gateway.send(Topic::Zones, &zones(Verdict::Clear)));
-            // Send for several seconds. Datagrams within a short time do not count as a second gateway.
+            // Send for several seconds, because the listener does not report a second gateway for datagrams within a
+            // short time.
             wait_at_least(Duration::from_millis(50));
         }
         let line = program.await_line("notice with a remedy", |line| line["kind"] == "problem");

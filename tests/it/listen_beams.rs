@@ -9,7 +9,8 @@ use crate::testkit::{
 };
 use scanhub_schema::{ArrayFlags, Family, MAX_BEAMS, Scan, ScanHead, Topic};
 
-/// Returns the values of a scan that must be the same at both ends. The others depend on the machine that published it.
+/// Returns the values of a scan that must be the same at both ends. The other values depend on the machine that
+/// published the scan.
 fn values_of_scan(line: &Value) -> Vec<Value> {
     let keys = [
         "seq",
@@ -64,14 +65,14 @@ fn revolutions_of_any_length_arrive_complete() {
             };
             echo.await_lines(25, "scans", |line| is_there(line) && is_class("scan")(line));
             echo.await_lines(5, "a foreground", |line| is_there(line) && is_class("foreground")(line));
-            // A background is sent when it is new, and the listener keeps it for late joiners.
+            // The gateway sends a background only when it is new. The listener keeps the last one for late joiners.
             assert!(echo.has_printed(is_model), "no background with {beams} beams");
             let outcome = echo.end(INT);
             for topic in ["scan", "foreground", "telegram"] {
                 let lines = outcome.of_class(topic);
                 let (far, near): (Vec<_>, Vec<_>) = lines.into_iter().partition(is_there);
-                // On a busy machine, `echo` of all topics may miss some samples, but the network loses none, as checked
-                // below.
+                // On a busy machine, `echo` may miss some samples, because it prints many topics. The network loses
+                // none, which the test checks below.
                 let numbers: Vec<u64> = far.iter().map(|line| number(line, "topic_seq")).collect();
                 assert!(numbers.is_sorted_by(|one, next| one < next), "{topic}: {numbers:?}");
                 let same = |line: &Value| near.iter().find(|it| it["seq"] == line["seq"]).cloned();

@@ -1,6 +1,6 @@
-//! `scanhub listen` with more gateways and sensors than it has room for, as when a sender invents them. It does not
-//! evict sensors that deliver. It receives a genuine sensor that starts later at once. Its log reports the shortage
-//! without a line for each sender.
+//! `scanhub listen` with more gateways and sensors than its tables have room for, such as when a sender invents them.
+//! The listener does not evict sensors that deliver. If a genuine sensor starts later, the listener receives it at
+//! once. The log reports the shortage, but not with a line for each sender.
 
 use std::time::Duration;
 
@@ -17,17 +17,18 @@ fn zones(verdict: Verdict) -> Zones {
     Zones { verdict: verdict as u8, ..Zones::unknown() }
 }
 
-/// Announces a sensor and sends samples of it.
+/// Announces the sensor of `sender`, and sends samples of it.
 fn deliver_samples(sender: &mut TestGateway) {
     sender.announce(&[Topic::Zones, Topic::Status]);
     sender.send(Topic::Zones, &zones(Verdict::Clear));
 }
 
-/// Time on the listener's clock after which a delivering gateway or sensor counts as proven.
+/// Time after which the listener accepts a gateway or sensor as proven, if it has delivered samples for all of this
+/// time.
 const PROOF_TIME: Duration = Duration::from_secs(1);
 
-/// Delivers until the sender counts as proven. `wait_until_received` waits until the listener has received the sample
-/// that was sent last.
+/// Delivers samples until the sender counts as proven. `wait_until_received` waits until the listener has received the
+/// sample that was sent last.
 fn deliver_for_proof_time(sender: &mut TestGateway, mut wait_until_received: impl FnMut(&mut TestGateway)) {
     deliver_samples(sender);
     wait_until_received(sender);
@@ -36,7 +37,8 @@ fn deliver_for_proof_time(sender: &mut TestGateway, mut wait_until_received: imp
     wait_until_received(sender);
 }
 
-/// Sends `verdict` repeatedly until `echo` prints it. A verdict that a client reads too late is printed as unknown.
+/// Sends `verdict` repeatedly until `echo` prints it. If `echo` reads a verdict too late, it prints `unknown` instead,
+/// and the verdict must be sent again.
 fn await_verdict(sender: &mut TestGateway, echo: &mut Program, verdict: Verdict) {
     let mut printed = Value::Null;
     while printed["verdict"] != verdict.name() {
@@ -45,7 +47,7 @@ fn await_verdict(sender: &mut TestGateway, echo: &mut Program, verdict: Verdict)
     }
 }
 
-/// Returns how often the listener has reported that there was no room.
+/// Returns how often the listener has reported that its tables had no room.
 fn count_capacity_notices(outcome: &Outcome) -> usize {
     let reports_capacity =
         |line: &&Value| line["message"].as_str().is_some_and(|text| text.contains("--hub"));
@@ -76,12 +78,13 @@ fn receives_real_gateway_at_once_after_64_invented() {
             program.await_line("sample of the genuine sensor", |line| {
                 line["hub"] == hub && line["class"] == "zones"
             });
-            // The report may be printed before or after the line of the genuine sensor.
+            // The listener may print the report of the shortage before or after the line of the genuine sensor.
             let is_problem = |line: &Value| line["kind"] == "problem";
             if !program.has_printed(is_problem) {
                 program.await_line("report of the shortage", is_problem);
             }
-            // The first announcement evicts no sensor that has just delivered. The next one is accepted.
+            // The first announcement does not evict a sensor that has just delivered, so it may be refused. Another
+            // announcement is accepted.
             deliver_samples(&mut sender);
             program.await_line("a line with the name of the sensor", |line| {
                 line["sensor"] == "front" && line["class"] == "zones"
@@ -120,7 +123,7 @@ fn invented_gateways_do_not_evict_a_delivering_one() {
             }
             let topic_seq = sender.next[usize::from(Topic::Zones.number())];
             sender.send(Topic::Zones, &zones(Verdict::Stop));
-            // Waiting for each sample keeps the flood from overrunning the kernel's buffer.
+            // Wait for this sample, so that the datagrams of the flood do not overflow the listener's receive buffer.
             program.await_line("sample of the genuine sensor", |line| {
                 line["verdict"] == "stop" && line["topic_seq"] == json!(topic_seq)
             });
@@ -137,8 +140,9 @@ fn publisher(env: &TestEnv) -> Program {
     env.start(&["listen", "--json", "--publish", NAME_FLAG]).ready()
 }
 
-/// Creates a genuine sensor, and waits until the listener publishes it. The listener does so once the gateway has
-/// delivered for a second. The sensor itself is not proven by then, because earlier samples do not count for it.
+/// Creates a genuine sensor, and waits until the listener publishes it. The listener publishes the sensor as soon as
+/// its gateway has delivered for a second. The sensor itself is not proven by then, because samples before the
+/// publication do not count for the sensor.
 fn published_sender(program: &mut Program) -> TestGateway {
     let mut sender = TestGateway::new(HUB_ID, 7, 0, "front");
     wait_until("the sensor is published", || {
@@ -189,7 +193,7 @@ fn new_sensors_do_not_evict_a_delivering_one() {
                 invented.announce(&[Topic::Zones]);
                 invented.send(Topic::Zones, &zones(Verdict::Clear));
             }
-            // Alternate the verdict, so that an earlier sample is not mistaken for the new one.
+            // Alternate the verdict, so that a line with an earlier sample is not taken for the new sample.
             await_verdict(&mut sender, &mut echo, if round % 2 == 0 { Verdict::Stop } else { Verdict::Slow });
         }
         let echoed = echo.end(INT);

@@ -1,4 +1,4 @@
-//! `scanhub listen` with hostile input: damaged datagrams of every kind, and valid ones with senseless content.
+//! `scanhub listen` with hostile input: damaged datagrams of every kind, and valid datagrams with senseless content.
 
 use crate::testkit::{INT, Program, TestEnv, TestGateway, in_a_network, number};
 use scanhub_schema::datagram::{DatagramError, DatagramPayload, HEADER_LEN, Head, MTU_ETHERNET};
@@ -7,7 +7,7 @@ use serde_json::Value;
 
 const DAMAGED_COUNT: u64 = 100_000;
 
-/// Number of datagrams that the listener's receive buffer can hold in any case.
+/// Number of datagrams for which the listener's receive buffer has room on every machine.
 const BATCH_SIZE: u64 = 50;
 
 fn resident_kb(program: &Program) -> u64 {
@@ -54,7 +54,7 @@ fn damaged_datagrams_are_refused_in_constant_memory() {
                     bytes[begin] ^= 1;
                 }
             }
-            // Flipping a bit twice restores it.
+            // If a bit was flipped twice, the datagram is intact again. Damage it then.
             if whole.contains(&bytes) {
                 bytes[0] ^= 0x80;
             }
@@ -83,7 +83,7 @@ fn damaged_datagrams_are_refused_in_constant_memory() {
     });
 }
 
-/// A hostile sender can compute a right checksum for senseless content.
+/// A hostile sender can put the right checksum on senseless content.
 #[test]
 fn listener_survives_valid_datagrams_with_bad_content() {
     in_a_network("listen_hostile::listener_survives_valid_datagrams_with_bad_content", || {
@@ -103,7 +103,7 @@ fn listener_survives_valid_datagrams_with_bad_content() {
                 let _ = Zones::unknown().pack(&mut buffer[HEADER_LEN..]);
             }
             let head = Head {
-                // One third of the datagrams claim to be parts.
+                // One third of the datagrams have headers of parts.
                 part: [0, 0, random.u8(..4)][n as usize % 3],
                 parts: [1, 1, 3][n as usize % 3],
                 topic: random.u8(..9),
@@ -119,7 +119,8 @@ fn listener_survives_valid_datagrams_with_bad_content() {
             };
             sender.send_bytes(Topic::Zones, head.seal(&mut buffer, len).expect("the payload fits"));
             if n % 50 == 49 {
-                // This sensor already has a slot in the listener's table, so it is received in spite of all others.
+                // This sensor already has a slot in the listener's table, so the listener receives it in spite of all
+                // the other datagrams.
                 sender.send(Topic::Zones, &Zones::unknown());
                 counted += 1;
                 std::thread::yield_now();
@@ -141,7 +142,7 @@ fn listener_survives_valid_datagrams_with_bad_content() {
         assert!(lines.len() <= 1024, "{} lines", lines.len());
         let own = lines.iter().find(|it| it["hub"] == "000000000000abcd" && it["topic"] == "zones");
         let own = own.unwrap_or_else(|| panic!("the sender was evicted: {lines:?}"));
-        // If the flood displaced the last datagrams of this sensor, the listener cannot count them.
+        // If the last datagrams of this sensor did not fit into the receive buffer, the listener cannot count them.
         let known = number(own, "received") + number(own, "lost");
         assert!((1..=counted).contains(&known), "{known} of {counted}");
         let sensors = &outcome.of_class("lan_published")[0]["sensors"];

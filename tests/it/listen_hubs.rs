@@ -1,5 +1,5 @@
-//! `scanhub listen --hub`: the hubs that it receives among many others, its message about a gateway on its own machine,
-//! and statistics on request.
+//! `scanhub listen --hub`, which receives only the named hubs among many others. The tests also check its message about
+//! a gateway on its own machine, and statistics on request.
 
 use crate::testkit::{INT, Robot, TestEnv, TestGateway, USR1, in_a_network, is_class, number};
 use scanhub_schema::{Topic, Verdict, Zones};
@@ -11,7 +11,7 @@ fn zones(verdict: Verdict) -> Zones {
     Zones { verdict: verdict as u8, ..Zones::unknown() }
 }
 
-/// Sends samples from more gateways than a listener can distinguish.
+/// Sends samples from more gateways than the listener's table has room for.
 fn crowd() {
     for hub in 0..70 {
         let mut sender = TestGateway::new(hub, 7, 0, "other");

@@ -1,5 +1,5 @@
-//! `scanhub listen` on links that fail for a moment. When a link fails, a switch that filters by multicast group
-//! forgets the members on it. The listener must then join its groups again.
+//! `scanhub listen` on network links that fail for a short time. When a link fails, a switch that filters by multicast
+//! group deletes the memberships of that link. The listener must then join its groups again.
 
 use std::collections::BTreeSet;
 use std::os::fd::OwnedFd;
@@ -7,10 +7,11 @@ use std::os::fd::OwnedFd;
 use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, skip, status, wait_until};
 use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, eth, recv, socket_with};
 
-/// Socket that receives the IGMP messages (version 2) that a switch would receive.
+/// Socket in place of a switch. It receives the IGMP messages (version 2) that a switch would receive.
 struct FakeSwitch {
     socket: OwnedFd,
-    /// Type of each message and last byte of its group. A leave message removes the earlier reports of its group.
+    /// Messages received so far. Each entry has the type of a message and the last byte of its group's address. A leave
+    /// message removes the earlier reports of its group.
     memberships: BTreeSet<(u8, u8)>,
 }
 
@@ -41,7 +42,8 @@ impl FakeSwitch {
     }
 }
 
-/// Returns type and last byte of the group of an IGMP message in an IP packet, if the group belongs to scanhub.
+/// Returns the type and the last byte of the group's address of the IGMP message in an IP packet. Returns `None` for
+/// other packets and for groups that do not belong to scanhub.
 fn message(packet: &[u8]) -> Option<(u8, u8)> {
     const IGMP_PROTOCOL: u8 = 2;
     let header = usize::from(packet.first()? & 15) * 4;
@@ -89,8 +91,8 @@ fn rejoins_groups_each_time_an_interface_is_recreated() {
         let mut switch = FakeSwitch::new();
         let env = TestEnv::on(&machine);
         let listener = env.start(&["listen", "--json"]).ready();
-        // A socket can join 20 groups, and the listener needs four. A new cable must therefore not use up more of the
-        // 20.
+        // A socket can join 20 groups, and the listener needs four. A new cable must therefore not use up more of these
+        // 20 memberships.
         for _ in 0..8 {
             switch.memberships.clear();
             machine.replace_cable();
@@ -101,9 +103,9 @@ fn rejoins_groups_each_time_an_interface_is_recreated() {
     });
 }
 
-/// Makes the kernel use IGMP version 2 on `interface` of `machine`. In this version, the kernel reports that it leaves
-/// a group. A report after a leave can therefore be distinguished from the repetition of the first report. Skips the
-/// test and returns false if the version cannot be selected.
+/// Makes the kernel use IGMP version 2 on `interface` of `machine`. In this version, the kernel sends a leave message
+/// for a group. A report after a leave message shows that the listener has joined again, and is not just the repetition
+/// of the first report. Skips the test and returns false if the version cannot be selected.
 fn force_igmp_version_2(machine: &Machine, interface: &str) -> bool {
     let mut version = command_in(&machine.network(), "sh");
     let path = format!("/proc/sys/net/ipv4/conf/{interface}/force_igmp_version");

@@ -1,5 +1,5 @@
-//! Memory that unknown senders can make `scanhub listen --publish` use. Topics are created only for gateways that have
-//! delivered for a second, and all topics together use at most the memory that `--memory` allows.
+//! Shared memory that unknown senders can make `scanhub listen --publish` use. The listener creates topics only for
+//! gateways that have delivered for a second. All its topics together use at most the memory that `--memory` allows.
 
 use std::time::Duration;
 
@@ -31,7 +31,7 @@ fn used_memory(env: &TestEnv) -> u64 {
     files.iter().filter_map(|path| path.metadata().ok()).map(|metadata| metadata.len()).sum()
 }
 
-/// Requests statistics from `program`, and returns the line of this class.
+/// Requests statistics from `program`, and returns the line of class `class`.
 fn request_statistics(program: &mut Program, class: &str) -> Value {
     program.signal(USR1);
     program.await_line(class, is_class(class))
@@ -48,7 +48,8 @@ fn invented_sensors_stay_within_the_memory() {
         front.wait_until_published(&mut program, &topics);
         let mut echo = env.echo(&["robot1.front/scan"]);
         let own = Scan::of(ScanHead::lms(361, -90_000, 500, 1, 13), &[2_000; 361]);
-        // While a sensor delivers and has delivered for a second, the listener never removes it for others.
+        // Prove the sensor: if a sensor has delivered for a second and still delivers, the listener never removes it to
+        // make room for others.
         for pause_ms in [1_100, 0] {
             front.send(Topic::Scan, &*own);
             echo.await_line("sample of the genuine sensor", is_class("scan"));
@@ -66,7 +67,8 @@ fn invented_sensors_stay_within_the_memory() {
                 (invented.sensor, invented.name) = (number, format!("s{number}"));
                 invented.announce(&topics);
                 invented.send(Topic::Scan, &*scan);
-                // Waiting for it keeps the flood from overrunning the kernel's buffer.
+                // Wait for this sample, so that the datagrams of the flood do not overflow the listener's receive
+                // buffer.
                 front.send(Topic::Scan, &*own);
                 echo.await_line("sample of the genuine sensor", is_class("scan"));
                 max_used = max_used.max(used_memory(&env));
@@ -102,7 +104,7 @@ fn unproven_gateways_take_no_shared_memory() {
         for n in 0..16 {
             let mut invented = TestGateway::new(INVENTED_HUB_ID + n, 7, 0, "other");
             invented.announce(&Topic::ALL);
-            // A single sample never covers a second, even on a busy machine.
+            // A single sample never proves that a gateway has delivered for a second, even on a busy machine.
             invented.send(Topic::Zones, &Zones::unknown());
         }
         wait_until("all samples are counted", || {

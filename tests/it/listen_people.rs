@@ -1,4 +1,5 @@
-//! `scanhub listen` with people: it prints tracks and events of another machine in the same format as local ones.
+//! `scanhub listen` with people: the listener prints tracks and events of another machine in the same format as local
+//! ones.
 
 use crate::testkit::{INT, TestEnv, TestGateway, in_a_network, is_class};
 use scanhub_schema::{Event, EventKind, Pose, PublisherKind, Topic, Track, TrackSensor, Tracks};

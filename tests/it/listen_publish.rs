@@ -1,5 +1,5 @@
-//! `scanhub listen --publish`: every verb can use remote sensors like local ones, even after losses, restarts and
-//! kills.
+//! `scanhub listen --publish`: every verb can use remote sensors like local ones. This is also true after lost
+//! datagrams, and after programs were restarted or killed.
 
 use std::time::Duration;
 
@@ -23,12 +23,13 @@ fn start_and_publish(env: &TestEnv, sender: &mut TestGateway) -> Program {
     let mut program = publisher(env);
     let topics = [Topic::Zones, Topic::Scan, Topic::Status, Topic::Telegram];
     assert_eq!(sender.wait_until_published(&mut program, &topics)["sensor"], SENSOR_NAME);
-    // Verbs that list sensors wait for the status of each one.
+    // Send a status, because verbs that list sensors wait for the status of each sensor.
     sender.send(Topic::Status, &Status { state: State::Starting as u8, ..Status::default() });
     program
 }
 
-/// Returns whether a line has zones that were sent. In a silence, a client also prints zones that were not sent.
+/// Returns whether a line has zones that the gateway sent. During a silence, a client also prints lines with zones that
+/// it creates itself.
 fn is_zones(line: &Value) -> bool {
     line["class"] == "zones" && line["stale"] != true
 }
@@ -64,7 +65,7 @@ fn remote_sensor_is_published_as_local_topics() {
             since_start_ns.split(' ').next().and_then(|text| text.parse().ok()).expect("seconds");
         let age_s = uptime_s - number(&line, "stamp_ns") as f64 / 1e9;
         assert!((-1.0..60.0).contains(&age_s), "the stamp differs from the arrival by {age_s} s");
-        // Two samples are lost, and one arrives late and twice.
+        // Two samples are lost, and one sample arrives late and twice.
         let (late, lost) = (sender.next_datagram(Topic::Zones, &zones(Verdict::Stop)), 2);
         sender.next[usize::from(Topic::Zones.number())] += lost;
         sender.send(Topic::Zones, &zones(Verdict::Clear));
@@ -144,7 +145,7 @@ fn follows_restarted_gateways_and_hubs() {
         for _ in 0..3 {
             sender.send(Topic::Zones, &zones(Verdict::Clear));
         }
-        // The gateway restarts. Two samples arrive before it announces its sensor.
+        // The gateway restarts. Two samples arrive before the restarted gateway announces its sensor.
         let mut again = TestGateway::new(HUB_ID, 8, 1, "front");
         again.send(Topic::Zones, &zones(Verdict::Slow));
         again.send(Topic::Zones, &zones(Verdict::Slow));
@@ -152,7 +153,7 @@ fn follows_restarted_gateways_and_hubs() {
         again.send(Topic::Zones, &zones(Verdict::Stop));
         let line = echo.await_line("sample of the gateway's next run", |line| line["verdict"] == "stop");
         assert_eq!(line["topic_seq"], 5);
-        // The hub restarts. Its gateway continues to count, and so do the subscribers.
+        // The hub restarts. Its gateway continues the sequence numbers, and `topic_seq` continues for the subscribers.
         again.boot = 0xb008;
         again.announce(&[Topic::Zones]);
         again.next[usize::from(Topic::Zones.number())] += 1;
@@ -176,7 +177,7 @@ fn one_domain_has_a_hub_and_two_remote_hubs() {
         let mut one = TestGateway::new(HUB_ID, 7, 0, "front");
         let mut other = TestGateway::new(0xab, 7, 0, "front");
         let mut listener = start_and_publish(&env, &mut one);
-        // A subscriber to a sensor of the hub waits for the hub, even if the domain has other publishers.
+        // A subscriber to a sensor without a prefix waits for the hub, even if the domain has other publishers.
         let mut early = env.start(&["echo", "--json", "front/scan"]);
         let absent = env.run(&["echo", "--json", "front/scan", "-n", "1"]);
         assert_eq!(
@@ -197,11 +198,11 @@ fn one_domain_has_a_hub_and_two_remote_hubs() {
         for sensor in ["front", SENSOR_NAME, "00000000000000ab.front"] {
             echo.await_line(sensor, |line| line["sensor"] == sensor && line["class"] != "notice");
         }
-        // The verdict of `robot` combines the robot's own sensors, and no sensors of other robots.
+        // The verdict of `robot` combines only the robot's own sensors, not those of other robots.
         let mut robot = env.start(&["echo", "--json", "robot/zones"]);
         robot.await_lines(3, "a verdict", |line| line["sensors"][0]["sensor"] == "front");
         let outcome = robot.end(INT);
-        // On a busy machine, a sensor may be late and is then not in the verdict.
+        // On a busy machine, the scans of a sensor may be late. The sensor is then not part of the verdict.
         let is_own = |line: &Value| line["sensors"].as_array().is_some_and(|sensors| sensors.len() <= 1);
         assert!(outcome.of_class("zones").iter().all(is_own), "{outcome}");
         let absent = env.run(&["echo", "--json", "robot2.front/zones", "-n", "1"]);
@@ -227,8 +228,8 @@ fn gateway_does_not_send_remote_sensors_again() {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &["--seed=62", "--baud=500000"]);
         let mut listener = env.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
-        // The gateway waits for the hub, although the listener already uses the domain. It never sends topics that the
-        // listener publishes.
+        // The gateway waits for a hub, although the domain already has the listener, because the gateway never sends
+        // topics that a listener publishes.
         let mut gateway = env.start(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
         let id =
             gateway.await_line("line of class gateway", |line| line["class"] == "gateway")["hub"].clone();
@@ -270,7 +271,7 @@ fn reused_sensor_number_is_a_separate_sensor() {
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("zones", is_zones);
         (sender.name, sender.boot) = ("rear".to_owned(), 0xb008);
-        // An unknown sender may announce a topic twice.
+        // An unknown sender may announce a topic twice, and the listener must accept this.
         let late = sender.announcement(&[Topic::Zones]);
         sender.announce(&[Topic::Zones, Topic::Zones]);
         let line = program.await_line("a sensor", |line| line["kind"] == "published");
@@ -280,8 +281,8 @@ fn reused_sensor_number_is_a_separate_sensor() {
         let mut rear = env.echo(&["robot1.rear/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         rear.await_line("sample of the second sensor", |line| line["verdict"] == "stop");
-        // The first sensor returns with another number, for which the listener has no counters. A late announcement has
-        // no effect.
+        // The first sensor returns with another number, for which the listener has no counters. An announcement of the
+        // other sensor that arrives late has no effect.
         let mut front = TestGateway::new(HUB_ID, 7, 1, "front");
         front.boot = 0xb008;
         front.next[usize::from(Topic::Zones.number())] = 40;
@@ -327,7 +328,7 @@ fn renumbered_sensors_are_not_mixed_up() {
         let next = echo.await_line("sample of the next run", |line| is_next(line, &front))["boot"].clone();
         echo.await_line("scan of the other sensor in the next run", |line| is_next(line, &rear));
         assert_eq!(hub.end(TERM).exit_code, Some(0));
-        // `front` now has the number that `rear` had, and the listener accepts it at once.
+        // `front` now has the number that `rear` had, and the listener accepts the change at once.
         let _hub = env.hub(&[env.link("front")]);
         echo.await_line("scan of the remaining sensor", |line| is_next(line, &front) && line["boot"] != next);
         env.await_info(&rear, |info| info["state"] == "silent");
@@ -371,7 +372,7 @@ fn samples_without_topic_are_counted_by_cause() {
         let mut rear = TestGateway::new(HUB_ID, 7, 4, "rear");
         rear.announce(&[Topic::Zones]);
         rear.send(Topic::Zones, &zones(Verdict::Clear));
-        // Sensors for which there is room continue.
+        // The other sensors, for which there is room, continue.
         front.send(Topic::Zones, &zones(Verdict::Slow));
         echo.await_line("zones", |line| is_zones(line) && line["verdict"] == "slow");
         let outcome = program.end(INT);
@@ -393,7 +394,7 @@ fn publishes_at_most_16_remote_sensors() {
         let mut senders: Vec<_> =
             (0..17).map(|number| TestGateway::new(0xab, 7, number, &format!("s{number}"))).collect();
         // The listener publishes the first 16 sensors when their gateway has delivered for a second. These sensors then
-        // deliver for another second.
+        // deliver for another second, so that they are proven. The sensor with index 16 starts last.
         for (count, wait_ms) in [(16, 1100), (16, 1100), (17, 0)] {
             for sender in &mut senders[..count] {
                 sender.announce(&[Topic::Zones]);

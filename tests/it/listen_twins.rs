@@ -1,11 +1,11 @@
-//! Two machines with one state directory, for example after a disk was copied. Their gateways use the same ID and
-//! epoch. A listener accepts one of the gateways and reports the conflict. It never takes a sample of one gateway for a
-//! sample of the other.
+//! Two machines with the same content in their state directories, for example after a disk was copied. Their gateways
+//! use the same ID and epoch. A listener accepts one of the gateways and reports the conflict. The listener never takes
+//! a sample of one gateway for a sample of the other gateway.
 
 use crate::testkit::{INT, Machine, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number};
 use serde_json::{Value, json};
 
-/// Machine with a hub, whose sensor has a given number of beams, and a directory for the state of its gateway.
+/// Machine with a hub and a directory for the state of its gateway. The hub's sensor has a given number of beams.
 struct Robot {
     env: TestEnv,
     _simulator: Program,
@@ -24,8 +24,8 @@ impl Robot {
         Robot { env, _simulator: simulator, _hub: hub, _machine: machine }
     }
 
-    /// Starts a gateway from the state that both machines have. Its epoch is far in the future, so that the times of
-    /// the starts do not affect it.
+    /// Starts a gateway from the state that both machines have. The saved epoch is far in the future, so that the times
+    /// at which the gateways start do not affect the next epoch.
     fn gateway(&self) -> Program {
         let domain = self.env.domain().name().to_owned();
         let state = self.env.path("state/scanhub");
@@ -44,7 +44,7 @@ fn reports_two_gateways(line: &Value) -> bool {
     line["message"].as_str().is_some_and(|text| text.contains("two gateways send as 5f3a12bc00d1e2f3"))
 }
 
-/// Returns the different numbers of beams of consecutive scans.
+/// Returns the numbers of beams of all scans in order, without repetitions of the number before.
 fn beam_counts(outcome: &Outcome) -> Vec<usize> {
     let scans = outcome.of_class("scan");
     let mut beams: Vec<_> = scans.iter().map(|line| line["ranges"].as_array().map_or(0, Vec::len)).collect();
@@ -56,7 +56,7 @@ fn beam_counts(outcome: &Outcome) -> Vec<usize> {
 fn reports_two_machines_with_one_id_without_mixing() {
     in_a_network("listen_twins::reports_two_machines_with_one_id_without_mixing", || {
         let (one, other) = (Robot::new(1, 361), Robot::new(2, 181));
-        // The environment of the test is connected to both machines.
+        // The test environment is connected to both machines, and runs the listeners.
         let env = TestEnv::new();
         let mut listener = env.start(&["listen", "--json"]).ready();
         let mut publisher = env.start(&["listen", "--json", "--publish"]).ready();
@@ -70,14 +70,14 @@ fn reports_two_machines_with_one_id_without_mixing() {
         let echoed = echo.end(INT);
         assert_eq!(beam_counts(&echoed), [361], "{echoed}");
         assert_eq!(echoed.of_class("summary")[0]["missed"], 0, "{echoed}");
-        // A listener that starts now receives one of them, but never both.
+        // A listener that starts while both gateways send receives one of them, but never both.
         let mut late = env.start(&["listen", "--json"]).ready();
         late.await_line("report of two gateways", reports_two_gateways);
         late.await_lines(10, "scans", is_class("scan"));
         let late = late.end(INT);
         assert!(beam_counts(&late) == [361] || beam_counts(&late) == [181], "{:?}", beam_counts(&late));
-        // After the first gateway has exited, the running listeners do not accept the other gateway: they refuse its
-        // datagrams for more than 3 s.
+        // After the first gateway has exited, the listeners that already run do not accept the other gateway. They have
+        // refused its datagrams for more than 3 s.
         assert_eq!(first.end(TERM).exit_code, Some(0));
         let mut other = env.start(&["listen", "--json"]).ready();
         other.await_lines(200, "scans of the second machine", is_class("scan"));

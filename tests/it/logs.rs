@@ -1,9 +1,10 @@
-//! CARMEN logs: each range and each code of a log reaches a subscriber, from the log itself and from its conversions.
+//! CARMEN logs: a subscriber receives each range and each code of a log. This is true for a replay of the log itself
+//! and for replays of its conversions.
 
 use crate::testkit::{INT, Outcome, TestEnv, number};
 use serde_json::{Value, json};
 
-/// Writes a log with scans `period_ms` apart, each of which starts with `ranges`. Returns its path.
+/// Writes a log with `scans` scans, which are `period_ms` apart. Each scan starts with `ranges`. Returns its path.
 fn log(env: &TestEnv, ranges: &[&str], scans: u64, period_ms: u64) -> String {
     let line = |scan: u64| {
         let beams: Vec<&str> = ranges.iter().chain([&"1.50"; 181]).take(181).copied().collect();
@@ -79,7 +80,7 @@ fn zones_stay_valid_until_the_next_scan_of_a_slow_log() {
             .iter()
             .position(|zones| zones["verdict"] != "unknown")
             .unwrap_or_else(|| panic!("{outcome}"));
-        // After the last scan, the client reports the silence with the verdict unknown.
+        // The lines after the last scan do not count. The client reports the silence there with the verdict `unknown`.
         let until_last = zones[first..].iter().take_while(|zones| zones["seq"] != last);
         let unknown = until_last.filter(|zones| zones["verdict"] == "unknown");
         assert_eq!(unknown.count(), 0, "{file}: {outcome}");

@@ -1,5 +1,5 @@
-//! Tests of the `scanhub` program from the outside, as one binary with one module per property, so that shared code is
-//! linked once.
+//! Tests of the `scanhub` program from the outside. All tests are one binary, so that shared code is linked only once.
+//! Each module tests one property.
 //!
 //! Tests run concurrently in one process. A test that changes process-wide state does so in a child process.
 

@@ -1,4 +1,4 @@
-//! Tests of `zones mask`, for a robot whose sensor sees the robot's own post: the verdict is `stop` until the mask
+//! Tests of `zones mask` for a robot that has a post in view of its own sensor. The verdict is `stop` until the mask
 //! hides the post.
 
 use crate::testkit;
@@ -10,7 +10,8 @@ fn world(env: &TestEnv, thing: &str) -> String {
     format!("--world={}", env.file("world.toml", format!("{room}\n{thing}")))
 }
 
-/// Warnings that are printed next to a mask. On a busy machine, there is also one about missed scans.
+/// Texts of warnings that the verb may print with a mask. On a busy machine, it also prints a warning about missed
+/// scans.
 const WARNINGS: [&str; 3] = ["nothing of the robot", "something moved", "are hidden"];
 
 const POST_WORLD: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
@@ -19,8 +20,8 @@ fn simulator(env: &TestEnv, world: &str) -> Program {
     env.simulator(&["front"], &["--seed=51", "--baud=500000", world])
 }
 
-/// Runs `zones front mask` with the arguments `more`. Repeats it with a longer `--for` if it received too few scans, as
-/// the error message advises.
+/// Runs `zones front mask` with the arguments `more`. If the verb received too few scans, runs it again with a longer
+/// `--for`, as the error message advises.
 fn mask(env: &TestEnv, more: &[&str]) -> Outcome {
     let run = |time: &str| env.run(&[&["zones", "front", "mask", "--for", time], more].concat());
     let few = |outcome: &Outcome| {
@@ -56,7 +57,7 @@ fn mask_hides_the_robots_own_post() {
     let table: toml::Table = text.parse().unwrap_or_else(|error| panic!("{error}: {outcome}"));
     let sectors = table["link"][0]["zones"]["body_mask"].as_array().unwrap();
     let key = |sector: &toml::Value, key: &str| sector[key].as_float().unwrap();
-    // The post is 6 degrees wide, and one or two more beams on each side hit its edge.
+    // The post is 6 degrees wide, and one or two more beams on each side hit the edge of the post.
     let first = sectors.iter().map(|sector| key(sector, "from_deg")).fold(90.0, f64::min);
     let last = sectors.iter().map(|sector| key(sector, "to_deg")).fold(-90.0, f64::max);
     assert!((-5.0..=-2.5).contains(&first) && (2.5..=5.0).contains(&last), "{outcome}");
@@ -67,11 +68,11 @@ fn mask_hides_the_robots_own_post() {
     await_verdict(&env, "clear");
     let mut subscriber = env.echo(&["front/zones"]);
     let lines = subscriber.await_lines(100, "a verdict", is_class("zones"));
-    // On a busy machine a scan may be late, which makes the verdict `unknown`. No zone may be violated.
+    // On a busy machine a scan may be late, which makes the verdict `unknown`. But no verdict may be `slow` or `stop`.
     let violations: Vec<_> =
         lines.iter().filter(|line| line["verdict"] == "stop" || line["verdict"] == "slow").collect();
     assert!(violations.is_empty(), "{violations:#?}");
-    // An active mask does not affect the next run of the verb: topic `scan` is published without the mask.
+    // An active mask does not affect the next run of the verb, because the hub publishes topic `scan` without the mask.
     let again = mask(&env, &["--json"]);
     assert_eq!(again.exit_code, Some(0), "{again}");
     let mask = &again.of_class("mask")[0];
@@ -99,7 +100,8 @@ fn empty_mask_loads_into_a_hub() {
     let _hub = env.hub(&[&env.link("front"), "--config", &file]);
     await_verdict(&env, "clear");
 
-    // Walls are not part of the robot. With a circle as large as the room, the verb masks them and prints a warning.
+    // Walls are not part of the robot. If the circle of `--within` is as large as the room, the verb nevertheless masks
+    // the walls, and prints a warning.
     let outcome = mask(&env, &["--within", "6"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     assert!(outcome.stderr.contains("the hub will be blind there"), "{outcome}");
@@ -144,7 +146,7 @@ fn mask_without_enough_scans_is_refused() {
         "{unknown}"
     );
 
-    // Interrupt it, and then kill the hub while it runs.
+    // Interrupt the verb, start it again, and kill the hub while the verb runs.
     let looking = env.start(&["zones", "front", "mask", "--for=1h", "--json"]);
     testkit::wait_until("a subscriber to scans", || env.subscribers("front/scan") == 1);
     assert_eq!(looking.end(INT).exit_code, Some(130));

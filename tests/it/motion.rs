@@ -1,5 +1,5 @@
-//! Tests of the topic `motion`, from the line to its subscribers: computed only while it has subscribers, configured by
-//! keys of a link, and used by the background method `moving`.
+//! Tests of the topic `motion`, from the line to its subscribers: the hub computes it only while it has subscribers,
+//! keys of a link configure it, and the background method `moving` uses it.
 
 use crate::testkit::{INT, TERM, TestEnv, checked_topic_seqs, is_class, number};
 use serde_json::Value;
@@ -37,7 +37,7 @@ fn standing_robot_has_no_motion_and_learns_background() {
     assert_ne!(refused.exit_code, Some(0), "{refused}");
     let outcome = front.end(INT);
     let (of_motion, of_scans) = (outcome.of_class("motion"), outcome.of_class("scan"));
-    // Each scan has its motion, with the same `seq`.
+    // The motion of each scan has the same `seq` as the scan.
     let seqs = |lines: &[Value]| lines.iter().map(|line| number(line, "seq")).collect::<Vec<_>>();
     let (of_scans, of_motion) = (seqs(&of_scans), seqs(&of_motion));
     assert!(of_motion.iter().filter(|seq| of_scans.contains(seq)).count() > 20, "{outcome}");

@@ -1,4 +1,4 @@
-//! Tests of a hub whose link has another family than the scanner on the line: bytes arrive, but the hub cannot decode
+//! Tests of a hub whose link has another family than the scanner on the line. Bytes arrive, but the hub cannot decode
 //! them.
 
 use std::fs::File;
@@ -23,8 +23,8 @@ use crate::testkit::{INT, TERM, TestEnv};
 
 const REMEDY: &str = "Remove family from link front and restart the hub: it finds the scanner";
 
-/// Flags of `simulate` for scanners that stream, each with two families that it does not belong to. [`IDLE_SCANNERS`]
-/// wait for requests. An LDROBOT scanner always streams.
+/// Flags of `simulate` for scanners that stream, each with two families to which the scanner does not belong. The
+/// scanners in [`IDLE_SCANNERS`] wait for requests instead. They include no LDROBOT scanner, which always streams.
 const STREAMING_SCANNERS: [(&[&str], [&str; 2]); 3] = [
     (&["--family=ld", "--model=ld19"], ["lms", "rplidar"]),
     (&["--baud=500000", "--state=streaming"], ["ld", "rplidar"]),
@@ -33,7 +33,7 @@ const STREAMING_SCANNERS: [(&[&str], [&str; 2]); 3] = [
 const IDLE_SCANNERS: [(&[&str], [&str; 2]); 2] =
     [(&[], ["ld", "rplidar"]), (&["--family=rplidar", "--model=a1"], ["lms", "ld"])];
 
-/// Calls `check` concurrently for each scanner and each family that it does not belong to.
+/// Calls `check` concurrently for each scanner with each of its wrong families.
 fn check_each_scanner(scanners: &[(&[&str], [&str; 2])], check: impl Fn(&[&str], &str) + Sync) {
     std::thread::scope(|scope| {
         let cases =
@@ -123,8 +123,8 @@ fn doctor_and_configure_suggest_scanhub_probe() {
     check_each_scanner(&IDLE_SCANNERS, check);
 }
 
-/// Once the hub has stopped, the suggested command finds the scanner. Without the key `family`, the hub finds it too.
-/// `probe` cannot search a port while the hub uses it.
+/// While a hub uses a port, `probe` cannot search the port, and its message names two remedies. After the hub has been
+/// stopped, the suggested command finds the scanner. Without the key `family`, a hub finds the scanner, too.
 #[test]
 fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
     let (env, other) = (TestEnv::new(), TestEnv::new());
@@ -175,7 +175,7 @@ fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
         assert!(text(&sensor, "remedy").contains(" info "), "{sensor}");
     }
 
-    // A third process takes bytes away from the hub.
+    // Another process (this test) now also reads from the port, and takes bytes away from the hub.
     let reader = File::options().read(true).open(env.path("front")).expect("the port");
     let [message, hint] = refused(&env, &["probe", &port]);
     let process = format!("process {} (", std::process::id());
@@ -184,13 +184,13 @@ fn refusal_of_a_busy_port_shows_hub_error_and_remedy() {
     drop(reader);
 
     assert_eq!(hub.end(TERM).exit_code, Some(0), "{info}");
-    // Each of the two remedies finds the scanner.
+    // Each of the two remedies works: `probe` finds the scanner, and so does a hub without `family`.
     assert_eq!(env.search(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming" && info["model"] == "ld19");
 }
 
-/// Returns streaming scanners, each with its name in the hub's message.
+/// Returns streaming scanners, each with the name that the hub's message has for it.
 fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     let room = || Room::new(&"room".parse().expect("a world"), 7);
     let head = LdSettings { seed: 7, ..LdSettings::of(ld::Model::Ld19) };
@@ -211,8 +211,8 @@ fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     ]
 }
 
-/// Connects `device` to a link of the hub from `begin` to `end`. Bytes arrive intact, whatever baud rate the hub has
-/// set. Calls `note` with the time after each step of 10 ms.
+/// Connects `device` to a link of the hub from `begin` to `end`. Bytes arrive intact at every baud rate that the hub
+/// sets. Calls `note` with the time after each step of 10 ms.
 fn connect(
     device: &mut dyn Device,
     link: &mut VirtualLink<'_>,
@@ -237,12 +237,12 @@ const ONE_SECOND: Nanos = 1_000 * MILLIS;
 /// Time at which the scanner is replaced by another one.
 const REPLACED_AT: Nanos = 10 * ONE_SECOND;
 
-/// Time, family and last error of a status.
+/// Time at which a status was received, and the family and the last error in the status.
 type ReportedStatus = (Nanos, Option<Family>, String);
 
-/// Runs a hub in virtual time until `end`. The scanner with the index `number` streams and is replaced by the next one
-/// on the same line at [`REPLACED_AT`]. `keys` are added to the link. Returns the name of the first scanner and all
-/// published statuses.
+/// Runs a hub in virtual time until `end`. At first, the scanner with the index `number` streams. At [`REPLACED_AT`],
+/// the next scanner replaces it on the same line. `keys` are added to the link. Returns the name of the first scanner
+/// and all published statuses.
 fn replace_scanner(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<ReportedStatus>) {
     let env = TestEnv::new();
     let (name, mut first) = scanners().into_iter().nth(number).expect("one of three scanners");
@@ -268,8 +268,8 @@ fn replace_scanner(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<
     (name, driven.expect("the domain is free"))
 }
 
-/// Asserts that the hub reports the exchange of the scanner `name` within 4 s, with `remedy`, and never reports damage
-/// on the line.
+/// Asserts that the hub reports within 4 s that the scanner `name` was replaced. The report must have the remedy
+/// `remedy`, and the hub must never report damage on the line.
 fn check_replacement(name: &str, remedy: &str, reported: &[ReportedStatus]) {
     let message =
         format!(" bytes/s arrive, but nothing from the {name}: another scanner, or a damaged line? {remedy}");
@@ -335,7 +335,8 @@ fn doctor_reports_each_link_of_the_running_hub() {
     }
     let text = env.run(&["doctor", "--no-system-config"]).to_string();
     assert!(text.contains(&format!("{server} (link side)")), "{text}");
-    // `doctor` checks the links of a configuration in addition to the links of the hub.
+    // If `doctor` has a configuration, it checks the links of the configuration in addition to the links of the running
+    // hub.
     let named = env.run(&["doctor", "--json", "--no-system-config", &env.link("front"), &env.link("rear")]);
     let findings = named.of_class("check");
     let links = ["front", "rear", "absent", "side"];

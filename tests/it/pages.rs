@@ -1,6 +1,6 @@
-//! Tests that run every example on every page as it is printed. Programs run next to a hub, in a room with walls and in
-//! an empty one, with sensors that measure in mm and in cm. Shell lines are run; configurations and worlds are parsed.
-//! Examples that cannot run are listed with the reason.
+//! Tests that run every example on every page, exactly as the page has it. Programs run next to a hub, in a room with
+//! walls and in an empty world, with sensors that measure in mm and in cm. Shell lines are run, and configurations and
+//! worlds are parsed. Examples that cannot run are listed with the reason.
 
 mod blocks;
 mod data_blocks;
@@ -15,7 +15,7 @@ use blocks::{Block, blocks};
 pub(crate) use program::Example;
 use rustix::time::{ClockId, clock_gettime};
 
-/// A simulated room and the sensor in it.
+/// A simulated room and the sensor in the room.
 #[derive(Clone, Copy, Debug)]
 struct ExampleScene {
     world: &'static str,
@@ -64,7 +64,8 @@ impl ExampleScene {
         examples.iter().filter_map(|example| self.check_example(example, &run(example)).err()).collect()
     }
 
-    /// Returns whether `example` must print a distance or a verdict: if it prints at all, and the room has walls.
+    /// Returns whether `example` must print a distance or a verdict. An example must print one of them if the room has
+    /// walls and the example prints anything.
     fn needs_distance(&self, example: &Example) -> bool {
         self.wall_m.is_some() && example.text.contains("print")
     }
@@ -73,7 +74,7 @@ impl ExampleScene {
     fn check_example(&self, example: &Example, outcome: &Outcome) -> Result<(), String> {
         let wrong =
             |description: &str| Err(format!("{}, {self:?}: {description}\n{outcome}", example.location));
-        // An example either ends by itself or runs until the test ends it.
+        // An example exits with 0 by itself, or runs until the test ends it by a signal.
         if !matches!(outcome.exit_code, None | Some(0)) || !outcome.stderr.is_empty() {
             return wrong("the example failed");
         }
@@ -114,10 +115,10 @@ fn distance_m(line: &str) -> Option<f64> {
 /// Runs `example` next to the hub of `env` until it has received some scans, and until it has printed something if
 /// `must_print` is set. `verdicts` receives the verdicts of the same scans.
 fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, must_print: bool) -> Outcome {
-    // Standard input stays open and empty.
+    // The example's stdin stays open, but has no data.
     let (stdin, _typed) = std::io::pipe().expect("a pipe");
     let mut program = Program::start_with(example.command(env), stdin);
-    // The example is attached to the hub once it has mapped the hub's memory.
+    // An example that has mapped the hub's memory is attached to the hub.
     let maps = format!("/proc/{}/maps", program.pid());
     let follows = || {
         let maps = std::fs::read_to_string(&maps).unwrap_or_default();
@@ -132,7 +133,7 @@ fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, must_print: boo
     if program.has_ended() { program.wait() } else { program.end(TERM) }
 }
 
-/// Returns the time of CLOCK_MONOTONIC in ns, as in stamps.
+/// Returns the time of CLOCK_MONOTONIC in nanoseconds, which is the clock of stamps.
 fn monotonic_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
@@ -159,11 +160,11 @@ fn is_program(block: &Block) -> bool {
     ["python", "rust", "c", "cpp"].contains(&block.language.as_str())
 }
 
-/// Pages whose programs subscribe to a tracker or publish a mount's angle instead of reading from a hub. `track.rs` and
-/// `tilt.rs` run them.
+/// Pages whose programs do not read from a hub. They subscribe to a tracker or publish the angles of a mount, and
+/// `track.rs` and `tilt.rs` run them.
 const PAGES_TESTED_ELSEWHERE: [&str; 2] = ["docs/tracks.md", "docs/tilt.md"];
 
-/// Builds the programs on `page` that contain `words`, except those that this machine cannot build.
+/// Builds the programs on `page` that contain `words`, except the programs that this machine cannot build.
 pub(crate) fn examples_on(page: &str, words: &str, env: &TestEnv) -> Vec<Example> {
     let is_wanted = |block: &Block| block.location.starts_with(page) && block.text.contains(words);
     let blocks = blocks().into_iter().filter(is_wanted).map(|block| match block.language.as_str() {
@@ -186,7 +187,8 @@ fn page_programs_run_and_print_only_real_distances() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
-/// Runs the programs `blocks` in `scenes` and returns a description of each failure, with its location.
+/// Builds the programs in `blocks`, runs them in each of `scenes`, and returns a description of each failure, with its
+/// location.
 fn failures(blocks: &[Block], scenes: &[ExampleScene]) -> Vec<String> {
     let shop = TestEnv::new();
     let (mut examples, mut wrong) = (Vec::new(), Vec::new());
@@ -196,12 +198,12 @@ fn failures(blocks: &[Block], scenes: &[ExampleScene]) -> Vec<String> {
             Err(refused) => wrong.push(format!("{}: {refused}", block.location)),
         }
     }
-    // Each scene has its own hub, and all of them wait most of the time.
+    // Run the scenes concurrently. Each scene has its own hub, and the programs wait most of the time.
     wrong.extend(run_concurrently(scenes, |situation| situation.check_examples(&examples)).concat());
     wrong
 }
 
-/// Examples with mistakes that pages once had, each with the expected error.
+/// Examples with mistakes that pages once had. The test must report the expected error for each of them.
 #[test]
 fn page_program_that_misuses_codes_is_detected() {
     let block = |language: &str, text: &str| Block {

@@ -1,5 +1,5 @@
-//! Upper bounds for the hub's instructions and system calls per telegram, so that a change shows its cost. They hardly
-//! depend on the load of the machine. `benches/path` shows where the cost arises.
+//! Upper bounds for the hub's instructions and system calls per telegram, so that a change that increases the cost
+//! fails the test. Both numbers hardly depend on the load of the machine. `benches/path` shows where the cost arises.
 
 #[cfg(not(target_arch = "x86_64"))]
 #[test]
@@ -14,19 +14,21 @@ fn telegram_costs_no_more_than_before() {
     use crate::testkit::{TERM, TestEnv, is_class, skip, wait_until};
     use std::time::Duration;
 
-    // Upper bounds: a quarter above the values that this test prints with `cargo test --test it -- path_cost
-    // --nocapture`. After a change that reduces the cost, set them to 1.25 times the new values, so that a later
-    // regression fails. Take the highest of five runs: the hub publishes the status with most of the stepped telegrams,
-    // but not with all.
-    /// With a learned background, in the profile `dev`. 182,000 to 217,000 were measured.
+    // The two maximums are a quarter above the values that this test prints with `cargo test --test it -- path_cost
+    // --nocapture`. After a change that reduces the cost, set the maximums to 1.25 times the new values, so that a
+    // later regression fails. Run the test five times and take the highest value, because values vary: the hub
+    // publishes the status with most of the stepped telegrams, but not with all.
+    /// Maximum number of instructions per telegram, with a learned background and in the profile `dev`. 182,000 to
+    /// 217,000 instructions were measured.
     const MAX_INSTRUCTIONS: u64 = 271_000;
-    /// At 500,000 baud. 7 were measured, and 5 to 9 on a busy machine.
+    /// Maximum number of system calls per telegram at 500,000 baud. 7 calls were measured, and 5 to 9 on a busy
+    /// machine.
     const MAX_SYSTEM_CALLS: u64 = 9;
 
-    /// Number of telegrams that are stepped through. Each of them takes some seconds.
+    /// Number of telegrams that are stepped through. Stepping through one telegram takes some seconds.
     const STEPPED_TELEGRAMS: usize = 10;
-    /// Number of telegrams whose system calls are counted. They follow [`LEARNING_TELEGRAMS`] others. During those, the
-    /// hub estimates how long before the end of a telegram it has to wake up.
+    /// Number of telegrams whose system calls are counted. The first [`LEARNING_TELEGRAMS`] telegrams are not counted.
+    /// During these, the hub estimates how long before the end of a telegram it has to wake up.
     const COUNTED_TELEGRAMS: usize = 40;
     const LEARNING_TELEGRAMS: usize = 110;
     /// Time between two telegrams at 9,600 baud.
@@ -38,8 +40,8 @@ fn telegram_costs_no_more_than_before() {
     const ROOM_WORLD: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
          [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
 
-    /// Returns the values per telegram in ascending order. If two telegrams were complete before the hub read them, the
-    /// hub sleeps once for both.
+    /// Returns the values per telegram in ascending order. A cost may cover two telegrams, because the hub sleeps only
+    /// once if both were complete before it read them.
     fn sorted(costs: &[TelegramCost], value: fn(&TelegramCost) -> u64) -> Vec<u64> {
         let mut values: Vec<u64> = costs.iter().map(|cost| value(cost).div_ceil(cost.telegrams)).collect();
         values.sort_unstable();
@@ -65,7 +67,7 @@ fn telegram_costs_no_more_than_before() {
         .collect();
     stepper.detach();
     // On a busy machine, sleeps end at other times, and most telegrams need one or two calls more. The lower quartile
-    // hardly depends on that.
+    // hardly depends on these calls.
     let calls =
         sorted(&costs[LEARNING_TELEGRAMS..], |cost| cost.system_calls.values().sum())[COUNTED_TELEGRAMS / 4];
     drop(subscriber);
@@ -78,13 +80,13 @@ fn telegram_costs_no_more_than_before() {
         Stepper::attach(link_thread(hub.pid(), "front").expect("the hub runs")).expect("ptrace is allowed");
     let stepped: Vec<TelegramCost> = (0..STEPPED_TELEGRAMS)
         .map(|_| {
-            // The steps of the previous telegram have delayed the hub.
+            // The steps of the previous telegram have delayed the hub, so let it catch up first.
             stepper.run_past_telegram(TELEGRAM_INTERVAL).expect("the hub publishes");
             stepper.step_telegram(|_, _, _| {}).expect("the hub publishes")
         })
         .collect();
     stepper.detach();
-    // A preempted hub may take another path.
+    // Use the median, because a hub that was preempted may execute other code.
     let instructions = sorted(&stepped, |cost| cost.instructions)[STEPPED_TELEGRAMS / 2];
     println!("{instructions} instructions, {calls} system calls");
     assert!(instructions <= MAX_INSTRUCTIONS, "{instructions} instructions: {stepped:?}");

@@ -1,5 +1,5 @@
-//! Tests of unusable ports: each cause has its message and its remedy. The hub exits only if a port is not a serial
-//! line. It waits for a port with any other problem.
+//! Tests of unusable ports. Each cause has its own message and remedy. The hub exits only if a port is not a serial
+//! line. For every other problem, it waits until the port can be used.
 
 use std::net::{TcpListener, TcpStream};
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
@@ -12,14 +12,15 @@ use serde_json::Value;
 /// An unprivileged user who owns no files.
 const UNPRIVILEGED_UID: u32 = 65534;
 
-/// Asserts that a hub with the port `port` exits with code 4 and an error of `kind`. Returns its message and hint.
+/// Asserts that a hub with the port `port` exits with code 4 and an error of `kind`. Returns the message and the hint
+/// of the error.
 fn assert_refused(env: &TestEnv, port: &str, kind: &str) -> String {
     let outcome = env.run(&["run", "--json", &format!("--link=front={port}")]);
     assert_eq!(outcome.exit_code, Some(4), "{outcome}");
     message_and_hint(&outcome.stderr, kind)
 }
 
-/// Asserts that `log` ends with an error of `kind`, and returns its message and hint.
+/// Asserts that the last line of `log` is an error of `kind`, and returns the message and the hint of the error.
 fn message_and_hint(log: &str, kind: &str) -> String {
     let line: Value = serde_json::from_str(log.lines().last().unwrap_or_default())
         .unwrap_or_else(|error| panic!("{error}: {log}"));
@@ -64,7 +65,8 @@ fn hub_waits_for_missing_ports() {
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// Removes the permissions of a pty: for other users if the test runs as root, or else for its owner.
+/// A user without permission for the port starts the hub. If the test runs as root, the permissions of other users are
+/// removed and another user starts the hub. Otherwise, the permissions of the pty's owner are removed.
 #[test]
 fn hub_waits_for_a_port_without_permission() {
     let env = TestEnv::new();
@@ -99,7 +101,7 @@ fn hub_waits_for_a_port_without_permission() {
     }
 }
 
-/// Returns whether `user` may run the program in its directory.
+/// Returns whether `user` may start the program in the directory in which Cargo has built it.
 fn command_can_run(user: u32) -> bool {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_scanhub"));
     succeeds(command.arg("--help").uid(user).gid(user))
@@ -127,7 +129,8 @@ fn hub_waits_for_a_port_held_by_another_hub() {
     let list = other.run(&["list"]);
     let reason = format!("front: {text}");
     assert!(String::from_utf8_lossy(&list.stdout).lines().any(|line| line == reason), "{list}");
-    // On a pty, exclusive mode persists after a close. The next process must not find it set.
+    // A pty stays in exclusive mode after a process has closed it. The hub must therefore leave this mode before it
+    // exits, so that the next process can open the port.
     assert_eq!(hub.end(TERM).exit_code, Some(0));
     let taken = |info: &Value| info["state"] != "absent" && info["last_error"] == "";
     other.await_info("front", taken);
@@ -141,7 +144,7 @@ fn hub_waits_for_a_port_held_by_another_hub() {
 #[test]
 fn ready_text_names_ports_the_hub_waits_for() {
     let env = TestEnv::new();
-    // No process listens at the first address, and the second one accepts no connection.
+    // No process listens at the first address. The server at the second address accepts no further connection.
     let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
     let mute = TcpListener::bind("127.0.0.1:0").expect("a port");
     rustix::net::listen(&mute, 0).expect("a socket");
@@ -156,7 +159,7 @@ fn ready_text_names_ports_the_hub_waits_for() {
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// A server that accepts the connection at once is not listed in `waiting`.
+/// The field `waiting` does not list a server that accepts the connection at once.
 #[test]
 fn ready_line_omits_connected_serial_servers() {
     let env = TestEnv::new();
@@ -168,6 +171,6 @@ fn ready_line_omits_connected_serial_servers() {
         assert_eq!((ready["sensors"].as_array().map(Vec::len), hub.end(TERM).exit_code), (Some(1), Some(0)));
         ready["waiting"] == serde_json::json!([])
     };
-    // On a busy machine, the hub may run too late to connect in time.
+    // On a busy machine, the hub may connect only after it has printed the line. The test then starts the hub again.
     testkit::wait_until("the hub is connected when it is ready", is_connected);
 }

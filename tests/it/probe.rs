@@ -1,4 +1,4 @@
-//! Tests of `scanhub probe`: it reports the scanner at a port and leaves the scanner in the state in which it was.
+//! Tests of `scanhub probe`: the command reports the scanner at a port, and leaves the scanner in its previous state.
 
 use std::io::Read;
 
@@ -39,8 +39,8 @@ fn reports_identity_without_changing_the_scanner() {
     assert_eq!(env.simulator_totals("front").1, 0);
 }
 
-/// The last line of the output is a command for a shell. `--toml` prints a section for a file. A hub that uses the
-/// command or the section streams.
+/// The last line of the output is a shell command that starts a hub. With `--toml`, the output is a section of a
+/// configuration file. A hub that is started with the command or with the section streams.
 #[test]
 fn printed_link_and_section_start_a_hub() {
     let families: [(&str, &[&str], &str); 3] = [
@@ -105,7 +105,7 @@ fn reports_dirty_window_despite_ok_status() {
 fn resumes_an_abandoned_stream() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--baud=500000"]);
-    // A hub that is killed leaves its scanner streaming.
+    // Kill a hub, which leaves its scanner streaming.
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     hub.end(testkit::KILL);
@@ -139,10 +139,11 @@ fn reports_silent_and_unusable_ports() {
     );
 }
 
-/// Verbs that search for a scanner in the same way, each with its exit code on a silent line.
+/// Verbs that search for a scanner in the same way, each with the exit code that it has on a silent line.
 const SEARCH_COMMANDS: [(&[&str], i32); 2] = [(&["probe"], 3), (&["doctor", "--no-system-config"], 5)];
 
-/// Asserts that `sent` has only requests of the search. Returns the count of each.
+/// Asserts that `sent` consists only of requests of the search, complete or interrupted. Returns how often each request
+/// was sent completely.
 fn count_requests(mut sent: &[u8]) -> [usize; 4] {
     const REQUESTS: [&[u8]; 4] = [
         &[0x02, 0x00, 0x01, 0x00, 0x3A, 0x1E, 0x12],
@@ -152,7 +153,8 @@ fn count_requests(mut sent: &[u8]) -> [usize; 4] {
     ];
     let mut counts = [0; 4];
     while !sent.is_empty() {
-        // If the next byte of a request would be late, the search starts the request again.
+        // If the search would send the next byte of a request too late, it starts the request again. So `sent` may have
+        // only the first bytes of a request.
         let len_of = |request: &[u8]| request.iter().zip(sent).take_while(|(a, b)| a == b).count();
         let (len, number) =
             (0..4).map(|number| (len_of(REQUESTS[number]), number)).max().expect("one of four requests");
@@ -186,14 +188,16 @@ fn sends_only_search_requests_to_unknown_scanner() {
         ] {
             assert!(text.contains(part), "{part}: {outcome}");
         }
-        // In each round, each family has four requests or rates. There are two rounds.
+        // The search has two rounds. In each round, it searches for an LMS at four rates, and sends each RPLIDAR
+        // request four times.
         let counts = count_requests(&sent);
         assert!(counts[0] >= 4 && counts[1] >= 4 && counts[2] >= 8 && counts[3] >= 8, "{counts:?}");
     }
 }
 
-/// Prints the requests that the search sent. In virtual time, a streaming scanner receives no byte at all. On a busy
-/// machine, its packets may have a gap in which the search continues.
+/// The test prints how many requests the search sent, but has no limit for them. In virtual time, a streaming scanner
+/// would receive no byte at all. On a busy machine, there may be gaps between its packets, in which the search
+/// continues.
 #[test]
 fn finds_streaming_scanner_with_search_requests_only() {
     let env = TestEnv::new();
@@ -218,7 +222,8 @@ fn finds_streaming_scanner_with_search_requests_only() {
     }
 }
 
-/// `probe` would receive only a part of the bytes and report the line as damaged.
+/// Another process reads from the port. Without the error, `probe` would receive only a part of the bytes, and would
+/// report the line as damaged.
 #[test]
 fn error_names_another_reader_of_the_port() {
     let env = TestEnv::new();
@@ -261,7 +266,7 @@ fn probe_without_a_port_lists_candidates() {
     let env = TestEnv::new();
     let outcome = env.run(&["probe", "--json"]);
     match outcome.exit_code {
-        // The result depends on the ports of the machine.
+        // The result depends on the ports of the machine on which the test runs.
         Some(0) => {
             for line in outcome.lines() {
                 assert_eq!(line["class"], "candidate", "{outcome}");

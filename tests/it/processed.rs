@@ -1,5 +1,5 @@
-//! Tests of the topics that the hub derives from scans: marks, zones, foreground and background with each scan, one
-//! `unknown` sample when scans stop, and the commands for the background.
+//! Tests of the topics that the hub derives from scans: marks, zones, foreground and background with each scan, and one
+//! sample of topic `zones` with the verdict `unknown` when scans stop. The commands for the background are tested, too.
 
 use crate::testkit;
 use crate::testkit::{INT, Outcome, TERM, TestEnv, checked_topic_seqs, is_class, number, wait_until};
@@ -11,7 +11,7 @@ fn background(env: &TestEnv, arguments: &[&str]) -> Outcome {
     env.run(&[&["background", "front"], arguments, &["--json"]].concat())
 }
 
-/// Asserts that `background front` accepts `arguments`.
+/// Asserts that the verb `background front` with these arguments succeeds.
 fn background_accepted(env: &TestEnv, arguments: &[&str]) {
     let outcome = background(env, arguments);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
@@ -37,7 +37,7 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     let hub = env.hub(&[env.link("front")]);
     let topics = ["scan", "marks", "zones", "foreground"];
     let mut subscribers = topics.map(|topic| env.echo(&[&format!("front/{topic}")]));
-    // Before any scan, the verdict is unknown, and the radii are the configured ones.
+    // Before the first scan, the verdict is `unknown`, and the radii are those of the configuration.
     let first = subscribers[2].await_line("the first sample", is_class("zones"));
     assert_eq!((&first["verdict"], number(&first, "topic_seq")), (&"unknown".into(), 0), "{first}");
     assert_eq!(
@@ -56,12 +56,13 @@ fn each_scan_has_its_marks_zones_and_foreground() {
         });
         assert!(of_scans.count() > 0, "{name}: {lines:?}");
     }
-    // The simulated room has reflectors, which the simulated scanner reports. The background is not known yet.
+    // The simulated room has reflectors, and the simulated scanner reports them. The background is not known yet, so no
+    // beam is foreground.
     assert!(marks.iter().all(|line| line["available"] == true));
     assert!(marks.iter().any(|line| line["marks"].as_array().is_some_and(|marks| !marks.is_empty())));
     assert!(zones.iter().all(|line| number(line, "nearest_mm") > 0 && line["verdict"] != "unknown"));
     assert!(foregrounds.iter().all(|line| line["beams"].as_array().is_some_and(Vec::is_empty)));
-    // For a late subscriber, earlier samples do not count as missed.
+    // A late subscriber does not count the samples before its start as missed.
     let late = env.run(&["echo", "--json", "front/marks", "front/foreground", "-n", "20"]);
     ["marks", "foreground"].iter().for_each(|topic| drop(checked_topic_seqs(&late, topic)));
     for (subscriber, topic) in subscribers.into_iter().zip(topics) {
@@ -73,7 +74,8 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
-/// Waits until a late joiner's sample of topic `zones` is the `unknown` of a silence, and returns it.
+/// Waits until a late joiner receives the sample of topic `zones` that the hub publishes when scans stop, with the
+/// verdict `unknown`. Returns this sample.
 fn await_silence_sample(env: &TestEnv) -> Value {
     let mut last = Value::Null;
     wait_until("an unknown verdict of the hub", || {
@@ -97,14 +99,15 @@ fn silence_is_published_once_and_to_late_joiners() {
     assert_eq!(env.run(&["control", "front", "pause"]).exit_code, Some(0));
     env.await_info("front", |info| info["state"] == "paused");
     let unknown = await_silence_sample(&env);
-    // Five statuses later, no further sample was added.
+    // After five more statuses, the hub still has not published another sample of topic `zones`.
     let mut statuses = env.echo(&["front/status", "front/scan", "front/background"]);
     let statuses = statuses.await_lines(5, "a status", is_class("status"));
-    // A subscriber that attaches meanwhile receives no scan, which is not an error.
+    // A subscriber that attaches during the pause receives no scan, and the hub does not report an error because of
+    // this.
     assert!(statuses.iter().all(|status| status["last_error"] == ""), "{statuses:?}");
     assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     let next = zones.await_line("the next verdict", |line| {
-        // When the client itself detects a silence, the line has no `topic_seq`.
+        // A line that the client prints because it has detected a silence itself has no `topic_seq`.
         line["class"] == "zones" && line["topic_seq"].as_u64() > unknown["topic_seq"].as_u64()
     });
     assert_eq!(number(&next, "topic_seq"), number(&unknown, "topic_seq") + 1);
@@ -114,7 +117,7 @@ fn silence_is_published_once_and_to_late_joiners() {
     let absent = env.await_info("front", |info| info["state"] == "absent");
     let line = await_silence_sample(&env);
     let last = scans.end(INT).of_class("scan").pop().expect("a scan");
-    // The sample has the `seq` of the last telegram and a later stamp.
+    // The sample has the `seq` of the last telegram, but a later stamp.
     assert!(number(&line, "seq") >= number(&last, "seq"), "{line}");
     assert!(number(&line, "stamp_ns") > number(&last, "stamp_ns"), "{line}");
     assert_eq!(absent["last_error"].as_str().map(str::is_empty), Some(false));
@@ -125,8 +128,9 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front"), "--set=background.scans=20".into()]);
     let mut generations = env.echo(&["front/background"]);
-    // World with a wall and no people, learned in a second. A subscriber that starts too late on a busy machine misses
-    // the first, empty sample. The second generation is frozen while it is empty.
+    // The world has a wall and no people, so the hub learns the background within a second. On a busy machine, the
+    // subscriber may start too late and miss the first sample, which is empty. The second generation is frozen before
+    // the hub learns anything, so it stays empty.
     let _simulator = env.simulator(&["front"], &["--seed=52", "--baud=500000", "--world=bare"]);
     let first = generations.await_line("the first generation", is_class("background"));
     assert_eq!((number(&first, "generation"), number(&first, "count")), (0, 361), "{first}");
@@ -154,7 +158,7 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
     background_accepted(&env, &["thaw"]);
     assert_eq!(model(&env)["frozen"], false);
 
-    // Models with another resolution or another unit are rejected.
+    // The hub rejects a model with another resolution or another unit.
     for (key, value, words) in [
         (
             "unit_mm",
@@ -185,7 +189,7 @@ fn background_can_be_saved_frozen_reset_and_loaded() {
     }
     assert_eq!(number(&model(&env), "generation"), 2);
     let outcome = generations.end(INT);
-    // The hub publishes a generation again after every 20 scans that it learned from.
+    // After every 20 scans from which the hub has learned, it publishes the generation again.
     let lines = outcome.of_class("background");
     let mut received: Vec<u64> = lines.iter().map(|line| number(line, "generation")).collect();
     received.dedup();
@@ -240,7 +244,7 @@ fn recording_has_zones_and_a_controllable_background() {
         (number(&shown, "generation"), number(&shown, "count"), &shown["frozen"]),
         (1, 361, &true.into())
     );
-    // The recording has mode 00h, which does not report reflectors.
+    // The recording was made in mode 00h, in which a scanner does not report reflectors.
     let marks = env.run(&["echo", "--json", "front/marks", "-n", "1"]);
     assert_eq!(marks.of_class("marks")[0]["available"], false, "{marks}");
 }
@@ -249,14 +253,15 @@ fn recording_has_zones_and_a_controllable_background() {
 fn slow_recording_has_no_false_silence() {
     let env = TestEnv::new();
     let ranges = vec!["2.0"; 181].join(" ");
-    // Ten scans per second and one pause of 0.9 s. A live sensor would be silent after a twentieth of this pause.
+    // The recording has ten scans per second, and one pause of 0.9 s. The hub would report a live sensor as silent
+    // after a twentieth of this pause.
     let at_s = |scan: usize| 10.0 + 0.1 * scan as f64 + if scan < 6 { 0.0 } else { 0.9 };
     let line = |at_s: f64| format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at_s} host {at_s}\n");
     let log: String = (0..12).map(at_s).map(line).collect();
     let _hub = env.hub(&["--link", &format!("front=file:{}", env.file("log", log))]);
     env.await_info("front", |info| info["state"] == "silent");
-    // At its end the sensor is silent, like any other. Before that, there were only the first sample and twelve
-    // verdicts.
+    // At the end of the recording, the sensor is silent, as a live sensor would be. Before the sample of this silence,
+    // the hub published only the first sample and one verdict for each of the twelve scans.
     let mut last = Value::Null;
     wait_until("an unknown verdict", || {
         last = env.run(&["echo", "--json", "front/zones", "-n", "1"]).lines()[0].clone();

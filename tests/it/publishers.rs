@@ -1,6 +1,6 @@
 //! Tests of Python and C programs that publish the angles of a mount. Subscribers receive the same samples as from Rust
-//! programs, are woken, and continue when a killed publisher is restarted. A name has one publisher, whatever its
-//! language.
+//! programs, the samples wake them, and they continue when a killed publisher is restarted. A name has at most one
+//! publisher, whatever the language of the publisher.
 
 use std::io::{PipeWriter, Write};
 use std::process::Command;
@@ -26,14 +26,14 @@ impl TestPublisher {
         TestPublisher { program: Program::start_with(command, stdin), commands }
     }
 
-    /// Starts `command` and waits until it publishes.
+    /// Starts `command` and waits until the program is ready to publish.
     pub(crate) fn start_and_publish(command: Command) -> TestPublisher {
         let mut mount = TestPublisher::start(command);
         mount.program.await_line("an open publisher", is_class("open"));
         mount
     }
 
-    /// Sends an angle with its stamp to the program, and waits until it has published it.
+    /// Sends an angle with its stamp to the program, and waits until the program has published the sample.
     pub(crate) fn send(&mut self, tilt: &Tilt, stamp_ns: u64) {
         let Tilt { angle_rad, rate_rad_s } = tilt;
         writeln!(self.commands, "{angle_rad} {rate_rad_s} {stamp_ns}").expect("an open pipe");
@@ -47,8 +47,8 @@ impl TestPublisher {
     }
 }
 
-/// Returns a function for each language available on this machine. Each function takes a name and returns the command
-/// of a program that publishes under this name.
+/// Returns a function for each programming language that is available on this machine. Each function takes a name and
+/// returns the command of a program that publishes under this name.
 pub(crate) fn languages(env: &TestEnv) -> Vec<impl Fn(&str) -> Command + use<'_>> {
     let python = check_on(env, "publish").is_some().then_some(None);
     let c = InstalledLibrary::installed()
@@ -67,7 +67,7 @@ pub(crate) fn languages(env: &TestEnv) -> Vec<impl Fn(&str) -> Command + use<'_>
     starts.collect()
 }
 
-/// Joins the domain as its listener, so that the domain stays in use.
+/// Joins the domain as its listener, so that the domain stays in use while publishers come and go.
 fn listener(env: &TestEnv) -> PublishSession {
     PublishSession::open(&env.domain(), &[Topic::Marks], TopicLimits::default()).expect("the only publisher")
 }
@@ -164,7 +164,7 @@ fn second_publisher_of_a_name_is_refused() {
             (ErrorKind::NameHeld, refused(mount.program.pid()))
         );
         assert_eq!(mount.end().exit_code, Some(0));
-        // The name is free at once.
+        // After the publisher has exited, its name is free at once.
         let in_rust = other_publisher().expect("the name is free");
         for other in &starts {
             let outcome = TestPublisher::start(other("mount")).program.wait();
@@ -180,8 +180,8 @@ fn second_publisher_of_a_name_is_refused() {
     }
 }
 
-/// While a publisher joins, it holds the lock for the prefix of shared memory. A publisher that leaves at the same time
-/// therefore sees the other publisher and does not remove the prefix.
+/// While a publisher joins the domain, it holds the lock for the prefix of shared memory. Another publisher that leaves
+/// at the same time therefore detects it, and does not remove the prefix.
 #[test]
 fn publisher_is_visible_while_another_exits() {
     let env = TestEnv::new();
@@ -228,7 +228,8 @@ fn subscribers_survive_a_killed_publisher() {
             assert_eq!(mount.program.end(KILL).exit_code, None);
         }
         drop((subscriber, listener));
-        // The last publisher removes everything, including files that killed publishers left.
+        // The last publisher in a domain removes everything when it exits, including the files that killed publishers
+        // left.
         assert_eq!(TestPublisher::start_and_publish(start("mount")).end().exit_code, Some(0));
         assert_eq!(env.leftover_files(), Vec::<std::path::PathBuf>::new());
         assert!(!exists_or_is_symlink(&env.domain().root().join("prefix")), "the next one has other names");

@@ -1,6 +1,6 @@
 //! Tests of the Python package next to a hub. Python scripts check properties that are visible only in Python, and the
-//! tests compare their samples with the samples of `echo`. The tests skip if no Python has a package built from these
-//! sources.
+//! tests compare the samples that the scripts print with those that `echo` prints. If the package was not built from
+//! these sources, the tests are skipped.
 
 mod read;
 
@@ -18,7 +18,8 @@ use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
 use scanhub_shm::{HubLock, Node, Payload, PortFactory, WakeSender};
 use serde_json::{Value, json};
 
-/// Returns the command for a script of the package's tests, or `None` if no suitable Python is installed.
+/// Returns the command that runs the script `name` of the package's tests, or `None` if no suitable Python is
+/// installed.
 fn check(name: &str) -> Option<Command> {
     let mut command = client_python()?;
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python/tests");
@@ -26,7 +27,7 @@ fn check(name: &str) -> Option<Command> {
     Some(command)
 }
 
-/// Like [`check`], with the domain and the root of `env` as first arguments.
+/// Returns the command of [`check`], with the domain and the root of `env` as first arguments.
 pub(crate) fn check_on(env: &TestEnv, name: &str) -> Option<Command> {
     let mut command = check(name)?;
     let domain = env.domain();
@@ -81,7 +82,7 @@ fn refuses_impossible_subscriptions() {
     assert_success(command);
 }
 
-/// Takes the lock of a hub and creates the doorbell of `front`. The test creates the topics.
+/// Takes the lock of a hub and creates the doorbell of `front`. The caller creates the topics.
 fn hub_without_sensors(env: &TestEnv) -> (HubLock, Node, WakeSender) {
     let lock = HubLock::acquire(env.domain().root()).expect("no hub runs");
     let node = scanhub_shm::hub_node(&env.domain()).expect("a node");
@@ -114,8 +115,8 @@ fn raising_notice_handler_loses_no_sample() {
     wait_until("the subscriber", || service.dynamic_config().number_of_subscribers() == 1);
     lines.write_all(b"\n").expect("an open pipe");
     script.await_line("a waiting subscriber", is_class("waits"));
-    // The sample does not wake the subscriber. The check that detects the end of the hub therefore also finds the
-    // sample.
+    // Publish a sample without ringing the doorbell, so that it does not wake the subscriber. The subscriber finds the
+    // sample only when it checks whether the hub has ended.
     let mut sample = publisher.loan().expect("a loan");
     *sample.user_header_mut() = Header { topic_seq: 7, ..Header::default() };
     *sample.payload_mut() = Status::default();
@@ -134,7 +135,7 @@ fn python_publishes_and_releases_own_names() {
     assert_eq!(env.leftover_files(), Vec::<std::path::PathBuf>::new());
 }
 
-/// Simulates a user without Rust and without a network.
+/// Creates the conditions of a user without Rust and without a network.
 #[test]
 fn wheel_installs_without_compiler_and_network() {
     let Some(python) = client_python() else { return };
@@ -182,7 +183,7 @@ fn wheel_installs_without_compiler_and_network() {
     assert!(line.ends_with(" m"), "{line}");
 }
 
-/// The stubs have all names and types of the module. The examples use these names and types correctly.
+/// The stubs declare all names and types of the module, and the examples use them correctly.
 #[test]
 fn python_types_match_the_stubs() {
     if python("mypy").is_none() || client_python().is_none() {
@@ -242,8 +243,8 @@ fn samples_equal_those_of_echo() {
     }
 }
 
-/// Returns whether `echo` printed `sample` too. Fails if `echo` printed it differently. Lines of a status or a
-/// background have no `topic_seq`, so they count only if all keys match.
+/// Returns whether `echo` also printed `sample`. Panics if `echo` printed this sample with other values. Lines of a
+/// status or a background have no `topic_seq`, so such a line is the same sample only if all keys match.
 fn is_printed_by(echo: &[Value], sample: &Value) -> bool {
     let is_numbered = |line: &Value| line.get("topic_seq").is_some();
     let same = |line: &&Value| line["topic_seq"] == sample["topic_seq"] && line["boot"] == sample["boot"];
@@ -251,7 +252,8 @@ fn is_printed_by(echo: &[Value], sample: &Value) -> bool {
         return echo.iter().any(|line| different_keys(line, sample).is_empty());
     }
     let Some(line) = echo.iter().find(same) else { return false };
-    // `echo` and the script each decide whether a verdict is stale. A stale verdict has no values.
+    // `echo` and the script each decide for themselves whether a verdict is stale. If only one of them does, the keys
+    // of the verdict differ, because a stale verdict has no values.
     let of_verdict = ["verdict", "nearest_mm", "nearest_beam", "zones", "invalid_beams", "stale"];
     let is_stale = [line, sample].iter().any(|line| line["stale"] == true);
     let mut differing = different_keys(line, sample);
@@ -263,7 +265,7 @@ fn is_printed_by(echo: &[Value], sample: &Value) -> bool {
 /// Returns the keys of `line` that are missing or different in `sample`.
 fn different_keys<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
     let keys = line.as_object().expect("an object").keys();
-    // `marks` is derived from the mode. The package offers the mode itself.
+    // In a status, `echo` derives the key `marks` from the mode. The package has the mode itself instead.
     keys.filter(|key| *key != "marks" || line["class"] == "marks")
         .filter(|key| line[*key] != sample[*key])
         .collect()
@@ -313,7 +315,7 @@ fn python_subscription_survives_hub_restarts() {
             let boot = line["boot"].as_str().expect("a boot ID").to_owned();
             let lines_of_run = runs.entry(boot).or_default();
             let python = &line["python"];
-            // A subscriber that waits for a hub receives its samples from the first one on.
+            // A subscriber that waits for a hub receives the hub's samples from the first one on.
             let next = lines_of_run.last().map_or(0, |last| number(last, "topic_seq") + 1);
             let is_first_hub = outcome.of_class(topic)[0]["boot"] == line["boot"];
             assert_eq!(python["restarted"], lines_of_run.is_empty() && !is_first_hub, "{line}");
@@ -326,7 +328,7 @@ fn python_subscription_survives_hub_restarts() {
     }
 }
 
-/// The combined verdict never stays clear without data. The test first switches off one sensor and then kills the hub.
+/// Without data, the combined verdict is never clear. The test first switches off one sensor and then kills the hub.
 #[test]
 fn python_robot_has_the_verdict_of_its_worst_sensor() {
     let env = TestEnv::new();
@@ -351,7 +353,7 @@ fn python_robot_has_the_verdict_of_its_worst_sensor() {
     };
     for subscriber in &mut subscribers {
         let line = subscriber.await_line("clear verdicts", are("clear", "clear", "clear"));
-        // Both sensors are equally clear. A subscriber of all sensors may find either one first.
+        // Both sensors have the verdict `clear`, so either of them may be reported as the worst one.
         let is_sensor = |key: &str| ["front", "rear"].contains(&line[key].as_str().unwrap_or_default());
         assert!(is_sensor("worst") && is_sensor("nearest_sensor") && line["nearest_mm"].is_u64(), "{line}");
         subscriber
@@ -388,7 +390,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
             move |line: &Value| line["verdict"] == verdict && line["sensors"] == json!({ sensor: verdict })
         };
         robot.await_line("an unknown verdict", are("unknown", "robot1.front"));
-        // A client reports `unknown` for a verdict that it reads too late.
+        // Send the verdict again and again, because a client that reads a verdict too late reports `unknown` instead.
         wait_until("clear", || {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             robot.prints(are("clear", "robot1.front"))
@@ -397,7 +399,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
             let last = robot.last_printed(is_class("robot"));
             last.is_some_and(|line| are("unknown", "robot1.front")(&line))
         });
-        // A second subscriber queries the current verdict on request and also has to find the remote sensor.
+        // A second subscriber queries the current verdict only on request, and must find the remote sensor, too.
         let mut command = check_on(&env, "robot").expect("the same Python as before");
         command.arg("--asked");
         let (stdin, mut ask) = std::io::pipe().expect("a pipe");
@@ -408,7 +410,8 @@ fn robot_without_a_hub_uses_remote_sensors() {
             busy.await_line("the current verdict", is_class("now"))["sensors"].clone()
         };
         wait_until("the remote sensor", || query_sensors(&mut busy).get("robot1.front").is_some());
-        // A hub has its own sensors. When it exits, remote sensors do not replace them.
+        // While a hub runs, `robot` combines the sensors of the hub. When the hub exits, remote sensors do not replace
+        // these sensors.
         let _simulator = env.simulator(&["front"], &["--seed=65", "--baud=500000"]);
         let hub = env.hub(&[&env.link("front"), "--set=zones.radii=[0.02,0.01]"]);
         wait_until("only the sensors of the hub", || query_sensors(&mut busy) == json!({"front": "clear"}));
@@ -419,7 +422,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
         assert_eq!(hub.end(KILL).exit_code, None);
         robot.await_line("unknown verdicts after the end of the hub", are("unknown", "front"));
         let mut named = env.start(&["echo", "--json", "robot1.front/zones"]);
-        // A client reports `unknown` for a verdict that it reads too late.
+        // Send the verdict again and again, because a client that reads a verdict too late reports `unknown` instead.
         wait_until("a verdict of the named remote sensor", || {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             named.prints(|line| line["verdict"] == "clear")
@@ -431,7 +434,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
     });
 }
 
-/// Interrupts a script and asserts that it ends at once, as any Python program does on Ctrl-C.
+/// Interrupts a script and asserts that the script ends normally, as after Ctrl-C.
 fn ended_by_interrupt(subscriber: Program) -> Outcome {
     let outcome = subscriber.end(INT);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");

@@ -1,6 +1,7 @@
-//! A scenario of the simulated world at real speed: with the real program, ptys, shared memory and processes. It checks
-//! the same invariants as in virtual time, as far as they are visible from outside, so that the simulation does not
-//! drift from the kernel. `SCANHUB_SEED` selects another scenario. CI runs a new one each time.
+//! A scenario of the simulated world at real speed, with the real program, ptys, shared memory and processes. The test
+//! checks the same invariants as in virtual time, as far as they are visible from outside the program. It fails if the
+//! simulation and the kernel behave differently. The variable `SCANHUB_SEED` selects another scenario, and CI runs
+//! another one for each commit.
 
 mod environment;
 mod invariants;
@@ -19,7 +20,7 @@ const SCENARIO_SECONDS: u64 = 24;
 fn scenario_keeps_its_invariants_at_real_speed() {
     let seed = std::env::var("SCANHUB_SEED").map_or(SCENARIO_SEED, |seed| seed.parse().expect("a number"));
     let plan = Scenario::from_seed(seed, SCENARIO_SECONDS);
-    // With the seed, a developer can run a failed scenario again.
+    // Print the seed, so that a developer can run a failed scenario again.
     println!("SCANHUB_SEED={seed}\n{plan}");
     let mut environment = RealSpeedEnvironment::new(seed);
     for action in &plan.actions {

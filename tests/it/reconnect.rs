@@ -1,4 +1,4 @@
-//! Tests of a port that disappears and comes back under its name while the hub and its subscribers run.
+//! Tests of a port that disappears and comes back under the same name while the hub and its subscribers run.
 
 use crate::testkit::{
     INT, Program, REAL_REPLY_TIME, TERM, TestEnv, TestLine, bytes_of, contiguous_numbers,
@@ -25,12 +25,12 @@ fn reconnects_to_a_returning_scanner() {
     assert_eq!(number(&info["counters"], "reconnects"), 1, "{info}");
     assert_eq!(info["last_error"], "");
     let outcome = subscriber.end(INT);
-    // Within one run of the hub, the sequence numbers continue.
+    // During one run of the hub, `topic_seq` has no gap, even if the port was lost.
     contiguous_numbers(&outcome.of_class("scan"), "topic_seq");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// Sends a scan and waits until the subscriber has received it. `seed` distinguishes the scans.
+/// Sends a scan and waits until the subscriber has received it. Scans with different values of `seed` differ.
 fn stream(line: &TestLine, subscriber: &mut Program, seed: u16) {
     let scan = scan(seed);
     line.wait_until_open();
@@ -45,11 +45,11 @@ fn reopens_a_port_by_name_on_each_new_device() {
     let port = env.path("front");
     let hub = env.hub(&[env.lms_link("front")]);
     let mut subscriber = env.echo(&["front/telegram", "front/status"]);
-    // Each device is another pty, because the previous device still exists when the next one is created.
+    // Each new device is another pty, because the previous pty still exists when the next one is created.
     let mut line = TestLine::create(&port);
     for plugged in 1..=5 {
-        // When the hub opens a line, it discards bytes that have already arrived. It sends its first request after
-        // that.
+        // Wait for the first request of the hub. When the hub opens a line, it discards the bytes that have already
+        // arrived, and sends its first request after that.
         line.wait_for_request();
         stream(&line, &mut subscriber, plugged);
         std::fs::remove_file(&port).expect("an existing link");
@@ -80,7 +80,8 @@ fn follows_a_port_name_that_moves_to_another_device() {
     stream(&old, &mut subscriber, 1);
     std::fs::remove_file(&port).expect("an existing link");
     let new = TestLine::create(&port);
-    // The hub keeps a port that streams, even though its name belongs to another device.
+    // The hub keeps the port from which it receives a stream, even though the port's name now belongs to another
+    // device.
     stream(&old, &mut subscriber, 2);
     assert!(!new.is_open());
     drop(old);
@@ -93,7 +94,7 @@ fn waits_for_a_returned_port_that_is_in_use() {
     let port = env.path("front");
     let hub = env.hub(&[env.lms_link("front")]);
     env.await_info("front", |info| info["state"] == "absent");
-    // The test holds a lock on the device before the device gets its name.
+    // The test holds a lock on the device before the device gets the name of the port.
     let line = TestLine::create(&env.path("elsewhere"));
     let holder = std::fs::File::open(env.path("elsewhere")).expect("a tty");
     flock(&holder, FlockOperation::LockExclusive).expect("a lock");

@@ -1,5 +1,5 @@
-//! Tests of `scanhub record`: the file has everything that the hub published during the recording, however the recorder
-//! ended, and other readers can read the file.
+//! Tests of `scanhub record`: however the recorder ended, the file has everything that the hub published during the
+//! recording, and readers of other projects can read the file.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::Path;
@@ -21,7 +21,8 @@ fn sensors(env: &TestEnv, flags: &[&str]) -> [Program; 2] {
     [simulator, hub]
 }
 
-/// Starts a recorder with these flags that writes `walk.mcap`, and waits until it has written at least `count` samples.
+/// Starts a recorder with these flags, which writes to `walk.mcap`, and waits until it has written at least `count`
+/// samples.
 fn start_recorder(env: &TestEnv, flags: &[&str], count: u64) -> Program {
     let file = env.path_argument("walk.mcap");
     let mut recorder = env.start(&[&["record", "--json", "-o", &file], flags].concat());
@@ -75,7 +76,7 @@ fn records_each_sample_exactly_once() {
                 (message.topic_seq() as u32, "scanhub.Telegram.v2")
             );
         }
-        // Samples that are derived from one telegram have its log time.
+        // Samples that were derived from one telegram have the same log time as the telegram.
         let times: BTreeMap<_, _> =
             telegrams.iter().map(|message| (message.seq(), message.log_time)).collect();
         let marks = recording.of(&format!("{sensor}/marks"));
@@ -150,7 +151,7 @@ fn killed_recorder_keeps_all_reported_samples() {
     assert_eq!(run_reader(python)["messages"], recording.messages.len());
 }
 
-/// Runs `python` with an independent MCAP reader and returns its output.
+/// Runs `python` with an independent MCAP reader and returns the output of this reader.
 fn run_reader(mut python: std::process::Command) -> Value {
     let outcome = output(python.current_dir(env!("CARGO_MANIFEST_DIR"))).unwrap();
     assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
@@ -164,7 +165,7 @@ fn recording_continues_after_a_restart_of_the_hub() {
     let mut recorder = start_recorder(&env, &["*/telegram"], 30);
     assert_eq!(hub.end(KILL).exit_code, None);
     recorder.await_line("hub_gone", |line| line["kind"] == "hub_gone");
-    // The next hub has another sensor, which is recorded too.
+    // The next hub has a sensor with a new name, which the recorder must record, too.
     let other = env.hub(&[env.link("front"), env.link("rear").replace("rear=", "back=")]);
     recorder.await_line("hub_back", |line| line["kind"] == "hub_back");
     env.await_info("back", |info| info["state"] == "streaming");
@@ -222,7 +223,7 @@ fn refuses_impossible_outputs_and_topics() {
     }
     assert_eq!(kind(&["robot/zones"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["front/scam"]), (Some(2), "usage".into()));
-    // Without samples, no file remains.
+    // If no sample was recorded, no file remains.
     let new = env.path_argument("new.mcap");
     assert_eq!(kind(&["-o", &new, "--for", "5s"]), (Some(3), "no_hub".into()));
     assert!(!Path::new(&new).exists());

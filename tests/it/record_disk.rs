@@ -1,5 +1,5 @@
-//! Tests of `scanhub record` on disks that are full, removed, slow or too small. Live topics lose no samples. The
-//! recorder keeps as much as it can hold, and reports gaps both in its output and in the file.
+//! Tests of `scanhub record` on disks that are full, removed, slow or too small. Topics lose no samples because of the
+//! recorder. The recorder buffers as many samples as it can, and reports gaps both in its output and in the file.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -36,7 +36,7 @@ fn await_samples(recorder: &mut Program, count: u64) {
     samples(recorder, before + count);
 }
 
-/// Asserts that the recorder ended successfully, and returns its files in their order.
+/// Asserts that the recorder ended successfully, and returns the paths of its files in order.
 fn files(outcome: &Outcome) -> Vec<PathBuf> {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
@@ -44,14 +44,14 @@ fn files(outcome: &Outcome) -> Vec<PathBuf> {
     files.map(|file| PathBuf::from(file.as_str().unwrap())).collect()
 }
 
-/// Asserts that the recorder missed no telegram.
+/// Asserts that the recorder missed no sample of topic `telegram`.
 fn nothing_missed(outcome: &Outcome) {
     let lines = outcome.of_class("summary");
     let telegrams = lines.iter().find(|line| line["topic"] == "telegram").expect("a summary");
     assert_eq!(number(telegrams, "missed"), 0, "{telegrams}");
 }
 
-/// Returns the telegrams of several files, and asserts that none is missing or duplicated.
+/// Returns the telegrams of several files. Asserts that none is missing between them and that none is duplicated.
 fn telegrams(recordings: &[Recording]) -> Vec<&RecordedMessage> {
     let all: Vec<_> = recordings.iter().flat_map(|recording| recording.of("front/telegram")).collect();
     contiguous_topic_seqs(&all);
@@ -73,14 +73,15 @@ fn splits_a_recording_and_keeps_the_last_files() {
     assert_eq!(files[0], env.path("walk-0001.mcap"));
     let (removed, stay) = files.split_at(files.len() - 3);
     assert!(removed.iter().all(|file| !file.exists()), "{files:?}");
-    // On a busy machine, a delayed recorder writes everything that has arrived as one chunk.
+    // On a busy machine, a delayed recorder writes everything that has arrived as one chunk. One of the files may then
+    // exceed the limit of 128 KiB.
     let lengths: Vec<_> = stay.iter().map(|file| fs::metadata(file).unwrap().len()).collect();
     assert!(lengths.iter().all(|length| *length <= 160 << 10), "{lengths:?}");
     assert!(lengths.iter().filter(|length| **length <= 128 << 10).count() > 1, "{lengths:?}");
     let recordings: Vec<_> = stay.iter().map(|file| Recording::read_complete(file)).collect();
     let expected = |number: usize| (files.len() - 3 + number).to_string();
     for (number, recording) in recordings.iter().enumerate() {
-        // Each file begins with the status, so that it can be replayed alone.
+        // Each file begins with the status, so that a file can be replayed without the earlier ones.
         assert_eq!(recording.messages[0].topic, "front/status");
         assert_eq!(recording.metadata("scanhub")[0]["part"], expected(number + 1));
         assert_eq!(recording.metadata("scanhub.run").len(), 1);
@@ -111,7 +112,8 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
     });
     assert_eq!(removed, [0, 0, 1]);
     assert_eq!(names(), ["walk-0002.mcap", "walk-0003.mcap"]);
-    // A file that another recorder writes stays and does not count.
+    // A file to which another recorder writes is not removed, and does not count as one of the files that `--keep`
+    // keeps.
     let mut other = env.start(&["record", "--json", "--force", "-o", &env.path_argument("walk-0001.mcap")]);
     await_samples(&mut other, 10);
     fs::write(env.path("walk-0000.mcap"), "my notes").unwrap();
@@ -125,7 +127,7 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
     let all = ["walk-0000.mcap", "walk-0001.mcap", "walk-0003.mcap", "walk-0004.mcap"];
     assert_eq!(names(), all);
     files(&other.end(INT));
-    // Neither a run that records no samples nor a refused run removes files.
+    // A run that records no samples removes no files, and neither does a run that is refused.
     assert_eq!(hub.end(INT).exit_code, Some(0));
     assert_eq!(env.run(&[&words[..], &["-n", "50"]].concat()).exit_code, Some(3));
     assert_eq!(env.run(&["record", "--split=1h", "--keep=2", "-o", &file]).exit_code, Some(73));
@@ -136,7 +138,7 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
 fn file_at_its_size_limit_starts_the_next_file() {
     let env = TestEnv::new();
     let _others = sensor(&env);
-    // 128 blocks of 512 or 1024 bytes.
+    // The limit is 128 blocks, which have 512 or 1024 bytes, depending on the shell.
     let limited = ["sh", "-c", "ulimit -f 128; exec \"$@\"", "sh"];
     let mut recorder = start_in(&env, &limited, &["record", "--json", "-o", &env.path_argument("walk.mcap")]);
     recorder.await_line("the next file", is_kind("file"));
@@ -144,7 +146,7 @@ fn file_at_its_size_limit_starts_the_next_file() {
     let outcome = recorder.end(INT);
     let files = files(&outcome);
     assert_eq!(files[..2], [env.path("walk.mcap"), env.path("walk-0002.mcap")]);
-    // Only the last file has room for its index.
+    // Only the last file has an index. The other files have no room for theirs.
     let recordings: Vec<_> = files.iter().map(|file| Recording::read_interrupted(file)).collect();
     nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 50);
@@ -167,7 +169,7 @@ fn recorder_waits_for_a_missing_directory() {
     await_samples(&mut recorder, 20);
     let outcome = recorder.end(INT);
     assert_eq!(files(&outcome)[1], place.join("walk-0002.mcap"));
-    // The samples that were written before the recorder noticed are in the renamed directory.
+    // The samples that were written before the recorder noticed the loss are in the renamed directory.
     let places = [env.path("unplugged/walk.mcap"), place.join("walk-0002.mcap")];
     let recordings = [Recording::read_interrupted(&places[0]), Recording::read_complete(&places[1])];
     nothing_missed(&outcome);
@@ -190,7 +192,7 @@ fn recorder_waits_while_the_disk_is_full() {
     let mut recorder =
         start_in(&env, &["unshare", "-rm", "sh", "-c", &script, "sh"], &["record", "--json", "-o", &file]);
     recorder.await_line("a failed write", is_kind("write_failed"));
-    // Path of the file system in the recorder's mount namespace.
+    // Path of the small file system, which only the recorder's mount namespace contains.
     let path_in_namespace = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
     let full = Recording::read_interrupted(&path_in_namespace.join("walk.mcap"));
     assert!(!full.of("front/telegram").is_empty(), "no complete chunk in the file");
@@ -200,7 +202,7 @@ fn recorder_waits_while_the_disk_is_full() {
     wait_until("a continued recording", || {
         Recording::read_interrupted(&path_in_namespace.join("walk.mcap")).messages.len() > before
     });
-    // The file system ends with its namespace, so open the file before the recorder ends.
+    // The small file system ends together with the recorder's namespace, so open the file before the recorder ends.
     let mut open = fs::File::open(path_in_namespace.join("walk.mcap")).unwrap();
     let outcome = recorder.end(INT);
     assert_eq!(files(&outcome).len(), 1);
@@ -215,8 +217,8 @@ fn counts_samples_dropped_because_of_a_slow_output() {
     let env = TestEnv::new();
     let stream: Vec<u8> = (0..40_000_u32).flat_map(|seed| scan((seed % 8000) as u16)).collect();
     env.file("stream", stream);
-    // A pipe that no program reads acts as the slowest possible disk. The test opens it for reading, so that the shell
-    // can open it for writing at once.
+    // A pipe from which no program reads acts as the slowest possible disk. The test opens the pipe for reading,
+    // because otherwise the shell would wait when it opens the pipe for writing.
     let pipe = env.path("pipe");
     assert!(succeeds(Command::new("mkfifo").arg(&pipe)));
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
@@ -226,7 +228,8 @@ fn counts_samples_dropped_because_of_a_slow_output() {
     recorder.await_line("the first line", is_class("recording"));
     let mut reader = fs::File::open(&pipe).unwrap();
     drop(open);
-    // Replay in a loop, because a busy machine may lose most samples before the recorder can receive them.
+    // Replay in a loop, because a busy machine may lose most samples in the first pass, before the recorder can receive
+    // them.
     let stream = env.path_argument("stream");
     let words = ["replay", "--json", "--no-system-config", "--loop", "--rate=max", &stream];
     let _hub = env.start(&words).ready();
@@ -253,7 +256,7 @@ fn counts_samples_dropped_because_of_a_slow_output() {
 fn simultaneous_signals_count_as_one_stop_request() {
     let env = TestEnv::new();
     let _others = sensor(&env);
-    // The pipe is so small that the recorder waits for its reader, even when the recorder ends.
+    // The pipe is so small that the recorder has to wait for the pipe's reader, even while the recorder ends.
     let pipe = env.path("pipe");
     assert!(succeeds(Command::new("mkfifo").arg(&pipe)));
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
@@ -265,8 +268,8 @@ fn simultaneous_signals_count_as_one_stop_request() {
     drop(open);
     wait_until("a subscriber to status", || env.subscribers("front/status") > 0);
     recorder.await_lines(2, "progress", is_class("recording"));
-    // The recorder cannot handle the first signal before the last one was sent. The crate `verbs` tests without a clock
-    // how far apart signals of one request may be.
+    // Stop the recorder, so that it cannot handle the first signal before the last one was sent. A test of the crate
+    // `verbs` checks, without a clock, how much time may pass between the signals of one request.
     recorder.signal(Signal::STOP);
     wait_until("a stopped process", || recorder.is_stopped());
     [INT, TERM, HUP, Signal::QUIT].into_iter().for_each(|signal| recorder.signal(signal));
@@ -313,7 +316,7 @@ fn recorder_fails_if_its_reader_closes_the_pipe() {
         spawn(command.stdin(Stdio::null()).stdout(writer).stderr(Stdio::piped())).unwrap()
     };
     refused(begin(&[], writer).wait_with_output().unwrap());
-    // A connection that breaks during the recording looks the same.
+    // If the reader closes the pipe during the recording, the recorder reports the same error.
     let _others = sensor(&env);
     let (mut reader, writer) = io::pipe().unwrap();
     let recorder = begin(&["--for=60s"], writer);
@@ -343,7 +346,7 @@ fn samples_of_a_removed_file_are_not_counted() {
     let repeated = 1;
     assert_eq!(number(&end, "samples") + repeated, next.messages.len() as u64, "{outcome}");
     assert_eq!(number(&end, "bytes"), fs::metadata(env.path("walk-0002.mcap")).unwrap().len());
-    // A file that is removed at the very end counts too.
+    // If a file is removed just before the recorder ends, the samples in it count as removed, too.
     let mut recorder = env.start(&["record", "--json", "--force", "-o", &file]);
     await_samples(&mut recorder, 20);
     fs::remove_file(&file).unwrap();
@@ -368,7 +371,7 @@ fn second_recorder_of_a_file_is_refused() {
     telegrams(&[Recording::read_complete(Path::new(&file))]);
 }
 
-/// Starts the program with the command `before` in front of it.
+/// Starts the program with the words of `before` in front of its command line.
 fn start_in(env: &TestEnv, before: &[&str], arguments: &[&str]) -> Program {
     let program = env.command(arguments);
     let mut command = Command::new(before[0]);

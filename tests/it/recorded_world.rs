@@ -1,5 +1,5 @@
-//! Recordings of simulated sensors with the stamps of a hub, computed without a wait and independent of the load of the
-//! machine.
+//! Recordings of simulated sensors with the stamps that a hub would give them. They are computed without waiting, and
+//! do not depend on the load of the machine.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -14,17 +14,18 @@ use scanhub_sim::world::World;
 
 use crate::testkit::TestEnv;
 
-/// Start of the world on the wall clock, in ns.
+/// Wall-clock time at which the simulated world starts, in nanoseconds since 1970.
 pub(crate) const START_NS: u64 = 1_700_000_000_000_000_000;
 const TELEGRAM_NS: u64 = 14_640_000;
-/// Time from one sensor's telegram to the next sensor's telegram.
+/// Time from a telegram of one sensor to the telegram of the next sensor, in nanoseconds.
 const SENSOR_OFFSET_NS: u64 = 9_000_000;
 /// Status byte of a scanner without a fault.
 const STATUS_OK: u8 = 0x10;
 
-/// Writes a recording with the telegrams of `sensors` and returns its path. It lasts `seconds`. The first sensor is on
-/// port 0 of `world`, the second one on port 1, and so on. Scans have 361 beams in millimeters, at 500,000 baud. If the
-/// first sensor has a mount, the recording also has the mount's angles as `mount/tilt`.
+/// Writes a recording with the telegrams of `sensors` and returns its path. The recording covers `seconds` seconds. The
+/// first sensor is the one that `world` has for port 0, the second one that for port 1, and so on. Scans have 361 beams
+/// in millimeters, at 500,000 baud. If the first sensor has a mount, the recording also has the mount's angles as
+/// `mount/tilt`.
 pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], seconds: u64) -> String {
     let file = env.path_argument("world.mcap");
     let rooms: Vec<Room> = (0..sensors.len() as u64).map(|port| Room::of_port(world, 5, port)).collect();
@@ -65,8 +66,8 @@ pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], sec
         }
         let now_ns = 1_000_000_000 + seq * period;
         while let Some(report) = reports.next_if(|report| report.arrival_ns <= now_ns) {
-            // The stamp of a telegram is earlier than the end of its scan by this time, so shift the stamps of angles
-            // as well.
+            // In this recording, the stamp of a telegram is earlier than the end of its scan by TELEGRAM_NS. Shift the
+            // stamps of the angles by the same time.
             let stamp_ns = report.stamp_ns - TELEGRAM_NS;
             let header = Header {
                 seq: angles,

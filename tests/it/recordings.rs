@@ -1,5 +1,5 @@
-//! Tests of a hub whose port is a recording: it publishes every telegram once and in order, whatever bytes lie between
-//! them, and the link is silent at the end.
+//! Tests of a hub whose port is a recording: the hub publishes every telegram once and in order, whatever bytes are
+//! between the telegrams. At the end of the recording, the link is silent.
 
 use std::path::PathBuf;
 
@@ -9,8 +9,9 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use serde_json::Value;
 
-/// Publishes `file`, with `option` appended to its name, to a subscriber of `topics`. The subscriber starts earlier and
-/// therefore receives the very first sample. Returns its outcome and the link's final `info`.
+/// Starts a hub that plays `file` (with `option` appended to its name), and a subscriber of `topics`. The subscriber
+/// starts before the hub, and therefore receives the very first sample. Returns the outcome of the subscriber, and the
+/// line that `info` prints for the link at the end.
 fn play(env: &TestEnv, file: &str, option: &str, topics: &[&str]) -> (Outcome, Value) {
     let before = env.hub(&["--link=a=/no/such/port"]);
     let mut subscriber = env.echo(topics);
@@ -24,7 +25,8 @@ fn play(env: &TestEnv, file: &str, option: &str, topics: &[&str]) -> (Outcome, V
     (outcome, info)
 }
 
-/// Waits until the recording ends, and returns the link's `info`. Asserts that every byte of it is counted.
+/// Waits until the recording has ended, and returns the line that `info` prints for the link. Asserts that every byte
+/// of the recording is counted.
 fn await_end(env: &TestEnv) -> Value {
     let info = env.await_info("a", |info| info["state"] == "silent");
     assert_eq!(info["last_error"], "the recording is at its end");
@@ -35,7 +37,8 @@ fn await_end(env: &TestEnv) -> Value {
     info
 }
 
-/// Returns a stream with replies, scans, noise between them and one damaged scan, and the telegrams to be found in it.
+/// Returns a stream, and the intact telegrams in it. The stream has replies, scans, noise between the telegrams, and
+/// one damaged scan.
 fn stream(scans: u16) -> (Vec<u8>, Vec<Vec<u8>>) {
     let configuration = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
     let mode = lms::reply::mode_reply(0, true, 0x10).bytes().to_vec();
@@ -46,7 +49,7 @@ fn stream(scans: u16) -> (Vec<u8>, Vec<Vec<u8>>) {
         [configuration, mode].into_iter().chain((0..scans).map(testkit::scan)).enumerate()
     {
         if number == 4 {
-            // Some of its bytes are missing.
+            // Damage this telegram: ten of its bytes are missing.
             bytes.extend([&telegram[..300], &telegram[310..]].concat());
             continue;
         }
@@ -89,7 +92,7 @@ fn marks_of_a_recording_need_the_configured_mode() {
 #[test]
 fn ambiguous_values_make_no_scans_until_mode_is_set() {
     let env = TestEnv::new();
-    // 8.6 m in 14 bits; in 13 bits it would be 0.4 m.
+    // In 14 bits, this value is 8.6 m. In 13 bits, it would be 0.4 m.
     let scan = lms::measured::encode(0, Unit::Mm, &[8600; 181], 0x10);
     let file = env.file("recording", scan.bytes().repeat(100));
     let message = "the recording does not contain its measuring mode: no scans; set link.a.mode";
@@ -107,7 +110,7 @@ fn ambiguous_values_make_no_scans_until_mode_is_set() {
     let ranges: Vec<_> = outcome.of_class("scan").iter().map(|scan| scan["ranges"][7].clone()).collect();
     assert_eq!(ranges, [8600], "{outcome}");
     assert_eq!(hub.end(INT).exit_code, Some(0));
-    // If no value has a higher bit, the values are not ambiguous.
+    // If no value in the recording has more than 13 bits, the values are not ambiguous.
     let plain = env.file("plain", testkit::scan(1).repeat(2));
     let (hub, words) = (env.hub(&[&format!("--link=a=file:{plain}")]), "no value has more than 13 bits");
     assert_eq!(await_end(&env)["counters"]["telegrams"], 2);
@@ -121,7 +124,8 @@ fn subscriber_at_start_gets_the_whole_recording() {
     let (bytes, whole) = stream(14);
     let file = env.file("recording", &bytes);
     let hub = env.hub(&[&format!("--link=a=file:{file}?rate=max")]);
-    // The subscriber attaches to its topic well within the second that the hub waits.
+    // The hub waits for a second before it plays the recording. This is long enough for the subscriber to attach to its
+    // topic.
     let outcome = env.run(&["echo", "--json", "a/telegram", "-n", &whole.len().to_string(), "--timeout=30s"]);
     check(&outcome, &whole);
     assert_eq!(hub.end(INT).exit_code, Some(0));
@@ -154,7 +158,7 @@ fn reflectors_of_a_recording_are_marks() {
 #[test]
 fn plays_a_recording_at_maximum_rate() {
     let env = TestEnv::new();
-    // Use no more samples than a subscriber's buffer holds, because the hub does not wait for subscribers.
+    // Use no more scans than fit into a subscriber's buffer, because the hub does not wait for subscribers.
     let (bytes, whole) = stream(14);
     let file = env.file("recording", &bytes);
     let (outcome, info) = play(&env, &file, "?rate=max", &["a/telegram", "a/status"]);
@@ -173,7 +177,7 @@ fn plays_a_recording_at_the_scanners_rate() {
     check(&outcome, &whole);
     let scans = outcome.of_class("scan");
     assert_eq!((scans.len(), contiguous_numbers(&scans, "topic_seq")[0]), (whole.len() - 2, 0));
-    // Mode 1, as the reply at the start states: 13 bits of range.
+    // The reply at the start of the recording states mode 1, in which a value has 13 bits of range.
     for (scan, telegram) in scans.iter().zip(&whole[2..]) {
         let first = u16::from_le_bytes([telegram[7], telegram[8]]);
         assert_eq!(
@@ -181,7 +185,8 @@ fn plays_a_recording_at_the_scanners_rate() {
             (Some(u64::from(first & 0x1FFF)), &1000.into())
         );
     }
-    // The stream lasts at least 59 periods of 26.64 ms. A busy machine takes longer.
+    // The hub plays the stream in real time, which takes at least 59 periods of 26.64 ms. On a busy machine, it takes
+    // longer.
     let stamps: Vec<_> = scans.iter().map(|scan| number(scan, "stamp_ns")).collect();
     let span_ms = (stamps[stamps.len() - 1] - stamps[0]) / 1_000_000;
     assert!(span_ms > 1_200, "{span_ms} ms");
@@ -210,8 +215,8 @@ fn plays_a_carmen_log() {
     }
 }
 
-/// Returns the directory with recordings of real sensors, which are not part of the project: `SCANHUB_DATA`, or a
-/// default next to the project. Skips if it does not exist.
+/// Returns the directory with recordings of real sensors, which are not part of the project: the directory in the
+/// variable `SCANHUB_DATA`, or a default directory next to the project. Skips the test if the directory does not exist.
 fn data() -> Option<PathBuf> {
     let default_folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
     let place = std::env::var_os("SCANHUB_DATA").map_or(default_folder, PathBuf::from);
@@ -244,7 +249,7 @@ fn hub_plays_recordings_of_real_scanners() {
         let counters = counters_of(&data, name);
         assert_eq!(counters["telegrams"].as_u64(), telegrams, "{name}: {counters}");
     }
-    // Bytes received at a wrong baud rate: no telegram is accepted.
+    // These bytes were received at a wrong baud rate, so the hub must not accept any telegram.
     let counters = counters_of(&data, "captures/host19200_while_sensor_38400.bin");
     assert_eq!((&counters["telegrams"], &counters["bytes_discarded"]), (&0.into(), &7745.into()));
 }

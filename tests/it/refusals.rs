@@ -1,6 +1,6 @@
-//! Tests of refusals: each kind of failure has an exit code and a message with the place, the value and the remedy.
-//! With `--json`, the error is an object. It goes to stdout, or to stderr for verbs whose stdout only has the line
-//! `ready`.
+//! Tests of refusals: each kind of failure has an exit code, and a message that names the location, the value and the
+//! remedy. With `--json`, the error is a JSON object. Programs print it to stdout, except those whose stdout has only
+//! the line `ready`, which print it to stderr.
 
 use std::process::{Command, Stdio};
 
@@ -8,8 +8,8 @@ use crate::testkit;
 use crate::testkit::{Child, Outcome, TERM, TestEnv, run_concurrently, spawn};
 use serde_json::Value;
 
-/// Asserts that the program exits with `code` and an error of `kind` whose message contains all of `words`, as text and
-/// as JSON.
+/// Asserts that the program exits with `code` and prints an error of `kind`. Its message must contain all of `words`,
+/// both as text and as JSON.
 fn assert_refused(env: &TestEnv, arguments: &[&str], code: i32, kind: &str, words: &[&str]) {
     let outcome = env.run(arguments);
     assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(code), true), "{outcome}");
@@ -18,7 +18,7 @@ fn assert_refused(env: &TestEnv, arguments: &[&str], code: i32, kind: &str, word
     let outcome = env.run(&[arguments, &["--json"]].concat());
     assert_eq!(outcome.exit_code, Some(code), "{outcome}");
     let text = match arguments.first() {
-        // The log goes to stderr as well. The error is its last line.
+        // These verbs also write their log to stderr, so the error is the last line.
         Some(&("run" | "replay" | "simulate")) if kind != "usage" => {
             assert!(outcome.stdout.is_empty(), "{outcome}");
             outcome.stderr.lines().last().unwrap_or_default().to_owned()
@@ -149,7 +149,7 @@ fn every_verb_rejects_unknown_topic_and_sensor_names() {
         (&["echo", "*"], &["topics are"]),
         (&["record", "*/scam"], &["*/scam", "*/scan"]),
         (&["gateway", "--topic=*/scam"], &["*/scam", "*/scan"]),
-        // Forms of topics that these verbs do not accept.
+        // Topics whose form these verbs do not accept.
         (&["echo", "*/scan", "--csv"], &["--csv"]),
         (&["echo", "front/*", "--raw"], &["--raw"]),
         (&["latency", "*/scan"], &["*"]),
@@ -168,7 +168,7 @@ fn every_verb_rejects_unknown_topic_and_sensor_names() {
         assert_eq!((outcome.exit_code, outcome.stdout.is_empty()), (Some(2), true), "{outcome}");
         check_contains_all(&outcome.stderr, words, &outcome);
         let outcome = env.run(&[arguments, &["--json"]].concat());
-        // If the error is an unknown flag, the command line parser reports it.
+        // The parser of the command line reports unknown flags, also as an error of kind `usage`.
         let kind = outcome.of_class("error").pop().map(|line| line["kind"].clone());
         assert_eq!((outcome.exit_code, kind), (Some(2), Some("usage".into())), "{outcome}");
     }
@@ -209,7 +209,7 @@ fn unreadable_input_exits_with_66() {
         let named = if is_there { "/etc/passwd" } else { &missing };
         assert_refused(&env, arguments, 66, "input", &[named]);
     }
-    // A wrong value in a readable file.
+    // A file that can be read, but has a wrong value.
     let wrong = env.file("wrong.toml", "[background]\nmethod = \"magic\"\n");
     assert_refused(
         &env,
@@ -350,7 +350,7 @@ fn reports_that_no_hub_is_running() {
 #[test]
 fn reports_unknown_sensors_and_timeouts() {
     let env = TestEnv::new();
-    // A missing port is a state of the link, not a failure.
+    // If a port is missing, the link is `absent`, but the hub does not fail.
     let hub = env.hub(&[env.link("front")]);
     let info = env.await_info("front", |info| info["state"] == "absent");
     assert!(info["last_error"].as_str().is_some_and(|error| error.contains("no such port")), "{info}");
@@ -408,7 +408,7 @@ fn second_hub_in_a_domain_is_refused() {
     let pid = format!("pid {}", hub.pid());
     assert_refused(&env, &["run", &env.link("front")], 1, "domain_held", &[&pid, "--domain"]);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
-    // The domain is free again.
+    // After the hub has exited, another hub can use the domain.
     let hub = env.hub(&[env.link("front")]);
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }

@@ -1,6 +1,7 @@
 //! Tests of a configuration that changes while the hub runs. Zones, marks, background and pose change with the next
-//! scan and without a gap in the stream. Lines change at the next start. An invalid configuration changes nothing.
-//! SIGHUP from a closed terminal still ends a hub.
+//! scan and without a gap in the stream. The keys for topic `lines` take effect only when a hub starts. An invalid
+//! configuration changes nothing. A hub in a terminal still exits on the SIGHUP that it receives when the terminal is
+//! closed.
 
 use std::process::Command;
 
@@ -11,18 +12,18 @@ use crate::testkit::{
 use serde_json::Value;
 
 const STREAM_FLAGS: [&str; 2] = ["--seed=71", "--baud=500000"];
-/// Minimum time from the stamp of the last scan to the stamp of the unknown zones that the hub sends in a silence, in
-/// ns. A verdict is valid for two periods of 26.6 ms and 20 ms.
+/// Minimum time from the last scan to the sample with the verdict `unknown` that the hub publishes in a silence, by
+/// their stamps, in nanoseconds. A verdict is valid for two periods of 26.6 ms plus 20 ms, so at least 73.2 ms.
 const MIN_SILENCE_NS: u64 = 70_000_000;
 
-/// Writes the configuration of one link with `settings` after it, and returns the flag for the file.
+/// Writes a configuration file with one link, followed by `settings`, and returns the flag that names the file.
 fn configure(env: &TestEnv, settings: &str) -> String {
     let port = env.path_argument("front");
     let text = format!("[[link]]\nname = \"front\"\nport = \"{port}\"\n{settings}");
     format!("--config={}", env.file("scanhub.toml", text))
 }
 
-/// Returns the radii of a line of class `zones` in mm.
+/// Returns the radii in a line of class `zones`, in millimeters.
 fn radii(line: &Value) -> Vec<u64> {
     line["zones"].as_array().into_iter().flatten().map(|zone| number(zone, "radius_mm")).collect()
 }
@@ -64,16 +65,16 @@ fn reload_changes_circles_without_a_stream_gap() {
     let (telegrams, zones) = (telegrams.end(INT), zones.end(INT));
     for (outcome, class) in [(&telegrams, "telegram"), (&zones, "zones")] {
         let mut lines = outcome.of_class(class);
-        // A silence that the client detected has no `topic_seq`.
+        // A line about a silence that the client itself has detected has no `topic_seq`.
         lines.retain(|line| line["topic_seq"].is_u64());
         contiguous_numbers(&lines, "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["missed"], 0, "{class}");
     }
-    // A line that the client received too late is stale and has no zones.
+    // If the client received a sample too late, the printed line is stale and has no zones.
     let mut verdicts = zones.of_class("zones");
     verdicts.retain(|line| line["topic_seq"].is_u64() && line["stale"] != true);
-    // On a busy machine, scans may be missing for so long that the hub sends unknown zones, already with the new radii.
-    // The reload does not cause them. All other samples belong to a scan.
+    // On a busy machine, scans may be missing for so long that the hub publishes the verdict `unknown`, already with
+    // the new radii. The reload does not cause such samples, so leave them out. All other samples belong to a scan.
     let mut last_ns = 0;
     verdicts.retain(|line| {
         let stamp_ns = number(line, "stamp_ns");
@@ -81,7 +82,7 @@ fn reload_changes_circles_without_a_stream_gap() {
         last_ns = if is_silence { last_ns } else { stamp_ns };
         !is_silence
     });
-    // The first verdict with new radii is not unknown.
+    // The first verdict with new radii must not be `unknown`.
     let firsts: Vec<_> = verdicts.windows(2).filter(|pair| radii(&pair[0]) != radii(&pair[1])).collect();
     assert_eq!(firsts.len(), 4, "{firsts:?}");
     assert!(firsts.iter().all(|pair| pair[1]["verdict"] != "unknown"), "{firsts:?}");
@@ -91,7 +92,7 @@ fn reload_changes_circles_without_a_stream_gap() {
     assert!(ended.stderr.contains("front: zones, marks, background changed as configured"), "{ended}");
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
     assert_eq!(env.simulator_totals("front").1, 0, "EEPROM writes");
-    // The subscriber received every scan between its first and its last one.
+    // The subscriber has received every scan between the first and the last scan that it received.
     let received = telegrams.of_class("telegram");
     let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED_VALUES).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
@@ -107,7 +108,7 @@ fn reload_reports_refused_and_restart_only_changes() {
     let env = TestEnv::new();
     let mut supervisor = env.supervisor();
     let flags = [configure(&env, ""), "--no-system-config".to_owned()];
-    // The port does not exist. The topics still report the configuration.
+    // The port does not exist, but the hub still publishes the samples that depend on the configuration.
     let hub = env.service(&mut supervisor, &flags, None).ready();
     supervisor.wait_for_message("READY=1");
     let mut zones = env.echo(&["front/zones"]);
@@ -149,7 +150,7 @@ fn hub_ends_with_its_terminal_except_under_nohup() {
         let env = TestEnv::new();
         let (keys, screen) = terminal();
         let hub = env.command(&["run", "--json", "--no-system-config", &configure(&env, "")]);
-        // `setsid` makes the hub the leader of a session that has this terminal.
+        // `setsid` makes the hub the leader of a session whose controlling terminal is `screen`.
         let mut command = Command::new("setsid");
         command.arg("--ctty").args(nohup).arg(hub.get_program()).args(hub.get_args());
         command.envs(hub.get_envs().filter_map(|(key, value)| Some((key, value?))));
@@ -157,7 +158,7 @@ fn hub_ends_with_its_terminal_except_under_nohup() {
         let hub = hub.ready();
         drop(keys);
         if survives {
-            // Under `nohup`, the hub reads its configuration on SIGHUP.
+            // Under `nohup`, the hub does not exit on SIGHUP, but reloads its configuration.
             configure(&env, "pose = { x = 0.5 }\n");
             hub.signal(HUP);
             env.await_info("front", |info| info["pose"]["x_m"] == 0.5);

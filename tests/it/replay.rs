@@ -1,4 +1,5 @@
-//! Tests of `scanhub replay`, a hub whose ports are a recording: its options, its keys and its end.
+//! Tests of `scanhub replay`, which is a hub whose ports are a recording: its options, its keys on the keyboard, and
+//! its end.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +26,7 @@ fn start(env: &TestEnv, words: &[&str]) -> Program {
     env.start(&[&["replay", "--json", "--no-system-config"], words].concat()).ready()
 }
 
-/// Returns the wall clocks of the scans, in ms from the start of the log.
+/// Returns the wall-clock times of the scans, in milliseconds since the start of the log.
 fn wall_times_ms(outcome: &Outcome) -> Vec<u64> {
     outcome.of_class("scan").iter().map(|scan| number(scan, "wall_ns") / 1_000_000 - 1_000_000).collect()
 }
@@ -115,7 +116,7 @@ fn motion_is_the_same_at_all_rates() {
     assert!(recorded.values().skip(1).all(|values| values[0] != "first" && values[0] != "refused"));
     for rate in ["--rate=0.5", "--rate=4", "--rate=max"] {
         let found = motion(rate);
-        // With `max`, a subscriber may miss samples.
+        // At the rate `max`, a subscriber may miss samples.
         assert!(found.len() as u64 > SCAN_COUNT / 2, "{rate}: {}", found.len());
         for (seq, values) in found {
             assert_eq!(Some(&values), recorded.get(&seq), "{rate}, scan {seq}");
@@ -144,12 +145,13 @@ fn hold_keeps_the_hub_running_and_pause_stops_it() {
     let player = start(&env, &[&log(&env, 100, 100), "--rate=max", "--hold"]);
     let info = env.await_info("front", |info| info["state"] == "silent");
     assert_eq!((number(&info["counters"], "telegrams"), &info["angle_deg"]), (100, &180.into()));
-    // Without `--hold`, the replay would have ended after a second.
+    // The replay holds at the end of the recording. Without `--hold`, it would have exited after a second.
     assert_eq!(number(&replay_summary(&player.end(TERM)), "telegrams"), 100);
 }
 
-/// Writes a recording of two runs of a hub. Each run has ten telegrams. The sixth telegram reports how the values are
-/// encoded. `format_versions` has a `seq` for each run: the hub published marks from this telegram on.
+/// Writes a recording of two runs of a hub. Each run has ten telegrams, and the sixth telegram reports how the values
+/// are encoded. `format_versions` has a `seq` for each run. From this telegram on, the recorded hub knew the encoding
+/// and published marks.
 fn recording_of_two_runs(env: &TestEnv, format_versions: [u64; 2]) -> String {
     let file = std::fs::File::create(env.path("lives.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("a new recording");
@@ -183,7 +185,8 @@ fn recording_of_two_runs(env: &TestEnv, format_versions: [u64; 2]) -> String {
     env.path("lives.mcap").display().to_string()
 }
 
-/// Writes a recording of 20 s from a line that loses six of ten scans and is silent for two seconds in the middle.
+/// Writes a recording of 20 s. Six of ten scans are missing, as on a bad line, and there is a pause of two seconds in
+/// the middle.
 fn recording_with_gaps(env: &TestEnv) -> String {
     let file = std::fs::File::create(env.path("lossy.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("a new recording");
@@ -220,19 +223,21 @@ fn missing_scans_are_not_reported_as_silence() {
         assert_eq!(listed.exit_code, Some(0), "{listed}");
         let rate =
             listed.lines().into_iter().find(|line| line["topic"] == "scan").map(|line| line["hz"].clone());
-        // 15 of 37.5 scans per second were recorded, and the replay is twice as fast.
+        // The recording has 15 of the 37.5 scans per second. The replay is twice as fast, so `list` reports about 30.
         rate.and_then(|rate| rate.as_f64()).is_some_and(|hz| (15.0..60.0).contains(&hz))
     });
     env.await_info("front", |info| info["last_error"] == "the recording is at its end");
     let outcome = player.end(INT);
     let count_in_log = |word: &str| outcome.stderr.lines().filter(|line| line.contains(word)).count();
-    // Once for the pause and once for the end.
+    // Each of the two messages is logged twice: `silent` for the pause and for the end, `streaming` before each of
+    // them.
     assert_eq!((count_in_log("front: silent"), count_in_log("front: streaming")), (2, 2), "{outcome}");
 }
 
 #[test]
 fn replay_has_no_scans_while_the_mode_is_unknown() {
-    // In each case, one of the two runs had the encoding at its start, from an earlier run.
+    // In each case, the recorded hub knew the encoding in one of the two runs from the start, because an earlier run
+    // had saved it.
     for understood in [[0, 6], [6, 0]] {
         let env = TestEnv::new();
         let player = start(&env, &[&recording_of_two_runs(&env, understood), "--paused"]);

@@ -1,12 +1,13 @@
-//! Tests of recordings that start while an RPLIDAR already streams, so that they do not have the replies that identify
-//! it. The recorded status supplies the mode and the beams with which the packets are decoded.
+//! Tests of recordings that start while an RPLIDAR already streams, so that they lack the replies that identify the
+//! scanner. The replay decodes the packets with the mode and the number of beams in the recorded status.
 
 use scanhub_schema::Header;
 
 use crate::replay_packets::{recorder, replay, samples, scan};
 use crate::testkit::{INT, TERM, TestEnv, is_class};
 
-/// Records an RPLIDAR that streams with these settings, until a subscriber has received this number of `scans`.
+/// Starts a recorder while an RPLIDAR streams with these settings. The recorder runs until a subscriber has received
+/// `scans` scans.
 fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     let words = ["--family=rplidar", &format!("--model={model}"), "--world=room", "--seed=5"];
     let faults = "--fault=loss=0.01,burst=40";
@@ -22,10 +23,10 @@ fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
-/// Asserts that the recorded scans are replayed in the same order and with the same flags. Scans are matched by their
-/// ranges, because sequence numbers differ. On a busy machine, stamps of packets are inexact. The replay may then judge
-/// gaps differently and lack some scans (in virtual time, it lacks none). With a wrong mode or number of beams, no scan
-/// would match.
+/// Asserts that the recorded scans are replayed in the same order and with the same flags. Finds a replayed scan by its
+/// ranges, because sequence numbers differ. With a wrong mode or number of beams, no scan would match. Some scans need
+/// not match: on a busy machine, stamps of packets are inexact, so the replay may detect gaps elsewhere and lack some
+/// scans. (In virtual time, it lacks none.)
 fn check(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
     let (mut rest, mut compared) = (replayed, 0);
     for (header, payload) in recorded {
@@ -42,7 +43,7 @@ fn check(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
 
 #[test]
 fn recorded_status_supplies_mode_and_beams() {
-    // Express packets and dense packets begin alike.
+    // Packets of the modes express and dense begin with the same bytes, so packets alone do not show the mode.
     for (model, settings, beams) in [
         ("a1", ["model=a1", "mode=express", "beams=400"], 400),
         ("s1", ["model=auto", "mode=denseboost", "beams=700"], 700),
@@ -58,7 +59,7 @@ fn recorded_status_supplies_mode_and_beams() {
 
 #[test]
 fn ambiguous_packets_need_a_configured_model_or_mode() {
-    // Packets of types 82h and 85h look alike.
+    // Packets of the types 82h and 85h cannot be distinguished.
     for (model, mode) in [("a1", "express"), ("s1", "denseboost")] {
         let env = TestEnv::new();
         let mode = format!("mode={mode}");
@@ -66,7 +67,7 @@ fn ambiguous_packets_need_a_configured_model_or_mode() {
         let simulator = env.simulator(&["front"], &words);
         let set = ["family=rplidar", &mode].map(|set| format!("--set=link.front.{set}"));
         let hub = env.hub(&[vec![env.link("front")], set.to_vec()].concat());
-        // From here on, the hub sends no requests to the scanner.
+        // While the scanner streams, the hub sends no requests, so the recording has no replies.
         env.await_info("front", |info| info["state"] == "streaming");
         let recorder = recorder(&env, "telegrams.mcap", &["front/telegram"]);
         let mut echo = env.echo(&["front/scan"]);
@@ -82,7 +83,7 @@ fn ambiguous_packets_need_a_configured_model_or_mode() {
             let messages = ["does not say which kind of packets it has", "link.NAME.model or mode is set"];
             assert!(messages.iter().all(|words| outcome.stderr.contains(words)), "{model}: {outcome}");
         }
-        // The remedy in the error message works.
+        // The remedy that the error message suggests works.
         replay(&env, "telegrams.mcap", &["--rate=max", &format!("--set=link.front.{mode}")]);
         assert!(samples(&env.path("replayed.mcap"), "front/scan").len() > 5, "{model}");
     }

@@ -1,5 +1,5 @@
-//! Tests of recordings of rotating scanners: their packets are replayed like telegrams of an LMS, and the replay
-//! publishes the same scans as the recorded hub.
+//! Tests of recordings of rotating scanners: the packets of these scanners are replayed like telegrams of an LMS, and
+//! the replay publishes the same scans as the hub that was recorded.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -20,8 +20,8 @@ pub(crate) fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
     recorder
 }
 
-/// Records two files, `all.mcap` and `telegrams.mcap`, until a subscriber has received this number of `scans`. The
-/// scanner is a `model` on a line with faults.
+/// Records two files, `all.mcap` and `telegrams.mcap`, until a subscriber has received `scans` scans. The scanner has
+/// the model `model`, and its line has faults.
 fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     let set = ["family=ld"].iter().chain(settings).map(|set| format!("--set=link.front.{set}"));
     let hub = env.hub(&[vec![env.link("front")], set.collect()].concat());
@@ -39,7 +39,7 @@ fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     assert_eq!(simulator.end(TERM).exit_code, Some(0));
 }
 
-/// Replays `name` with the flags `words`, and records the result in `replayed.mcap`. Returns the player's last line.
+/// Replays `name` with the flags `words`, and records the result in `replayed.mcap`. Returns the last line of `replay`.
 pub(crate) fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
     let file = env.path_argument(name);
     let words = [&["replay", "--json", "--no-system-config", "--paused", &file], words].concat();
@@ -52,7 +52,7 @@ pub(crate) fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
     outcome.of_class("replayed").pop().expect("a summary")
 }
 
-/// Returns the headers and payloads of a topic in a file.
+/// Returns the headers and payloads of all samples of `topic` in a file.
 pub(crate) fn samples(file: &Path, topic: &str) -> Vec<(Header, Vec<u8>)> {
     let recording = Recording::read_complete(file);
     let parts = |data: &[u8]| file::split_message(data).map(|(header, payload)| (header, payload.to_vec()));
@@ -65,8 +65,8 @@ pub(crate) fn scan(payload: &[u8]) -> Box<Scan> {
     scan
 }
 
-/// Asserts that recorded scans are replayed unchanged. Stamps are not compared, because they depend on when the hub got
-/// a processor. `tests/world` checks stamps of a live stream in virtual time (invariant `turns`).
+/// Asserts that recorded scans are replayed unchanged. Does not compare stamps, because they depend on when the hub was
+/// scheduled. `tests/world` checks the stamps of a live stream in virtual time (invariant `turns`).
 fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
     let by_seq: BTreeMap<u64, _> =
         replayed.iter().map(|(header, payload)| (header.seq, (header, payload))).collect();
@@ -90,7 +90,7 @@ fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
         incomplete += u32::from(then.is_incomplete());
         suspect += u32::from(header.reasons != 0);
     }
-    // On a busy machine, the recorder may miss a scan of the replay. The sequence numbers show that.
+    // On a busy machine, the recorder may miss scans of the replay. The `topic_seq` of the others shows how many.
     let gap = |pair: &[(Header, Vec<u8>)]| pair[1].0.topic_seq - pair[0].0.topic_seq - 1;
     let missed: u64 = replayed.windows(2).map(gap).sum();
     assert!(absent.len() as u64 <= missed, "no scans of {absent:?}, {missed} missed");
@@ -111,7 +111,7 @@ fn replayed_scans_equal_recorded_scans() {
         let file = env.path("replayed.mcap");
         let replayed = samples(&file, "front/telegram");
         let expected = samples(&env.path(name), "front/telegram");
-        // On a busy machine, the recorder of the replay may miss some scans.
+        // On a busy machine, the recorder of the replay may miss some telegrams.
         assert!(replayed.len() > expected.len() / 2, "{name}: {} of {}", replayed.len(), expected.len());
         for (header, bytes) in &replayed {
             let (recorded, recorded_bytes) = &expected[header.topic_seq as usize];
@@ -132,7 +132,7 @@ fn replayed_scans_equal_recorded_scans() {
     };
     let known = info(&[]);
     assert_eq!((&known["type"], number(&known, "angle_deg")), (&"LD19".into(), 360), "{known}");
-    // A configured value has priority over a recorded one.
+    // A configured value takes precedence over a recorded value.
     let fewer = info(&["--set=link.front.beams=300"]);
     assert_eq!(fewer["step_deg"], 1.2, "{fewer}");
 }
@@ -144,7 +144,7 @@ fn replay_uses_the_recorded_number_of_beams() {
     let recorded = samples(&env.path("all.mcap"), "front/scan");
     replay(&env, "all.mcap", &[]);
     check_scans(&recorded, &samples(&env.path("replayed.mcap"), "front/scan"));
-    // A recording with only telegrams does not have the number of beams, so the replay uses the model's number.
+    // A recording that has only telegrams lacks the number of beams, so the replay uses the default of the model.
     replay(&env, "telegrams.mcap", &["--rate=max"]);
     let replayed = samples(&env.path("replayed.mcap"), "front/scan");
     assert!(!replayed.is_empty() && replayed.iter().all(|(_, payload)| scan(payload).beams() == 2_160));
@@ -170,7 +170,8 @@ fn replays_a_part_and_in_a_loop() {
         !found.is_empty() && found.is_sorted_by(|a, b| a < b),
         "other scans, or another order: {positions:?}"
     );
-    // On a busy machine, the recorder may have missed scans. The replay computes these scans from the telegrams.
+    // On a busy machine, the recorder may have missed scans. The replay nevertheless publishes them, because it
+    // computes them from the telegrams.
     let is_complete = recorded.windows(2).all(|pair| pair[1].0.topic_seq == pair[0].0.topic_seq + 1);
     assert!(!is_complete || found.len() == inner.len(), "other scans: {positions:?}");
     assert!(replayed.windows(2).all(|pair| pair[0].0.stamp_first_ns < pair[1].0.stamp_first_ns));
@@ -198,7 +199,8 @@ fn stream_file_is_played_by_the_scanners_clock() {
     let scans = echo.await_lines(20, "a scan", is_class("scan"));
     assert_eq!((echo.end(INT).exit_code, player.end(INT).exit_code), (Some(0), Some(0)));
     let stamps = |of: &Value| number(of, "stamp_ns") as i64;
-    // The revolution in which the replay starts depends on earlier bytes, so match scans by their ranges.
+    // The first revolution of the replay depends on the bytes before it, so scans are not matched by number, but by
+    // their ranges.
     let ranges: Vec<Vec<Option<u64>>> = scans
         .iter()
         .map(|line| line["ranges"].as_array().expect("ranges").iter().map(Value::as_u64).collect())
@@ -215,7 +217,8 @@ fn stream_file_is_played_by_the_scanners_clock() {
     let known: Vec<_> =
         places.iter().zip(&scans).filter_map(|(place, line)| Some(((*place)?, line))).collect();
     for pair in known.windows(2) {
-        // Stamps follow from the scanner's clock alone: ten revolutions per second.
+        // The replay computes the stamps from the scanner's clock alone, and the scanner makes ten revolutions per
+        // second.
         let turns = (pair[1].0 - pair[0].0) as f64;
         let passed_s = (stamps(pair[1].1) - stamps(pair[0].1)) as f64 / 1e9;
         assert!((0.08..0.12).contains(&(passed_s / turns)), "{passed_s} s for {turns} turns");
@@ -257,7 +260,7 @@ fn refuses_recordings_of_another_family() {
         (Some(66), true),
         "{outcome}"
     );
-    // A family that this version does not have.
+    // A recording of a family that this version does not support.
     let later = env.path("later.mcap");
     let mut writer = Writer::begin(std::fs::File::create(&later).expect("a file"), "", BTreeMap::new())
         .expect("a new recording");
@@ -288,7 +291,7 @@ fn convert_and_replay_give_the_same_scans() {
     let (published, computed) = (rows("all.mcap"), rows("telegrams.mcap"));
     let ranges =
         |rows: &[Vec<String>]| rows.iter().map(|row| row[row.len() - 450..].to_vec()).collect::<Vec<_>>();
-    // The recorder of telegrams ended last.
+    // The recorder of `telegrams.mcap` ended last, so this file may have more scans at the end.
     assert!(
         published.len() > 20 && ranges(&computed).starts_with(&ranges(&published)),
         "{} {}",

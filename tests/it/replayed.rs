@@ -1,6 +1,6 @@
-//! Tests that a replay publishes what was published during the recording, byte for byte, if it has the same parameters,
-//! and different samples otherwise. Two sensors in simulated rooms with people are recorded in virtual time and
-//! replayed telegram by telegram.
+//! Tests that a replay with the same parameters publishes the same samples as during the recording, byte for byte, and
+//! that other parameters change them. Two sensors in simulated rooms with people are recorded in virtual time. The
+//! recording is then replayed telegram by telegram.
 
 #[path = "../testkit/recorded_rooms.rs"]
 pub(crate) mod recorded_rooms;
@@ -18,10 +18,10 @@ use scanhub_schema::{Flags, Topic};
 use scanhub_shm::{Domain, Node};
 
 const SCAN_COUNT: u64 = 400;
-/// Scan before which the sensor is silent for a second.
+/// Index of the scan before which both sensors are silent for a second.
 const SILENCE_AT_SCAN: u64 = 300;
 
-/// Records two sensors. Returns the file and the published samples of each sensor.
+/// Records two sensors. Returns the path of the file, and the samples that each sensor published.
 fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<PublishedSample>>) {
     let (file, mut published) = (env.path("two.mcap"), vec![Vec::new(), Vec::new()]);
     recorded_rooms::record(&env.domain(), &file, SCAN_COUNT, Some(SILENCE_AT_SCAN), |number, sample| {
@@ -30,7 +30,7 @@ fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<PublishedSample>>) {
     (file, published)
 }
 
-/// Replays `file` step by step. Returns the published samples of each sensor.
+/// Replays `file` step by step. Returns the samples that were published for each sensor.
 fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Vec<Vec<PublishedSample>> {
     let set = set.iter().map(|word| (*word).to_owned()).collect();
     let sources = Sources { set, ..Sources::default() };
@@ -50,7 +50,8 @@ fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Ve
             telegrams
         },
     );
-    // Samples before the first telegram, and samples of the silence after the end, belong to no telegram.
+    // Leave out samples that do not belong to a telegram: those before the first telegram, and those of the silence
+    // after the end.
     let is_around =
         |it: &PublishedSample| it.header.hub_time_ns().is_none() && [0, SCAN_COUNT].contains(&it.header.seq);
     published.iter_mut().for_each(|published| published.retain(|it| !is_around(it)));
@@ -58,7 +59,7 @@ fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Ve
 }
 
 /// Plays a recording step by step, with subscribers attached before the first telegram. `take` takes the samples that
-/// have arrived, and returns the number of telegrams so far.
+/// have arrived, and returns the number of telegrams that have arrived since the start.
 pub(crate) fn step_through<T>(
     domain: &Domain,
     replay: &Replay<'_>,
@@ -83,13 +84,13 @@ pub(crate) fn step_through<T>(
             assert!(Instant::now() < give_up_at, "the recording does not end");
             let before = take(&subscribers);
             player.step();
-            // A step that is a silence publishes no telegram, so continue after a short time.
+            // If this step is a silence, it publishes no telegram. Therefore wait only for a short time.
             let patience = Instant::now() + Duration::from_millis(50);
             while take(&subscribers) == before && !player.progress().is_over && Instant::now() < patience {
                 thread::yield_now();
             }
         }
-        // With `holds`, wait for the silence after the end, which the hub reports.
+        // If the replay holds at the end, wait until the hub has reported the silence after the end.
         let until = Instant::now() + Duration::from_millis(if replay.holds { 1_000 } else { 0 });
         while Instant::now() <= until {
             take(&subscribers);

@@ -1,5 +1,5 @@
-//! Tests of a hub that is killed or ended and started again while its subscribers run: they report it and continue on
-//! their own, and the new hub adopts the sensor while it streams.
+//! Tests of a hub that is killed or ended and started again while its subscribers run: the subscribers report this and
+//! continue on their own, and the new hub adopts the sensor's stream.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -10,7 +10,7 @@ use serde_json::Value;
 
 #[test]
 fn subscribers_survive_several_hub_restarts() {
-    // A hub without CPU time makes topics stale, but no client reports the hub as gone.
+    // If a hub gets no CPU time, its topics become stale. But clients report `hub_gone` only for a hub that has ended.
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=21"]);
     let link = [env.lms_link("front")];
@@ -40,7 +40,7 @@ fn subscribers_survive_several_hub_restarts() {
 
     let notices = telegrams.of_class("notice");
     let kinds = notices.iter().map(|line| line["kind"].as_str().unwrap_or_default());
-    // On a busy machine, a hub takes long to start.
+    // On a busy machine, a hub takes long to start, so the client may also report stale topics.
     let changes: Vec<_> = kinds.filter(|kind| *kind != "stale").collect();
     assert_eq!(changes, ["hub_gone", "hub_back"].repeat(4));
     let truth = env.truth("front");
@@ -48,13 +48,13 @@ fn subscribers_survive_several_hub_restarts() {
     let runs = split_by_boot(telegrams.of_class("telegram"));
     assert_eq!(runs.len(), 5);
     for run in &runs {
-        // Parts of two telegrams could together have a right checksum by chance, but the simulator never sent them as
-        // one.
+        // A telegram that consists of parts of two others could have a right checksum by chance, but the simulator
+        // never sent it.
         assert!(run.iter().all(|line| sent.contains(&hash(&bytes_of(line)))), "never sent");
         contiguous_numbers(run, "seq");
         contiguous_numbers(run, "topic_seq");
     }
-    // A subscriber that waits for a hub receives its samples from the first one on.
+    // A subscriber that waits for a hub receives all samples of the hub from the first one on.
     assert!(runs[1..].iter().all(|run| number(&run[0], "topic_seq") == 0));
     let runs = split_by_boot(scans.of_class("scan"));
     assert!(runs.len() == 5 && runs[1..].iter().all(|run| number(&run[0], "topic_seq") == 0));
@@ -62,17 +62,18 @@ fn subscribers_survive_several_hub_restarts() {
         assert_eq!(summary["missed"], 0);
     }
 
-    // The first hub found the rate and set it.
+    // The first hub found the scanner and set its baud rate. The last hub uses this rate, too.
     assert_eq!((&info["state"], &info["baud"]), (&"streaming".into(), &500_000.into()));
     let states: Vec<_> = scans.of_class("status").iter().map(|line| line["state"].clone()).collect();
     let first = states.iter().position(|state| state == "streaming").expect("an intact scan");
     let later: HashSet<_> = states[first..].iter().filter_map(Value::as_str).collect();
-    // Virtual time tests that a hub leaves a stream as it is. Here, the simulator may be late enough to seem silent.
+    // A test in virtual time checks that a new hub does not interrupt a stream. Here, the simulator may be so late that
+    // the hub detects a silence, and other states may occur, too.
     assert!(later.is_superset(&HashSet::from(["probing", "streaming"])), "{later:?}");
     assert_eq!(env.simulator_totals("front").1, 0, "EEPROM");
 }
 
-/// Groups `lines` by the run of the hub. Keeps their order.
+/// Groups `lines` by the run of the hub that published them. The order of the runs and of their lines stays the same.
 fn split_by_boot(lines: Vec<Value>) -> Vec<Vec<Value>> {
     let mut order = Vec::new();
     let mut runs = BTreeMap::<String, Vec<Value>>::new();

@@ -1,12 +1,12 @@
-//! Tests of the combined verdict of a robot with two sensors: it becomes unknown if a sensor or the hub dies, and
-//! recovers when they return.
+//! Tests of the combined verdict of a robot with two sensors: the verdict becomes `unknown` if a sensor or the hub
+//! stops, and recovers after both run again.
 
 use crate::testkit::{INT, KILL, Program, TERM, TestEnv, TestGateway, in_a_network, wait_until};
 use scanhub_client::{Robot, RobotSubscriber};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
-/// Radii within which the simulated room has no object.
+/// Setting with zones so small that the simulated room has no object in them.
 const SMALL_ZONES: &str = "--set=zones.radii=[0.02,0.01]";
 
 fn hub(env: &TestEnv) -> Program {
@@ -18,7 +18,7 @@ fn sensor(env: &TestEnv, name: &str) -> Program {
     env.start(&["simulate", "--json", "--baud=500000", &port]).ready()
 }
 
-/// Returns the verdicts of robot, front and rear in a line of `echo robot/zones`.
+/// Returns three verdicts in a line of `echo robot/zones`: those of the robot, of `front` and of `rear`.
 fn verdicts(line: &Value) -> [&str; 3] {
     let of = |value: &Value, name: &str| {
         let sensors = value["sensors"].as_array()?;
@@ -45,7 +45,8 @@ fn dead_sensor_or_hub_makes_the_robot_unknown() {
     assert!(line.get("stale").is_none() && line["nearest_mm"].is_u64(), "{line}");
 
     env.kill_port_simulator(rear, "rear");
-    // Either the hub or the client reports the absence of `rear` first. The samples of `front` itself are not stale.
+    // Either the hub or the client detects first that `rear` is absent. The samples of `front` are not stale, so
+    // neither is the line.
     echo.await_line("a clear front without the rear", |line| {
         verdicts(line) == ["unknown", "clear", "unknown"] && line.get("stale").is_none()
     });
@@ -89,7 +90,7 @@ fn robot_subscriber_receives_each_verdict_change() {
     });
 }
 
-/// On a machine without a hub, `robot` combines the sensors that its listener publishes.
+/// On a machine without a hub, `robot` combines the sensors that the listener of this machine publishes.
 #[test]
 fn robot_without_a_hub_uses_remote_sensors() {
     in_a_network("robot::robot_without_a_hub_uses_remote_sensors", || {
@@ -103,7 +104,7 @@ fn robot_without_a_hub_uses_remote_sensors() {
 
         let mut front = TestGateway::new(1, 7, 0, "front");
         front.wait_until_published(&mut listener, &[Topic::Zones]);
-        // A sensor without zones is not part of the robot.
+        // A sensor that does not publish zones is not part of the robot.
         TestGateway::new(1, 7, 1, "mapper").wait_until_published(&mut listener, &[Topic::Scan]);
         let mut echo = env.start(&["echo", "--json", "robot/zones"]);
         let mut leds = env.start(&["leds", "--json", "robot", "--hold=0s"]);
@@ -120,9 +121,10 @@ fn robot_without_a_hub_uses_remote_sensors() {
         leds.await_line("slow", |line| line["verdict"] == "slow" && line["worst"] == "robot1.front");
         leds.await_line("silence", |line| line["verdict"] == "unknown" && line["red"] == true);
 
-        // A hub has its own sensors. When it exits, remote sensors do not replace them.
+        // While a hub runs, `robot` combines the sensors of the hub. When the hub exits, remote sensors do not replace
+        // these sensors.
         let _sensor = sensor(&env, "front");
-        // A second subscriber queries the current verdict and also has to find the remote sensor.
+        // A second subscriber queries the current verdict, and must find the remote sensor, too.
         let mut busy =
             RobotSubscriber::builder(&[]).in_domain(&env.domain()).open().expect("a robot without names");
         let names = |robot: &Robot| robot.sensors().map(|(name, _)| name.to_owned()).collect::<Vec<_>>();

@@ -1,5 +1,5 @@
-//! Tests of recordings for ROS 2, made live or converted later. Independent readers can read every message. A message
-//! has the same values, frame and time as the published scan.
+//! Tests of recordings for ROS 2, which are either made live or converted later. Readers of other projects can read
+//! every message. A message has the same values, frame and time as the published scan.
 
 use std::collections::BTreeMap;
 use std::process::Command;
@@ -11,7 +11,7 @@ use scanhub_schema::datagram::DatagramPayload;
 use scanhub_schema::{Code, Header, Pose, Scan, file};
 use serde_json::Value;
 
-/// Poses of two sensors. The second one is mounted upside down.
+/// Poses of two sensors. The sensor `rear` is mounted upside down.
 const FRONT_POSE: Pose = Pose { x_m: 0.3, y_m: 0.1, yaw_rad: 0.25, upside_down: 0, reserved: [0; 7] };
 const REAR_POSE: Pose = Pose { x_m: -0.25, y_m: 0.0, yaw_rad: -2.5, upside_down: 1, reserved: [0; 7] };
 
@@ -25,8 +25,8 @@ fn link(env: &TestEnv, name: &str, pose: &Pose) -> Vec<String> {
 
 type PublishedScan = (Header, Box<Scan>);
 
-/// Returns the scans of a recording as the hub published them, by ROS topic and wall clock. No two scans of a sensor
-/// have the same wall clock.
+/// Returns the scans of a recording as the hub published them, by ROS topic and wall-clock stamp. No two scans of a
+/// sensor have the same wall-clock stamp.
 fn published_scans(recording: &Recording) -> BTreeMap<(String, u64), PublishedScan> {
     let of = |sensor: &str| {
         let scan_messages = recording.of(&format!("{sensor}/scan"));
@@ -46,7 +46,7 @@ fn published_scans(recording: &Recording) -> BTreeMap<(String, u64), PublishedSc
     by_time
 }
 
-/// Runs the independent reader `verb` on the file at `path` and returns all messages.
+/// Runs the independent reader `verb` on the file at `path` and returns all messages that the reader prints.
 fn run_reader(mut python: Command, verb: &str, path: &str) -> Vec<Value> {
     python.args(["tests/testkit/read.py", verb, path]).current_dir(env!("CARGO_MANIFEST_DIR"));
     let outcome = output(python).expect("Python");
@@ -92,7 +92,7 @@ fn check_scan(message: &Value, (header, scan): &(Header, Box<Scan>)) {
     }
 }
 
-/// Returns the direction to which the quaternion of `transform` rotates the beam at `angle_deg`.
+/// Returns the direction of the beam at `angle_deg` after the rotation by the quaternion of `transform`.
 fn rotate(transform: &Value, angle_deg: f64) -> [f64; 3] {
     let [x, y, z, w] = ["qx", "qy", "qz", "qw"].map(|key| real(transform, key));
     let (b, a) = angle_deg.to_radians().sin_cos();
@@ -136,7 +136,8 @@ fn ros_decoders_read_live_and_converted_messages() {
     for sensor in ["front", "rear"] {
         env.await_info(sensor, |info| info["state"] == "streaming");
     }
-    // The recorder of all topics starts earlier and ends later than the ROS recorder.
+    // The recorder of all topics starts before the ROS recorder and ends after it, so it has all scans of the ROS
+    // recording.
     let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| env.path_argument(name));
     let mut recorder_of_all = env.start(&["record", "--all", "--json", "-o", &all]);
     recorder_of_all
@@ -185,8 +186,8 @@ fn ros_decoders_read_live_and_converted_messages() {
                 let key = (topic, number(line, "log_time"));
                 match published.get(&key) {
                     Some(scan) => check_scan(line, scan),
-                    // The recording may have a telegram without its scan at either end, because the recorder attaches
-                    // to one topic after the other.
+                    // The recording of all topics may have a telegram without its scan at its start or end, because the
+                    // recorder attaches to one topic after the other. Only messages there may be unknown.
                     None => assert!(is_at_an_end(&key), "{verb} of {name}: {key:?} was not published"),
                 }
                 checked += usize::from(published.contains_key(&key));

@@ -1,12 +1,13 @@
-//! Tests of a hub with simulated RPLIDARs: it identifies them, selects a mode, publishes whole revolutions on an even
-//! grid and the packets as they arrived, and stops the motor if configured. It changes no stored settings.
+//! Tests of a hub with simulated RPLIDARs: the hub identifies each scanner and selects a mode. It publishes whole
+//! revolutions on an even grid, and the packets as they arrived. It stops the motor if this is configured. It changes
+//! no settings that a scanner stores.
 
 use serde_json::Value;
 
 use crate::replay_packets::{recorder, replay, samples, scan};
 use crate::testkit::{INT, Program, TERM, TestEnv, contiguous_numbers, is_class, number};
 
-/// Starts a scanner of this model with the flags `more`.
+/// Starts a simulated scanner of this model, with the flags `more` in addition.
 fn simulator(env: &TestEnv, model: &str, more: &[&str]) -> Program {
     let model = format!("--model={model}");
     let arguments = ["--family=rplidar", &model, "--world=room", "--seed=7"];
@@ -30,7 +31,8 @@ fn identifies_scanner_and_publishes_its_revolutions() {
     let mut scans = env.echo(&["front/scan"]);
     let telegrams = env.echo(&["front/telegram"]);
     let simulator = simulator(&env, "a1", &[]);
-    // On a busy machine, the simulator is late, and revolutions lack the packets that it could not send in time.
+    // On a busy machine, the simulator is late and cannot send some packets in time, so some revolutions are
+    // incomplete.
     scans.await_lines(8, "a complete scan", |line| is_class("scan")(line) && line["incomplete"].is_null());
     let info = env.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 6.0));
     assert_eq!(
@@ -38,7 +40,7 @@ fn identifies_scanner_and_publishes_its_revolutions() {
         ("rplidar", "a1", "streaming")
     );
     assert_eq!((number(&info, "baud"), text(&info, "last_error")), (115_200, ""), "{info}");
-    // On a busy machine, the simulator is late, and the hub counts the missing revolutions as lost.
+    // On a busy machine, the hub may count revolutions as lost, because the simulator is late. But no byte is damaged.
     assert_eq!(info["damaged"].as_f64(), Some(0.0), "{info}");
     let scans = scans.end(INT).of_class("scan");
     contiguous_numbers(&scans, "topic_seq");
@@ -61,7 +63,7 @@ fn configured_model_and_mode_are_used() {
     for scan in env.echo(&["front/scan"]).await_lines(5, "a scan", is_class("scan")) {
         assert_eq!((text(&scan, "family"), number(&scan, "count")), ("rplidar", 500), "{scan}");
     }
-    // Packets with a single point have no checksum.
+    // The kind of packet that has only a single point has no checksum.
     let data = telegrams.await_line("packets", |line| line["kind"] == "data");
     assert!(data["checked"].is_null() && number(&data, "length") == 5 * number(&data, "packets"), "{data}");
     let info = env.await_info("front", |info| info["state"] == "streaming");
@@ -88,7 +90,7 @@ fn motor_stops_without_subscribers() {
     scans.await_lines(3, "a scan", is_class("scan"));
     assert_eq!(text(&env.info("front"), "state"), "streaming");
     scans.end(INT);
-    // A subscriber to `status` alone does not need a scanner that measures.
+    // A subscriber to `status` alone does not need a scanner that measures, so the hub stops the motor.
     let _status = env.echo(&["front/status"]);
     env.await_info("front", paused);
     assert_eq!((hub.end(TERM).exit_code, simulator.end(TERM).exit_code), (Some(0), Some(0)));
@@ -118,7 +120,7 @@ fn probe_identifies_scanner_and_checks_its_line() {
     }
 }
 
-/// Tests a model ID that this version does not know.
+/// The scanner has a model ID that this version does not know.
 #[test]
 fn unknown_model_is_shown_with_its_id() {
     let env = TestEnv::new();
@@ -146,8 +148,8 @@ fn unknown_model_is_shown_with_its_id() {
     );
 }
 
-/// A recorder that attaches to a running stream misses the replies that the scanner sent before. A converted stream
-/// file has these replies.
+/// A recorder that attaches to a running stream misses the replies that the scanner sent before. The stream file into
+/// which the recording is converted nevertheless has these replies.
 #[test]
 fn stream_file_has_the_recorded_scans() {
     let env = TestEnv::new();
@@ -172,11 +174,11 @@ fn stream_file_has_the_recorded_scans() {
         scans.map(|(_, payload)| scan(&payload).ranges().to_vec()).collect()
     };
     let (recorded, replayed) = (ranges("all.mcap"), ranges("replayed.mcap"));
-    // The recorder of the default topics started later and ended later.
+    // The recorder of the default topics started and ended later than the recorder of all topics.
     let begin = recorded.iter().position(|scan| *scan == replayed[0]).expect("the first one was recorded");
     let both = (recorded.len() - begin).min(replayed.len());
-    // On a busy machine, a recorder may miss samples, and the line may be late or lose bytes. The scans then differ, so
-    // the test does not compare them.
+    // On a busy machine, a recorder may miss samples, and the line may be late or lose bytes. The scans may then
+    // differ, so the test compares them only if nothing was missed or lost.
     let has_lost = env.truth("front").iter().any(|sent| sent.fault.is_some());
     let is_unbroken = |name: &str, topic: &str| {
         let numbers: Vec<u64> =
@@ -224,7 +226,7 @@ fn reports_line_that_damages_most_bytes() {
     let expected = if percent > 50.0 { ("failed", Some(5)) } else { ("warning", Some(0)) };
     assert_eq!((text(&line_loss, "state"), outcome.exit_code), expected, "{outcome}");
     assert!(percent > 3.0, "{outcome}");
-    // The line may damage every reply with the health.
+    // The line may damage every reply to the request for the health, and the check then has a warning.
     assert!(["ok", "warning"].contains(&text(&of("health"), "state")), "{outcome}");
 
     let _hub = hub(&env, &["model=s2"]);
@@ -290,7 +292,7 @@ fn clears_resettable_error_and_reports_persistent_one() {
     let persistent = simulator(&env, "a1", &["--fault=health=2,stubborn=1"]);
     let info = env.await_info("front", |info| text(info, "last_error").contains("has stopped measuring"));
     assert_ne!(info["state"], "streaming", "{info}");
-    // A healthy scanner streams again without a restart of the hub.
+    // When a healthy scanner is connected instead, it streams without a restart of the hub.
     env.kill_port_simulator(persistent, "front");
     let _well = simulator(&env, "a1", &[]);
     env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] == "");

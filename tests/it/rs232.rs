@@ -1,5 +1,5 @@
-//! Tests of a hub with an LMS on RS-232, on a pty: at 500,000 baud the hub loses the scanner until its power is cycled,
-//! so it falls back to 38,400 baud and saves that.
+//! Tests of a hub with an LMS on RS-232, on a pty: at 500,000 baud, the hub loses the scanner until the scanner's power
+//! is cycled. The hub therefore falls back to 38,400 baud, and saves this rate.
 
 use std::fs;
 use std::os::unix::net::UnixStream;
@@ -75,8 +75,8 @@ fn is_streaming_slowly(status: &Value) -> bool {
     status["state"] == "streaming" && status["baud"] == 38_400 && has_rs422_problem(status)
 }
 
-/// Asserts that the log has the reason and does not repeat it. If a reply is late on a busy machine, the log may have
-/// another reason between.
+/// Asserts that the log has a warning with RS422_MESSAGE, and not twice in a row. If a reply is late on a busy machine,
+/// another warning may be between two of them.
 fn assert_single_warning(log: &str) {
     let warnings: Vec<_> = log.lines().filter(|line| line.contains(" WARN ")).collect();
     let is_reason = |line: &&str| line.contains(RS422_MESSAGE);
@@ -103,7 +103,8 @@ fn falls_back_to_38400_baud_and_saves_the_rate() {
     assert!(text.starts_with("38400,silent=2 "), "{text}");
     scanner.end();
 
-    // After a power cycle, the scanner is at 9,600 baud. A single switch to 500,000 baud would lose it permanently.
+    // After a power cycle, the scanner is at 9,600 baud. The next hub must use the saved rate at once: if it switched
+    // to 500,000 baud even once, it would lose the scanner, whose power the test does not cycle again.
     let scanner = Scanner::start(&env);
     let hub = env.hub(&[env.link("front")]);
     let mut echo = env.echo(&["front/status"]);

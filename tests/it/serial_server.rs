@@ -1,5 +1,5 @@
-//! Tests of a scanner behind a serial server, which the test simulates between a loopback socket and the simulator's
-//! pty.
+//! Tests of a scanner behind a serial server. The test itself is the server, and forwards bytes between a loopback
+//! socket and the simulator's pty.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -19,14 +19,14 @@ use serde_json::Value;
 /// A serial server that accepts one connection at a time, until it is dropped.
 struct Server {
     address: String,
-    /// Set to end the current connection.
+    /// Flag that the test sets to end the current connection.
     hang_up: Arc<AtomicBool>,
     end: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Server {
-    /// Starts a server whose serial port is the line at `path` and is set to `rate`.
+    /// Starts a server whose serial port is the line at `path`, with the baud rate `rate`.
     fn new(env: &TestEnv, path: &str, rate: u32) -> Server {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
         let address = listener.local_addr().expect("a bound address").to_string();
@@ -123,7 +123,7 @@ fn finds_scanner_of_any_family_behind_a_server() {
         subscriber.await_line("a scan", |line| is_class("scan")(line) && line["family"] == family);
         let info = env.await_info("front", |info| info["state"] == "streaming" && info["model"] == model);
         assert_eq!((&info["family"], &info["last_error"]), (&family.into(), &"".into()), "{info}");
-        // After a reconnect, the search starts again and finds this scanner again.
+        // After the connection was lost and opened again, the search starts again and finds this scanner again.
         server.hang_up.store(true, Ordering::Relaxed);
         subscriber.await_line("absent", |line| line["state"] == "absent");
         subscriber.await_line("a search", |line| line["state"] == "probing" && line["family"].is_null());
@@ -140,7 +140,7 @@ fn finds_scanner_of_any_family_behind_a_server() {
     }
 }
 
-/// Number of scans that are sent while the hub is stopped.
+/// Number of scans that the simulator sends while the hub is stopped.
 const BACKLOGGED_SCANS: usize = 20;
 
 #[test]
@@ -157,7 +157,8 @@ fn scans_buffered_for_a_stopped_hub_give_no_verdict() {
     wait_until("scans wait", || sent() > before + BACKLOGGED_SCANS);
     hub.signal(Signal::CONT);
     let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
-    // The server sends five per second, so the scans of the last second may be recent.
+    // The simulator sends about five scans per second. The scans of the last second may count as recent, so expect six
+    // fewer.
     for _ in 0..BACKLOGGED_SCANS - 6 {
         subscriber.await_line("an old scan", |line| line["verdict"] == "unknown" && is_estimated(line));
     }
@@ -180,9 +181,9 @@ fn wrong_rate_of_a_serial_server_is_reported() {
 #[test]
 fn unreachable_serial_server_is_reported() {
     let env = TestEnv::new();
-    // This port was free a moment ago.
+    // No process listens at this port, because it was free a short time ago.
     let address = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
-    // Longer than a DNS label may be, so no name server is queried.
+    // This name is longer than a DNS label may be, so the system rejects it without a query to a name server.
     let nowhere = "x".repeat(64);
     let hub = env.hub(&[&format!("--link=front=tcp:{address}"), &format!("--link=named=tcp:{nowhere}:4001")]);
     for (sensor, message) in
@@ -218,7 +219,8 @@ fn descriptor_shortage_is_not_a_network_error() {
 #[test]
 fn interrupt_ends_connecting_to_a_mute_serial_server() {
     let env = TestEnv::new();
-    // No process accepts, and the backlog is full, so the kernel drops further connections.
+    // No process accepts connections, and the listener's queue is full, so the kernel drops further attempts to
+    // connect.
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     rustix::net::listen(&listener, 0).expect("a socket");
     let address = listener.local_addr().expect("a bound address");
@@ -263,7 +265,8 @@ fn probe_and_doctor_work_behind_a_serial_server() {
     let outcome = env.search(&["probe", &port, "--json"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let found = &outcome.lines()[0];
-    // The server sets the rate. The scanner reports its own rate.
+    // In a serial server, the server's own settings determine the baud rate. `probe` reports the rate that the scanner
+    // itself reports.
     assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0x25), "{found}");
     let outcome = env.run(&["doctor", &port, "--no-system-config", "--json"]);
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
@@ -276,7 +279,7 @@ fn probe_and_doctor_work_behind_a_serial_server() {
 }
 
 /// Runs the program with `arguments` at a terminal and answers its question with yes. Returns the output and the exit
-/// code.
+/// code of the program.
 fn run_and_confirm(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let (mut keys, screen) = terminal();
     let mut command = env.command(arguments);
@@ -285,7 +288,7 @@ fn run_and_confirm(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let mut process = spawn(command.stdin(stdin).stdout(stdout).stderr(stderr)).expect("a started program");
     drop((command, screen));
     let (mut output, mut byte) = (Vec::new(), [0]);
-    // Reading fails once no process has the terminal open.
+    // Reading fails as soon as no process has the terminal open.
     while keys.read(&mut byte).is_ok_and(|len| len > 0) {
         output.push(byte[0]);
         if output.ends_with(b"Type yes: ") {

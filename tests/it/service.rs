@@ -1,5 +1,6 @@
-//! Tests of the hub as a service. It reports when it is ready, and notifies the watchdog only while its links work. It
-//! stores its ports in the service manager, so that data that arrives while a killed hub restarts is not lost.
+//! Tests of the hub as a service. The hub reports when it is ready, and notifies the watchdog only while its links
+//! work. It stores its ports in the service manager, so that no data is lost that arrives after a hub was killed and
+//! before the next one runs.
 
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
@@ -30,7 +31,7 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
         supervisor.wait_for_message("READY=1");
     }
     await_next_run(&mut telegrams, &mut boots);
-    // Only the service manager has the line open, and it is still locked.
+    // Now only the service manager has the line open. The line must still be locked.
     kill_between_telegrams(&env, hub, &simulator, &mut telegrams);
     let elsewhere = TestEnv::new();
     let other = elsewhere.hub(&flags);
@@ -52,7 +53,7 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
         runs.entry(line["boot"].as_str().unwrap_or_default()).or_default().push(line.clone());
     }
     assert_eq!(runs.len(), KILL_COUNT + 2);
-    // The client reports the samples that it misses on a busy machine.
+    // On a busy machine, the client may miss samples, but it reports how many.
     let notices = got.of_class("notice");
     let notices = notices.iter().filter(|line| line["kind"] == "missed");
     let missed: u64 = notices.map(|line| number(line, "missed")).sum();
@@ -68,7 +69,7 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
     let at =
         |hash: &String| truth.iter().position(|sent| &sent.hash == hash).expect("a telegram that was sent");
     let span = &truth[at(&received[0])..=at(&received[received.len() - 1])];
-    // A killed hub loses the telegram that it has partly read, and no other.
+    // A killed hub loses only one telegram, whose first bytes it had read.
     let last_of = |run: &Vec<Value>| {
         let last = run.iter().rfind(|line| line["command"] == MEASURED_VALUES).expect("a measured telegram");
         at(&hash(&bytes_of(last)))
@@ -87,7 +88,7 @@ fn restart_after_kill_loses_only_the_partial_telegram() {
 }
 
 /// Stops `simulator` until `telegrams` has printed everything that the line has carried, kills `hub`, and lets the
-/// simulator continue. A part of the last telegram may wait in the simulator for room on the line.
+/// simulator continue. A part of the last telegram may still be in the simulator, because the line had no room for it.
 fn kill_between_telegrams(env: &TestEnv, hub: Program, simulator: &Program, telegrams: &mut Program) {
     simulator.signal(Signal::STOP);
     let sent = env.truth("front");
@@ -99,8 +100,8 @@ fn kill_between_telegrams(env: &TestEnv, hub: Program, simulator: &Program, tele
     simulator.signal(Signal::CONT);
 }
 
-/// Waits for telegrams of a run that is not in `boots`, and adds this run to `boots`. Lines of earlier runs may still
-/// arrive first.
+/// Waits for telegrams of a run that is not in `boots`, and adds this run to `boots`. Skips lines of earlier runs,
+/// which may still arrive.
 fn await_next_run(telegrams: &mut Program, boots: &mut HashSet<String>) {
     let boot = |line: &Value| line["boot"].as_str().unwrap_or_default().to_owned();
     let is_new = |line: &Value| line["command"] == MEASURED_VALUES && !boots.contains(&boot(line));
@@ -127,13 +128,13 @@ fn scans_resume_with_first_telegram_of_the_next_hub() {
         let first = samples
             .await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED_VALUES);
         let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
-        // A client on a busy machine may miss the first samples. It then reports this.
+        // On a busy machine, a client may miss the first samples, and then reports this.
         let has_missed = samples.has_printed(|line| line["kind"] == "missed");
         if has_missed || scan["seq"] == first["seq"] {
             break (first, scan);
         }
-        // On a busy machine, the identity that the previous hub saved may be too old when the next one starts: more
-        // than 3 s.
+        // On a busy machine, the identity that the previous hub saved may be too old (more than 3 s) when the next hub
+        // starts. Then try again.
         assert!(tries < 10, "{scan} {first}");
         samples.await_lines(100, "a scan", |line| of_next(line) && line["class"] == "scan");
         (boot, tries) = (first["boot"].clone(), tries + 1);
@@ -146,7 +147,7 @@ fn scans_resume_with_first_telegram_of_the_next_hub() {
         ["unit_um", "count"].map(|key| number(&scan, key)),
         ["unit_um", "count"].map(|key| number(&scans[0], key))
     );
-    // The hub requests the status again in any case. The type is known from the saved identity.
+    // The hub has the type from the saved identity. It requests the status again in any case.
     let info = env.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
     assert_eq!((&info["type"], &info["mode"]), (&"LMS200;301063;V02.30".into(), &1.into()), "{info}");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
@@ -163,13 +164,13 @@ fn hub_releases_stored_ports_it_cannot_use() {
     supervisor.wait_for_message("FDNAME=front");
     supervisor.wait_for_message("READY=1");
     assert_eq!(hub.end(KILL).exit_code, None);
-    // The next hub has a link with another name, so the stored port belongs to no link.
+    // The next hub has a link with another name, so no link of this hub has the stored port.
     let side = format!("--link=side={}", env.path_argument("side"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.wait_for_message("FDSTOREREMOVE=1");
     supervisor.wait_for_message("STATUS=sensors: side");
     assert_eq!(hub.end(TERM).exit_code, Some(0));
-    // The port was closed, so the next hub can open it.
+    // The hub has closed the stored port, so the next hub can open this port.
     let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
     supervisor.wait_for_message("FDNAME=front");
     env.await_info("front", |info| info["state"] == "streaming");
@@ -189,14 +190,14 @@ fn renamed_link_takes_over_its_stored_port() {
     supervisor.wait_for_message("FDNAME=front");
     supervisor.wait_for_message("READY=1");
     assert_eq!(hub.end(KILL).exit_code, None);
-    // The stored port is still locked, so the hub cannot open it again, but only take it over.
+    // The stored port is still locked. The hub cannot open the port again, but only take over the stored descriptor.
     let side = format!("--link=side={}", env.path_argument("front"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.wait_for_message("FDSTOREREMOVE=1");
     supervisor.wait_for_message("FDNAME=side");
     supervisor.wait_for_message("READY=1");
     assert_eq!(hub.end(KILL).exit_code, None);
-    // The link has another port now, so the port stored under its name is released.
+    // The link now has another port, so the hub releases the port that was stored under the link's name.
     let side = format!("--link=side={}", env.path_argument("nowhere"));
     let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.wait_for_message("FDSTOREREMOVE=1");
@@ -209,7 +210,7 @@ fn renamed_link_takes_over_its_stored_port() {
 fn watchdog_is_fed_while_links_work() {
     let env = TestEnv::new();
     let mut supervisor = env.supervisor();
-    // A link whose port is missing does not hang.
+    // A link that waits for its missing port works, so the hub notifies the watchdog.
     let hub = env.service(&mut supervisor, &[env.link("front")], Some(Duration::from_secs(2))).ready();
     for _ in 0..3 {
         supervisor.wait_for_message("WATCHDOG=1");

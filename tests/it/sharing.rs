@@ -1,5 +1,5 @@
-//! Tests of docs/sharing.md: a hub that runs as one user and its subscribers as another. Each test has its own network,
-//! /run, /tmp and /dev/shm.
+//! Tests of docs/sharing.md: a hub that runs as one user, and subscribers that run as another user. Each test has its
+//! own network, /run, /tmp and /dev/shm.
 
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, chown};
@@ -13,16 +13,16 @@ use serde_json::{Value, json};
 const SHARING_PAGE: &str = include_str!("../../docs/sharing.md");
 /// Variable that is set when the test runs again inside the namespaces.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_SHARING";
-/// User IDs. They need not exist on the system.
+/// User IDs of the tests. No user with such an ID needs to exist on the system.
 const HUB_UID: u32 = 65531;
 const OTHER_UID: u32 = 65532;
 
-/// Runs `test`, which is called `name`, in new namespaces as root. Skips if the system does not allow that.
+/// Runs `test`, which is called `name`, in new namespaces as root. Skips the test if the system does not allow this.
 fn in_namespace(name: &str, test: impl FnOnce()) {
     if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();
     }
-    // A mount on /tmp may hide the programs, so copy them to /mnt first.
+    // The mount on /tmp may hide the programs, so copy them to /mnt first.
     let script = "ip link set lo up && mount -t tmpfs -o mode=755 none /mnt && cp \"$1\" /mnt/test && cp \"$2\" /mnt/scanhub \
                   && mount -t tmpfs -o mode=755 none /run && mount -t tmpfs -o mode=1777 none /tmp \
                   && mount -t tmpfs -o mode=1777 none /dev/shm";
@@ -48,8 +48,8 @@ fn create_directory_of(user: u32, path: &str) {
     chown(path, Some(user), Some(user)).expect("permission of root");
 }
 
-/// Returns the program with the environment of a login session of `user`. The hub's user also has the environment of
-/// the hub's service.
+/// Returns a command that runs the program in the environment of a login session of `user`. If `user` is the hub's
+/// user, the command also has the environment of the hub's service.
 fn scanhub(user: u32, arguments: &[&str]) -> Command {
     let mut command = Command::new("/mnt/scanhub");
     command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").current_dir("/");
@@ -65,14 +65,15 @@ fn start(user: u32, arguments: &[&str]) -> Program {
     Program::start(scanhub(user, arguments))
 }
 
-/// Returns the arguments of the page's line that equals `begin` or, if there is none, starts with it.
+/// Returns the arguments of a command line on the page. This is the line that equals `begin`, or else the first line
+/// that starts with `begin`.
 fn arguments_on_page(begin: &str) -> Vec<&'static str> {
     let find = |is_it: &dyn Fn(&str) -> bool| SHARING_PAGE.lines().find(|line| is_it(line));
     let line = find(&|line| line == begin).or_else(|| find(&|line| line.starts_with(begin)));
     line.unwrap_or_else(|| panic!("no line {begin:?}")).split(' ').skip(1).collect()
 }
 
-/// Like [`arguments_on_page`], with `--json`. The ID `hub` replaces the ID on the page.
+/// Does the same as [`arguments_on_page`], but replaces the ID on the page by `hub`, and appends `--json`.
 fn arguments_with_hub(begin: &str, hub: &str) -> Vec<String> {
     let words = arguments_on_page(begin).into_iter().map(|word| word.replace("5f3a12bc00d1e2f3", hub));
     words.chain(["--json".to_owned()]).collect()
@@ -97,7 +98,8 @@ fn commands_of_the_page_work_for_another_user() {
             start(HUB_UID, &["simulate", "--json", &port_flag, "--seed=61", "--baud=500000"]).ready();
         let link = format!("--link=front={port}");
         let _hub = start(HUB_UID, &["run", "--json", &link]).ready();
-        // The other user cannot access the hub's memory.
+        // Without the listener, the other user cannot receive from the hub, because this user cannot access the hub's
+        // memory.
         let alone = start(OTHER_UID, &["echo", "front/scan", "--json", "-n", "1"]).wait();
         assert_ne!(alone.exit_code, Some(0), "{alone}");
 
@@ -127,7 +129,7 @@ fn commands_of_the_page_work_for_another_user() {
         );
         assert_eq!(listener.end(TERM).exit_code, Some(0));
 
-        // A listener that publishes under a given name.
+        // This listener publishes the sensors of the hub under a given name.
         let named = arguments_with_hub("scanhub listen --publish --interface lo --name", &hub);
         let listener = start(OTHER_UID, &words(&named)).ready();
         wait_until("the name is there", || {
@@ -143,18 +145,19 @@ fn commands_of_the_page_work_for_another_user() {
     });
 }
 
-/// Domain of the hubs that [`reports_the_user_of_a_running_hub`] starts. Hubs of other tests are visible in /proc too.
+/// Domain of the hubs that [`reports_the_user_of_a_running_hub`] starts. The name is unique, because hubs of other
+/// tests are visible in /proc, too.
 const DOMAIN_FLAG: &str = "--domain=whose";
 
-/// Starts the program as sudo does: without the variables of a login session.
+/// Starts the program as `sudo` does, without the environment variables of a login session.
 fn by_sudo(user: u32, arguments: &[&str]) -> Program {
     let mut command = scanhub(user, arguments);
     command.env_remove("XDG_RUNTIME_DIR").env_remove("RUNTIME_DIRECTORY");
     Program::start(command)
 }
 
-/// Asserts that verbs of `caller` find no hub and suggest a command, and that this command lists the topics of `hub`,
-/// which belongs to `owner`.
+/// Asserts that verbs that `caller` starts find no hub and suggest a command. Asserts that this command, run as
+/// `owner`, lists the topics of `hub`, which belongs to `owner`.
 fn assert_suggestion_works(caller: &dyn Fn(&[&str]) -> Program, owner: u32, hub: &Program) {
     let sudo = if owner == 0 { "sudo".to_owned() } else { format!("sudo -u '#{owner}'") };
     let suggested = format!("process {}: {sudo} /mnt/scanhub ", hub.pid());
@@ -171,7 +174,7 @@ fn assert_suggestion_works(caller: &dyn Fn(&[&str]) -> Program, owner: u32, hub:
             "{words:?}: {listed}"
         );
     }
-    // A verb that waits for a hub suggests the command too.
+    // A verb that waits for a hub suggests the command, too.
     let mut echo = caller(&["echo", "front/scan", "--json", DOMAIN_FLAG]);
     let notice = echo.await_line("no hub", |line| line["kind"] == "hub_gone");
     assert!(notice["hint"].as_str().is_some_and(|hint| hint.contains(&suggested)), "{notice}");
@@ -203,7 +206,8 @@ fn reports_the_user_of_a_running_hub() {
         assert_suggestion_works(&root, OTHER_UID, &of_session);
         assert_eq!(of_session.end(TERM).exit_code, Some(0));
 
-        // Other users cannot read the variables of a process, so they do not see the domain in SCANHUB_DOMAIN.
+        // Other users cannot read the variables of a process, so they cannot see the domain of this hub, which is only
+        // in SCANHUB_DOMAIN.
         let mut command = scanhub(0, &run[..run.len() - 1]);
         command.env_remove("XDG_RUNTIME_DIR").env("SCANHUB_DOMAIN", "whose");
         let of_variable = Program::start(command).ready();
@@ -227,13 +231,13 @@ fn reports_the_user_of_a_running_hub() {
             (&line["domain"], &line["user"], &line["remedy"]),
             (&Value::Null, &json!("root"), &remedy)
         );
-        // The terminal of the web server names the hub of the other user.
+        // The web server prints in its terminal that the hub belongs to another user.
         let mut web = other(&["web", "--listen", "127.0.0.1:0", DOMAIN_FLAG]);
         web.wait_for_text("no hub of this user in domain whose");
         assert_eq!(web.end(TERM).exit_code, Some(0));
         assert_eq!(of_variable.end(TERM).exit_code, Some(0));
 
-        // A hub of this user in another directory is listed.
+        // If a hub of the same user is in another directory, it is listed.
         let below = start(OTHER_UID, &[&run[..], &["--root", &format!("/tmp/{OTHER_UID}")]].concat()).ready();
         let listed = other(&["list", "--domains", "--json"]).wait();
         let root = json!(format!("/tmp/{OTHER_UID}/whose"));
@@ -242,7 +246,7 @@ fn reports_the_user_of_a_running_hub() {
     });
 }
 
-/// The configuration of the service on the page is valid for a gateway.
+/// The page has a configuration for a service, which must be valid for a gateway.
 #[test]
 fn configuration_on_the_page_is_valid() {
     let block =
@@ -261,7 +265,7 @@ fn configuration_on_the_page_is_valid() {
     assert!(shown.lines().iter().any(is_it), "{shown}");
 }
 
-/// Runs the three commands of docs/tilt.md in the order of the page: the mount publishes before a hub runs.
+/// Runs the three commands of docs/tilt.md in the order of the page, in which the mount publishes before a hub runs.
 #[test]
 fn mount_and_hub_share_a_domain_in_either_order() {
     in_namespace("sharing::mount_and_hub_share_a_domain_in_either_order", || {
@@ -293,7 +297,8 @@ fn mount_and_hub_share_a_domain_in_either_order() {
             tilt.await_line("a sweep", is_class("obstacles"));
             assert!(!fs::exists("/run/scanhub").expect("/run can be read"), "a service's place is not ours");
             assert_eq!((tilt.end(INT).exit_code, hub.end(INT).exit_code), (Some(0), Some(0)));
-            // The mount continues alone in the directory in which the next hub searches.
+            // After the hub has exited, the mount still publishes in its directory, and the next hub uses the same
+            // directory.
             let hub = start(user, &run).ready();
             let mut echo = start(user, &["echo", "mount/tilt", "--json"]);
             echo.await_line("an angle", is_class("tilt"));

@@ -1,4 +1,4 @@
-//! Tests of `scanhub simulate`: its flags determine what a hub or `probe` finds.
+//! Tests of `scanhub simulate`: the flags of the simulator determine what a hub or `probe` finds.
 
 use std::io::{Read, Write};
 use std::time::Duration;
@@ -105,7 +105,7 @@ fn rplidar_streams_in_the_requested_mode_and_replies() {
     let is_packet = |packet: &[u8]| packet[0] >> 4 == 0xA && packet[1] >> 4 == 5 && packet[132] >> 4 == 0xA;
     read("a stream", &mut port, &|bytes| bytes.windows(133).any(is_packet));
     port.write_all(&[0xA5, 0x25]).expect("a written request");
-    // A request for the recommended mode (parameter 7Ch). Its reply is the number of the mode.
+    // Request the recommended mode of the scanner (parameter 7Ch). The reply has the number of this mode.
     port.write_all(&[0xA5, 0x84, 4, 0x7C, 0, 0, 0, 0xA5 ^ 0x84 ^ 4 ^ 0x7C]).expect("a written request");
     let answer = [0xA5, 0x5A, 6, 0, 0, 0, 0x20, 0x7C, 0, 0, 0, 4, 0];
     read("an answer", &mut port, &|bytes| bytes.ends_with(&answer));
@@ -155,22 +155,22 @@ fn simulator_sends_recorded_packets_again() {
     wait_until("packets are sent again", || env.truth("again").len() > 100);
     assert_eq!(again.end(TERM).exit_code, Some(0));
     let replayed: Vec<_> = env.truth("again").into_iter().map(|sent| sent.hash).collect();
-    // The packets are a subsequence of those that were sent.
+    // The packets that the second simulator has replayed are some of those that the first one sent, in the same order.
     let mut rest = sent.iter();
     assert!(replayed.iter().all(|packet| rest.any(|sent| sent == packet)), "{} packets", replayed.len());
 }
 
-/// A host that pauses in the middle of a request and receives no reply can find the reason in the simulator's log.
+/// If a host pauses in the middle of a request, it receives no reply. The simulator's log then has the reason.
 #[test]
 fn dropped_request_is_reported_with_its_reason() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=3"]);
     let mut port = open_line(&env.path("front"), 9_600);
-    // A status request (Telegram listing, 31h), whose second half arrives far too late.
+    // Send a status request (Telegram listing, 31h), but its second half far too late.
     port.write_all(&[0x02, 0x00, 0x01]).expect("a written request");
     wait_at_least(Duration::from_secs(1));
     port.write_all(&[0x00, 0x31, 0x15, 0x12]).expect("a written request");
-    // A complete request. Its ACK shows that the simulator has handled all earlier bytes.
+    // Send a complete request. Its ACK shows that the simulator has handled all earlier bytes.
     port.write_all(&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12]).expect("a written request");
     let mut acknowledge = [0];
     wait_until("a reply", || port.read(&mut acknowledge).is_ok_and(|len| len > 0));

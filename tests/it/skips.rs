@@ -1,5 +1,5 @@
-//! Tests of skipped tests: a skip is reported even though the test harness hides the output of passed tests, and it
-//! fails if `SCANHUB_REQUIRE` names what is missing.
+//! Tests of skipped tests: the reason for a skip is printed although the test harness hides the output of passed tests.
+//! A test fails instead of being skipped if `SCANHUB_REQUIRE` names the missing requirement.
 
 use std::process::{Command, Output};
 
@@ -17,7 +17,7 @@ fn required_tool_may_not_be_skipped() {
         let message = skip_verdict(required, "tmux", "there is none").expect_err(required);
         assert_eq!(message, "tmux is required here by SCANHUB_REQUIRE: there is none");
     }
-    // If a misspelled name were accepted, it would require nothing.
+    // A misspelled name must be an error, because it would otherwise require nothing.
     for (required, need) in [("tmuks", "tmux"), ("", "tmuks"), ("tmux,netn", "cc")] {
         let message = skip_verdict(required, need, "there is none").expect_err(required);
         assert!(message.contains("is not a requirement of tests; known are bash, cc, "), "{message}");
@@ -31,7 +31,7 @@ fn skipped_test_is_reported_or_fails() {
     }
     let again = |required: &str| -> Output {
         let mut command = Command::new(own_program());
-        // Without `--nocapture`, the harness hides the output of passed tests.
+        // Leave out `--nocapture`, so that the harness hides the output of passed tests.
         command.args(&single_test_args("skips::skipped_test_is_reported_or_fails")[..2]);
         command.env(RERUN_VARIABLE, "1").env("SCANHUB_REQUIRE", required).env_remove("RUST_TEST_NOCAPTURE");
         output(command).expect("the output of the program")

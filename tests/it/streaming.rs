@@ -1,5 +1,5 @@
-//! Tests of two sensors that stream to a running hub with subscribers in separate processes: everything that was sent
-//! arrives, bit for bit and in order, and all verbs report the same.
+//! Tests of two sensors that stream to a running hub with subscribers in separate processes: all telegrams that were
+//! sent arrive, bit for bit and in order, and all verbs report the same values.
 
 use crate::testkit::{
     INT, MEASURED_VALUES, REAL_REPLY_TIME, TERM, TestEnv, bytes_of, contiguous_numbers, hash, is_class,
@@ -17,7 +17,7 @@ fn everything_sent_arrives_bit_for_bit_and_in_order() {
     let env = TestEnv::new();
     let hub = env.hub(&[env.link("front"), env.link("rear")]);
     let sensors = ["front", "rear"];
-    // The subscribers start before the first telegram is sent, so none may be missing.
+    // The subscribers start before the simulator sends the first telegram, so they must receive all telegrams.
     let mut subscribers =
         sensors.map(|sensor| ["telegram", "scan"].map(|topic| env.echo(&[&format!("{sensor}/{topic}")])));
     let simulator = env.simulator(&sensors, &["--seed=11", REAL_REPLY_TIME]);
@@ -53,8 +53,8 @@ fn everything_sent_arrives_bit_for_bit_and_in_order() {
     }
 }
 
-/// Asserts that a line of class `scan` has the values of a telegram in measuring mode 1 (13 bits of range, 3 of
-/// reflector level).
+/// Asserts that a line of class `scan` has the values of `telegram`, which was sent in measuring mode 1 (13 bits of
+/// range and 3 bits of reflector level).
 fn check_scan(scan: &Value, telegram: &[u8]) {
     let telegram = Telegram::check(telegram).expect("an intact telegram");
     let measured = MeasuredValues::decode(telegram).expect("a measured telegram");
@@ -97,7 +97,7 @@ fn verbs_agree_on_rate_state_and_counters() {
     assert_eq!(topics, expected.each_ref().map(|(name, payload): &(Value, Value)| (name, payload)));
     assert_eq!(number(&listed[0], "subscribers"), 1, "{listed:?}");
     let info = env.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 0.0));
-    // These are two measurements of the same stream. Neither is exact on a busy machine.
+    // `info` and `hz` each measure the rate of the same stream, and neither is exact on a busy machine.
     let hz_of_info = info["hz"].as_f64().unwrap_or_default();
     assert!((hz_of_info / hz - 1.0).abs() < 0.3, "info says {hz_of_info}, hz {hz}");
     let facts = ["state", "baud", "mode", "unit_mm", "angle_deg", "last_error"].map(|key| info[key].clone());
@@ -121,7 +121,7 @@ fn verbs_agree_on_rate_state_and_counters() {
     assert_eq!(hub.end(TERM).exit_code, Some(0));
 }
 
-/// Returns the number of telegrams in `bytes`, and of the bytes outside of telegrams.
+/// Returns the number of telegrams in `bytes`, and the number of bytes outside of telegrams.
 fn frame(mut bytes: &[u8]) -> (u64, u64) {
     let mut framer = Framer::default();
     while !bytes.is_empty() {
@@ -134,7 +134,7 @@ fn frame(mut bytes: &[u8]) -> (u64, u64) {
             assert!(matches!(found, FramerEvent::Telegram(_)));
         }
     }
-    // No later bytes can contradict the last telegram.
+    // Release the last telegram, because no later bytes can contradict it.
     framer.release(lms::framer::VETO_HOLD_TIME);
     while framer.poll().is_some() {}
     let tally = framer.counters();
@@ -143,6 +143,6 @@ fn frame(mut bytes: &[u8]) -> (u64, u64) {
 
 /// Largest range in 13 bits. Larger values are codes (Telegram listing, table 6-9).
 const LARGEST_RANGE: u64 = 8183 - 1;
-/// Codes from the largest value downwards.
+/// Names of the codes, from the largest value downwards.
 const CODES: [&str; 9] =
     ["no_return", "too_bright", "overflow", "overflow", "weak", "error", "overflow", "overflow", "beyond"];

@@ -1,5 +1,6 @@
-//! Tests of a hub that is stopped for a while, as on a suspended machine: it delivers what fits into the buffer of the
-//! line, counts the rest as lost, and continues. A stopped listener does not report waiting datagrams as new.
+//! Tests of a hub that is stopped for a while, as on a suspended machine: after it continues, it publishes the
+//! telegrams that the line's buffer could hold, and counts the others as lost. A stopped listener does not report
+//! datagrams that arrived meanwhile as new.
 
 use crate::testkit::{
     INT, TERM, TestEnv, TestGateway, bytes_of, hash, in_a_network, is_class, number, wait_until,
@@ -20,7 +21,7 @@ fn resumed_hub_delivers_backlog_with_right_stamps() {
     hub.signal(Signal::STOP);
     let lost = |env: &TestEnv| env.truth("front").iter().filter(|sent| sent.fault.is_some()).count();
     let before = lost(&env);
-    // The buffer is full, and more than a second has passed.
+    // When 50 telegrams are lost, the line's buffer is full, and more than a second has passed.
     wait_until("telegrams are lost", || lost(&env) > before + 50);
     let continued = now_ns();
     hub.signal(Signal::CONT);
@@ -40,7 +41,8 @@ fn resumed_hub_delivers_backlog_with_right_stamps() {
     let (Some(&first), Some(&last)) = (places.first(), places.last()) else { panic!("no telegram arrived") };
     assert!(places.is_sorted(), "out of order");
     assert!(places.iter().all(|&place| truth[place].fault.is_none()), "a telegram was not sent intact");
-    // The burst may be too fast for a subscriber, which then reports how many samples it missed.
+    // The hub publishes the buffered telegrams in a burst that may be too fast for a subscriber. The subscriber then
+    // reports how many samples it missed.
     let notices = outcome.of_class("notice");
     let of_telegrams = notices.iter().filter(|line| line["kind"] == "missed" && line["topic"] == "telegram");
     let missed: u64 = of_telegrams.map(|line| number(line, "missed")).sum();
@@ -50,21 +52,21 @@ fn resumed_hub_delivers_backlog_with_right_stamps() {
     let stamps: Vec<u64> = lines.iter().map(|line| number(line, "stamp_ns")).collect();
     assert!(stamps.is_sorted(), "stamps run backwards: {stamps:?}");
     // A telegram that waited has a stamp that is not too new, or a stamp that is marked as estimated. The hub estimates
-    // the stamp if the kernel's own threads have to wait for a processor. The line is then silent before the hub has
-    // read the whole backlog.
+    // the stamp if the line seems to be silent before the hub has read the whole backlog. This happens if the kernel's
+    // own threads have to wait for a processor.
     let is_estimate = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
     let sample = |n: usize| (truth[places[n]].sent_ns, stamps[n], is_estimate(&lines[n]));
     let all: Vec<(u64, u64, bool)> = (0..places.len()).map(sample).collect();
     let waited: Vec<_> = all.iter().filter(|(sent, ..)| (stopped..continued).contains(sent)).collect();
     let are_right = waited.iter().all(|(sent, stamp, is_estimate)| stamp < sent || *is_estimate);
     assert!(waited.len() > 10 && are_right, "{waited:?}");
-    // The hub reads the first of these telegrams at once. Its stamp is wrong only if the host was late before the hub
-    // was stopped: stamps continue with the period of the earlier scans.
+    // The hub reads the first of these telegrams at once. The stamp of this telegram continues the period of the
+    // earlier scans. It is therefore wrong only if the host was already late before the hub was stopped.
     let was_late = all.iter().any(|(sent, stamp, _)| *sent < stopped && stamp >= sent);
     assert!(was_late || waited.first().is_some_and(|(sent, stamp, _)| stamp < sent), "{all:?}");
 
-    // Each scan has a verdict. Additional samples of `zones` report a silence. No silence is reported between the scans
-    // that waited.
+    // Each scan has a verdict. Additional samples of `zones` report a silence. Between the scans that were buffered,
+    // the hub must not report a silence.
     let scans = outcome.of_class("scan");
     let ahead = outcome.of_class("zones").into_iter().filter_map(|line| {
         let scan = scans.iter().find(|scan| scan["seq"] == line["seq"])?;
@@ -76,7 +78,7 @@ fn resumed_hub_delivers_backlog_with_right_stamps() {
     assert!(last - first < waited.len() as u64 / 2, "{ahead:?} with {} that waited", waited.len());
 }
 
-/// Returns the time of CLOCK_MONOTONIC in ns, as in the truth file and in stamps.
+/// Returns the time of CLOCK_MONOTONIC in nanoseconds, which is the clock of stamps and of the simulator's log.
 fn now_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
@@ -88,10 +90,11 @@ fn datagram_for_a_stopped_listener_keeps_arrival_time() {
         let env = TestEnv::new();
         let mut listener = env.start(&["listen", "--json"]).ready();
         let mut sender = TestGateway::new(0x5f3a_12bc_00d1_e2f3, 7, 2, "front");
-        // Sends a sample to a listener that is stopped for a while. Returns its line and the range of possible stamps.
+        // Sends a sample to a listener that is stopped for a while. Returns the line that the listener prints, and the
+        // range of stamps that are right.
         let mut stop = || {
             listener.signal(Signal::STOP);
-            // Otherwise, a listener that still runs receives the datagram at once.
+            // Wait, because a listener that still runs would receive the datagram at once.
             wait_until("the listener is stopped", || listener.is_stopped());
             let before = now_ns();
             sender.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
@@ -99,10 +102,11 @@ fn datagram_for_a_stopped_listener_keeps_arrival_time() {
             wait_until("enough time to make a later stamp wrong", || now_ns() > after + 200_000_000);
             listener.signal(Signal::CONT);
             let line = listener.await_line("zones", is_class("zones"));
-            // The kernel stamps with another clock, so allow for a small difference.
+            // The kernel stamps datagrams with another clock, so allow for a small difference between the clocks.
             (line, before - 1_000_000..after + 100_000_000)
         };
-        // The kernel starts to stamp datagrams some time after the first socket of the machine requests it.
+        // After the first socket of the machine has requested stamps, it takes some time until the kernel stamps
+        // datagrams.
         wait_until("a stamp of the kernel", || {
             let (line, possible) = stop();
             possible.contains(&number(&line, "stamp_ns"))

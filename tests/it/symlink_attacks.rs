@@ -1,4 +1,5 @@
-//! Tests of symbolic links that another user has planted where root writes files: root's files stay unchanged.
+//! Tests of symbolic links that another user has created where programs of root write files. The files to which the
+//! links point must stay unchanged.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -10,7 +11,8 @@ use crate::testkit::{INT, Outcome, Program, TERM, is_class, wait_until};
 const TARGET_FILE: &str = "/mnt/victim";
 const TARGET_CONTENT: &str = "a file of root";
 
-/// Creates root's file and the input of each verb in a directory in which the other user cannot write.
+/// Creates the file of root that must not change, and the input files of the verbs, in a directory to which the other
+/// user cannot write.
 fn prepare() {
     fs::write(TARGET_FILE, TARGET_CONTENT).expect("a file");
     let scan = format!("FLASER 181{} 0 0 0 0 0 0 1.5 host 1.5\n", " 1.5".repeat(181));
@@ -83,19 +85,19 @@ fn directories_are_not_created_through_foreign_links() {
         }
         assert_eq!(fs::read_dir("/mnt/prey").expect("a readable directory").count(), 0);
         assert!(!fs::exists("/mnt/new").unwrap());
-        // Directories in a shared directory are created as usual.
+        // Inside a directory to which all users can write, the program creates new directories as usual.
         let outcome = run(&["man", "/tmp/pages/deep"]);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         assert!(fs::exists("/tmp/pages/deep/scanhub-run.1").unwrap());
     });
 }
 
-/// Another user could plant a name that contains the process ID before the process starts.
+/// If a name contained only the process ID, another user could create a link with this name before the process starts.
 #[test]
 fn temporary_file_names_cannot_be_guessed() {
     with_another_user("symlink_attacks::temporary_file_names_cannot_be_guessed", || {
         prepare();
-        // The program replaces the shell and therefore has its process ID.
+        // The program replaces the shell, and therefore has the shell's process ID, which is in the link's name.
         let planted = |name: &str, words: &str| {
             let link = format!("setpriv --reuid=65533 --clear-groups ln -s /mnt/victim /tmp/.{name}.$$");
             let mut shell = Command::new("sh");
@@ -116,13 +118,13 @@ fn temporary_file_names_cannot_be_guessed() {
     });
 }
 
-/// After `sudo -E`, the environment of another user may name the directory.
+/// After `sudo -E`, a variable in the environment of another user may name the state directory.
 #[test]
 fn state_directory_of_another_user_is_not_used() {
     with_another_user("symlink_attacks::state_directory_of_another_user_is_not_used", || {
         prepare();
         fs::create_dir("/mnt/prey").expect("a directory");
-        // Links at each of the levels that a program would open.
+        // Each command creates a link at another level of the path that a program would open.
         let plant = [
             "mkdir -p /tmp/state/scanhub && ln -s /mnt/victim /tmp/state/scanhub/gateway-scanhub-lo-1",
             "rm -r /tmp/state/scanhub && ln -s /mnt/prey /tmp/state/scanhub",
@@ -156,7 +158,7 @@ fn files_of_a_gateway_are_private() {
     with_another_user("symlink_attacks::files_of_a_gateway_are_private", || {
         fs::create_dir_all("/mnt/state/scanhub").expect("a directory");
         let file = "/mnt/state/scanhub/gateway-scanhub-lo-1";
-        // An earlier version left the file with this mode.
+        // Assume that an earlier version has left the file with a mode that lets all users write.
         fs::write(file, "").expect("a file");
         fs::set_permissions(file, Permissions::from_mode(0o666)).expect("permission to change the mode");
         let mut command = scanhub(0, &["gateway", "--json", "--no-system-config", "--interface=lo"]);
@@ -168,14 +170,15 @@ fn files_of_a_gateway_are_private() {
     });
 }
 
-/// Another user cannot block a demo by occupying its directory.
+/// Another user cannot block a demo by creating the demo's usual directory.
 #[test]
 fn demo_runs_if_its_usual_directory_is_occupied() {
     with_another_user("symlink_attacks::demo_runs_if_its_usual_directory_is_occupied", || {
         run_as_other_user("mkdir -m 777 /tmp/scanhub-0");
         let mut demo = scanhub(0, &["demo", "--headless", "--json"]);
         demo.env("PATH", std::env::var_os("PATH").unwrap_or_default());
-        // If /run belongs to root, this is the usual directory.
+        // Without this variable, and if /run belongs to root, the demo usually takes the directory that the other user
+        // has created.
         demo.env_remove("XDG_RUNTIME_DIR");
         let mut demo = Program::start(demo);
         let ready = demo.await_line("ready", is_class("ready"));

@@ -1,6 +1,6 @@
-//! Tests of names that are taken. Sensors, trackers and mounts share one name space per domain. A name belongs to the
-//! first process that publishes under it. A hub waits for a name that a program has. A program gets an error for a name
-//! that another process has.
+//! Tests of names that are already in use. Sensors, trackers and mounts share one name space per domain. A name belongs
+//! to the first process that publishes under this name. If another program has the name of a link, the hub waits until
+//! the name is free. A program does not wait: it reports an error and exits.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -16,13 +16,13 @@ fn start_mount(env: &TestEnv, name: &str) -> Program {
     env.start(&["simulate", "--json", "--world=tilt", &port, &format!("--angles={name}")])
 }
 
-/// Returns the message for a name that `holder` has.
+/// Returns the message with which programs report that `holder` uses the name `name`.
 fn name_taken_message(name: &str, holder: &Program) -> String {
     format!("the name {name} is published by process {} (scanhub)", holder.pid())
 }
 
-/// Asserts that a program got the error for a name that is taken. Programs whose stdout only has the line `ready`
-/// report errors on stderr.
+/// Asserts that a program has reported `message` as an error about a name in use, and has exited. Programs whose stdout
+/// only has the line `ready` report errors on stderr.
 fn assert_refused(outcome: &Outcome, message: &str) {
     let mut lines = outcome.stderr.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
     let error = lines.next_back().unwrap_or_default();
@@ -47,10 +47,10 @@ fn link_waits_for_a_name_in_use() {
         let list = env.run(&["list"]);
         let listed = String::from_utf8_lossy(&list.stdout).into_owned();
         assert!(listed.lines().any(|line| line.starts_with(&format!("front: {words}"))), "{list}");
-        // The program keeps its topic, and other links stream.
+        // The program that has the name still publishes its topic, and the other links stream.
         env.await_info("rear", |info| info["state"] == "streaming");
         env.echo(&["front/tilt"]).await_lines(20, "angles", is_class("tilt"));
-        // A second program receives the same message as the hub.
+        // A second program with this name reports the same message as the hub.
         assert_refused(&start_mount(&env, "front").wait(), &words);
 
         let mut waiting = env.echo(&["front/scan"]);
@@ -68,13 +68,14 @@ fn link_waits_for_a_name_in_use() {
         assert_eq!(scans[0]["topic_seq"], 0, "{waiting}");
         contiguous_numbers(&scans, "topic_seq");
 
-        // Now the hub has the name.
+        // Now the hub uses the name.
         assert_refused(&start_mount(&env, "front").wait(), &name_taken_message("front", &hub));
         let outcome = hub.end(TERM);
         assert_eq!(outcome.exit_code, Some(0), "{outcome}");
         let lines = outcome.stderr.lines().filter(|line| line.contains(&format!("front: absent: {words}")));
         assert_eq!(lines.count(), 1, "one line for one reason: {outcome}");
-        // The last publisher removes everything, including the files of a killed one.
+        // The last publisher in a domain removes everything when it exits, including the files that a killed publisher
+        // left.
         assert_eq!(start_mount(&env, "front").ready().end(INT).exit_code, Some(0));
         assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
     }
@@ -102,7 +103,7 @@ fn killed_hub_does_not_keep_its_names() {
     assert_eq!(ready["waiting"], Value::Array(Vec::new()), "{ready}");
     let outcome = hub.end(TERM);
     assert!(outcome.exit_code == Some(0) && !outcome.stderr.contains("is published by"), "{outcome}");
-    // A hub that ended normally does not keep its names either.
+    // A hub that has exited normally does not keep its names, either.
     let holder = start_mount(&env, "front").ready();
     assert_eq!(holder.end(INT).exit_code, Some(0));
 }
@@ -118,7 +119,7 @@ fn program_is_refused_the_name_of_another_program() {
     assert!(env.leftover_files().is_empty(), "{:?}", env.leftover_files());
 }
 
-/// A recording does not wait for its names, because the links of a replay start together.
+/// A replay does not wait for the names of its sensors, because all links of a replay start together.
 #[test]
 fn recording_is_refused_the_name_of_a_program() {
     let env = TestEnv::new();

@@ -1,5 +1,5 @@
-//! Tests of `scanhub telegram decode`: it explains every telegram, counts every byte outside of telegrams, and refuses
-//! unreadable input with a remedy.
+//! Tests of `scanhub telegram decode`: it explains every telegram, counts every byte outside of telegrams, and for
+//! input that cannot be read it prints an error with a remedy.
 
 use std::io::Write as _;
 use std::process::{Command, Output, Stdio};
@@ -17,7 +17,7 @@ use serde_json::Value;
 
 use crate::testkit::spawn;
 
-/// Runs the verb with `input` on its stdin.
+/// Runs `scanhub telegram` with these words as further arguments, and with `input` on its stdin.
 fn telegram(words: &[&str], input: &[u8]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command
@@ -30,10 +30,10 @@ fn telegram(words: &[&str], input: &[u8]) -> Output {
     let mut program = spawn(command).expect("a started program");
     let mut stdin = program.stdin.take().expect("a pipe");
     let input = input.to_vec();
-    // The program may write before it has read everything.
+    // Write in a thread, because the program may print before it has read all input, and the pipes would fill.
     let writer = std::thread::spawn(move || stdin.write_all(&input));
     let output = program.wait_with_output().expect("the output of the program");
-    // A program that reads nothing closes its end of the pipe.
+    // Writing fails if the program exits without reading its stdin, which is not an error here.
     let _ = writer.join().expect("a thread that does not panic");
     output
 }
@@ -46,7 +46,7 @@ fn lines(output: &Output) -> Vec<Value> {
     text(&output.stdout).lines().map(|line| serde_json::from_str(line).expect("an object")).collect()
 }
 
-/// Returns every request and the simpler replies, each with a part of its explanation.
+/// Returns every request and the simpler replies, each with a part of the explanation that the verb must print for it.
 fn telegrams() -> Vec<(EncodedTelegram, &'static str)> {
     let span = |first, last| SubRange { first, last };
     let spans = |spans: &[SubRange]| SubRanges::new(spans).expect("one to five sub-ranges");
@@ -226,7 +226,8 @@ fn telegrams_inside_a_recording_are_decoded() {
     let output = telegram(&["decode", "--json", golden], &[]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     let (decoded, summary) = (lines(&output), lines(&output).pop().expect("a summary"));
-    // Every byte belongs to a telegram: the program does not take the framing of the file for one.
+    // All bytes that the program examined belong to telegrams. It has examined only the recorded telegrams, and not the
+    // other bytes of the file.
     let inside: u64 = decoded.iter().filter_map(|line| line["length"].as_u64()).sum();
     assert!(inside > 0 && inside < bytes.len() as u64, "{summary}");
     assert_eq!((summary["bytes"].as_u64(), summary["other_bytes"].as_u64()), (Some(inside), Some(0)));

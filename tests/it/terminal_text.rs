@@ -1,12 +1,12 @@
-//! Tests of control characters in files, on a line and in names: they reach neither stdout nor stderr unescaped. JSON
-//! has them as escapes.
+//! Tests of control characters in files, on a serial line and in names. No program writes them unescaped to stdout or
+//! stderr. JSON lines have them as escapes.
 
 use std::fs;
 
 use crate::testkit::{Outcome, TERM, TestEnv};
 use scanhub_drivers::lms::telegram::Writer;
 
-/// Characters of C0, DEL and C1, which a terminal may take for commands.
+/// Characters of C0, DEL and C1, which a terminal may interpret as commands.
 const CONTROL_CHARACTERS: &str = "\u{1b}]0;x\u{7}\u{9b}31m\u{7f}\u{85}\u{9d}";
 
 /// Asserts that the output has no control characters except line feeds.
@@ -26,7 +26,8 @@ fn configuration_text_has_no_control_characters() {
         "sound.toml",
         format!("[[link]]\nname = \"a\"\nport = \"{port}\"\n[gateway]\ninterface = \"{quoted}\"\n"),
     );
-    // A key with bytes that TOML does not allow, and a value and a key with C1 characters, which TOML allows.
+    // The first file has a key with characters that TOML does not allow. The others have a value and a key with C1
+    // characters, which TOML allows.
     let raw = env.file("raw.toml", "[[link]]\nname = \"a\"\npo\u{1b}[2Jrt = 1\n");
     let value = env.file("value.toml", "[[link]]\nname = \"\u{9b}31m\"\nport = \"x\"\n");
     let key = env.file("key.toml", "[[link]]\n\"\u{9b}31m\\u001b\" = 1\n");
@@ -49,10 +50,10 @@ fn configuration_text_has_no_control_characters() {
             assert_printable(&outcome);
         }
     }
-    // JSON has the exact value.
+    // JSON output has the exact value, with escapes.
     let outcome = env.run(&["config", "check", &sound, "--json"]);
     assert_eq!(outcome.lines()[0]["links"][0]["port"], format!("/dev/{CONTROL_CHARACTERS}"), "{outcome}");
-    // Check the log of a hub, its status, and verbs that print the status.
+    // Check the log of a hub, and verbs that print the status of the hub.
     let hub = env.hub(&["--config", &sound]);
     for verb in
         [&["info", "a"][..], &["info", "a", "--json"], &["list"], &["echo", "a/status", "-n1", "--json"]]

@@ -1,5 +1,5 @@
-//! Tests with three machines on a router: two rooms with a hub each, and a machine that watches both. The test's own
-//! network is the router's machine, which has a cable to each of the three.
+//! Tests with three machines that a router connects: two rooms with a hub each, and a machine that receives from both.
+//! The router runs in the test's own network, which has a cable to each of the three machines.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,8 @@ use crate::testkit::{
     is_class, number, skip, wait_until,
 };
 
-/// Returns the path of `scanhub-bridge`, or skips if it is not built: `cargo build` alone does not build it.
+/// Returns the path of `scanhub-bridge`, or skips the test if the bridge is not built. `cargo build` alone does not
+/// build it.
 fn bridge_program() -> Option<PathBuf> {
     let default_path = Path::new(env!("CARGO_BIN_EXE_scanhub")).with_file_name("scanhub-bridge");
     if !default_path.is_file() {
@@ -20,7 +21,7 @@ fn bridge_program() -> Option<PathBuf> {
     Some(default_path)
 }
 
-/// Returns the bridge with these flags, in the network and domain of `env`.
+/// Returns a command that runs the bridge with these flags, in the network and the domain of `env`.
 fn command(env: &TestEnv, flags: &[&str]) -> Command {
     let inner = env.command(flags);
     let own = OsStr::new(env!("CARGO_BIN_EXE_scanhub"));
@@ -39,7 +40,7 @@ fn command(env: &TestEnv, flags: &[&str]) -> Command {
     command
 }
 
-/// Starts a bridge and waits until it is ready. Returns it with its hub ID.
+/// Starts a bridge and waits until it is ready. Returns the bridge and its hub ID.
 fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut program = Program::start(command(env, &[&["--json"], flags].concat()));
     let begin = program.await_line("the first line", is_class("bridge_ready"));
@@ -82,7 +83,7 @@ fn third_machine_receives_two_rooms() {
             here.await_line("a room", |line| line["kind"] == "published");
         }
 
-        // The third machine receives both rooms as if they were local.
+        // On the third machine, verbs can use the sensors of both rooms like local sensors.
         for room in ["room0.front", "room1.front"] {
             let ages = watcher.run(&["latency", &format!("{room}/scan"), "-n20", "--json"]);
             let line = ages.of_class("latency").pop();
@@ -106,10 +107,11 @@ fn third_machine_receives_two_rooms() {
         assert!(code == Some(0) && found.len() == 1 && found[0].0 == "ok", "{found:?}");
         assert!(bridges.iter().all(|(_, hub)| found[0].1.contains(hub)), "{found:?}");
 
-        // The slots of `watch` become free only after the publishers have cleaned up.
+        // A killed `watch` leaves its subscriber slots. They become free only after the publishers have cleaned up.
         wait_until("the end of the subscription", || watcher.subscribers("room0.front/zones") == 0);
 
-        // Without the router, the rooms continue on their own. No other machine keeps an old verdict.
+        // Without the router, the programs in a room continue to receive from their own hub. On other machines, the
+        // verdict of the room becomes `unknown`.
         let mut zones = watcher.echo(&["room0.front/zones"]);
         zones.await_line("a verdict", |line| line["class"] == "zones" && line["verdict"] != "unknown");
         let mut local = rooms[0].start(&["hz", "--json", "front/scan"]);

@@ -1,5 +1,5 @@
-//! Checks of the project's sources. Each test first finds the project in order, then builds in violations and must find
-//! each of them.
+//! Checks of the project's sources. Each test asserts that the sources conform to a rule. It then changes copies of the
+//! sources in memory so that they violate the rule, and asserts that the rule finds each violation.
 
 mod between;
 mod crates;
@@ -16,7 +16,8 @@ mod words;
 
 use tree::{Rule, SourceTree};
 
-/// Asserts that the project's tree conforms to the rule `wall`, and that each tree of `broken` violates it.
+/// Asserts that the project's tree conforms to the rule `wall`, and that each tree that `broken` returns violates the
+/// rule.
 fn assert_rule(wall: Rule, broken: impl Fn(&SourceTree) -> Vec<SourceTree>) {
     let tree = SourceTree::load();
     let breaches = wall(&tree);

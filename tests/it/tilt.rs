@@ -1,5 +1,5 @@
-//! Tests of `scanhub tilt`, from telegrams and angles to points and an obstacle: with the commands of its page, and
-//! with missing angles.
+//! Tests of `scanhub tilt`, from telegrams and angles to points and an obstacle. The tests use the commands of the page
+//! about `tilt`, and also check what happens when angles are missing.
 
 use std::cell::Cell;
 
@@ -14,8 +14,8 @@ use crate::recorded_world::{START_NS, recorded_world};
 use crate::testkit::{INT, Outcome, Program, TestEnv, is_class, number};
 use crate::tilted::TiltedPublisher;
 
-/// World with a hall, a post ahead of the sensor, and a mount that tilts slowly. The late stamps of a busy machine
-/// therefore move points little.
+/// World with a hall, a post ahead of the sensor, and a mount that tilts slowly. Because the mount is slow, the late
+/// stamps on a busy machine displace points only a little.
 const TILT_WORLD: &str = "
 [[sensor]]
 pose = [0, 0, 90]
@@ -36,7 +36,7 @@ height_mm = 800
 pose = [0, 1500]
 ";
 
-/// Argument for a box around the post in which obstacles are near.
+/// Flag with a box around the post. Obstacles in this box are marked as near.
 pub(crate) const NEAR_FLAG: &str = "--near=1,2,-0.5,0.5,0.1,0.7";
 
 pub(crate) struct TiltHub {
@@ -50,7 +50,7 @@ impl TiltHub {
         TiltHub::with_encoder("mount")
     }
 
-    /// Starts a hub with a mount whose angles are published as `name`.
+    /// Starts a hub with a scanner on a mount. The angles of the mount are published under the name `name`.
     fn with_encoder(name: &str) -> TiltHub {
         let env = TestEnv::new();
         let world = env.file("hall.toml", TILT_WORLD);
@@ -71,7 +71,7 @@ fn tilt(env: &TestEnv, more: &[&str]) -> Program {
     env.start(&[&place[..], more].concat())
 }
 
-/// Replays a recording of `world` in a loop. Its stamps are exact, however busy the machine is.
+/// Replays a recording of `world` in a loop. The stamps of the replay are exact, however busy the machine is.
 fn replay_tilt(env: &TestEnv, world: &str) -> Program {
     let file = recorded_world(env, &World::of_toml("hall", world).expect("a world"), &["front"], 20);
     env.start(&["replay", &file, "--loop", "--json", "--no-system-config"]).ready()
@@ -114,7 +114,7 @@ fn points_match_the_hall_and_the_post_is_an_obstacle() {
     let before = number(&clouds.await_line("the end of a sweep", is_last), "sweep");
     let sweep = number(&clouds.await_line("the end of the next one", is_last), "sweep");
     assert!(sweep > before, "{sweep} {before}");
-    // A sweep may have few points, because a busy machine loses scans.
+    // On a busy machine, scans are lost, so a sweep may have few points. Collect the points of several sweeps.
     let count = Cell::new(0);
     clouds.await_line("enough points", |line| {
         count.set(count.get() + line["points"].as_array().map_or(0, Vec::len));
@@ -128,9 +128,9 @@ fn points_match_the_hall_and_the_post_is_an_obstacle() {
     let points: Vec<Vec<f64>> = points.collect();
     let mut off: Vec<f64> = points.iter().map(|point| distance_from_wall(point)).collect();
     off.sort_by(f64::total_cmp);
-    // If the machine stalls, the hub stamps scans late.
+    // Only nine of ten points must be near a surface, because the hub stamps scans late if the machine stalls.
     assert!(off[off.len() * 9 / 10] < 0.08, "{:?}", [off[off.len() / 2], off[off.len() * 9 / 10]]);
-    // `tilt` refuses a name that a link, a mount or another `tilt` has.
+    // `tilt` must not use a name that a link, a mount or another `tilt` uses.
     let again = hall.tilt(&["--as=hall"]).wait();
     let held = |name: &str, pid: u32| format!("the name {name} is published by process {pid} (scanhub)");
     assert!(again.exit_code == Some(75) && reports_error(&again, &held("hall", tilt.pid())), "{again}");
@@ -150,7 +150,8 @@ fn points_match_the_hall_and_the_post_is_an_obstacle() {
 fn page_programs_publish_mount_angles() {
     let page = TestEnv::new();
     for example in examples_on("docs/tilt.md", "mount", &page) {
-        // An interrupted program leaves its topic in its domain until the next program replaces it.
+        // Use a new domain for each program, because an interrupted program leaves its topic in the domain until
+        // another program replaces it.
         let env = TestEnv::new();
         let _hub = env.hub(&[env.link("front")]);
         let mount = Program::start(example.command(&env));
@@ -165,13 +166,13 @@ fn page_programs_publish_mount_angles() {
             example.location
         );
         let outcome = mount.end(INT);
-        // An interrupt ends a Python program with a traceback.
+        // A Python program prints a traceback when it is interrupted.
         assert!(outcome.stderr.is_empty() || outcome.stderr.contains("KeyboardInterrupt"), "{outcome}");
     }
 }
 
-/// Tests a mount whose program is not in Rust: it receives the angles of the simulated encoder and publishes them
-/// again.
+/// Programs in several languages act as the program of the mount. Each of them receives the angles of the simulated
+/// encoder and publishes them again.
 #[test]
 fn tilt_accepts_angles_of_programs_in_all_languages() {
     let hall = TiltHub::with_encoder("encoder");
@@ -196,7 +197,7 @@ fn tilt_accepts_angles_of_programs_in_all_languages() {
         let [x, y] = ["x_m", "y_m"].map(|key| obstacles["obstacles"][0][key].as_f64().expect("a number"));
         assert!((x - 1.42).abs() < 0.1 && y.abs() < 0.1, "{obstacles}");
         let sum = &found.of_class("summary")[0];
-        // On a busy machine, `tilt` may miss angles.
+        // On a busy machine, `tilt` may miss angles, but no angle may be wrong.
         let invalid =
             ["angles_out_of_order", "angles_in_future", "angles_invalid"].map(|key| number(sum, key));
         assert_eq!(invalid, [0; 3], "{sum}");
@@ -213,7 +214,7 @@ pub(crate) fn end_cleanly(hall: TiltHub) {
 fn commands_of_the_page_find_an_obstacle() {
     let hall = TiltHub::new();
     let lines = commands_on("docs/tilt.md", &["scanhub tilt front --angles", "scanhub echo hall/"]);
-    // The third command, with `--check`, has its own test.
+    // Another test checks the third command, which has the flag `--check`.
     let [tilt, echo, _] = &lines[..] else { panic!("{lines:?}") };
     let start = |words: &[String]| hall.env.start(&[words, &["--json".to_owned()]].concat());
     let mut tilt = start(tilt);
@@ -235,7 +236,7 @@ fn tilt_processes_a_replayed_recording() {
     assert_eq!(env.run(&["control", "front", "resume"]).exit_code, Some(0));
     let angles = echo.await_lines(100, "angles", is_class("tilt"));
     for pair in angles.windows(2) {
-        // At rate 1, the times between stamps are the same as in the recording.
+        // At rate 1, the intervals between the stamps of the replay are the same as in the recording.
         assert_eq!(number(&pair[1], "stamp_ns") - number(&pair[0], "stamp_ns"), 10_000_000, "{pair:?}");
         assert_eq!(number(&pair[1], "wall_ns") - number(&pair[0], "wall_ns"), 10_000_000, "{pair:?}");
     }
@@ -311,7 +312,7 @@ fn reports_missing_angles_and_bad_arguments() {
     let mut hall = TiltHub::new();
     let mut tilt = hall.tilt(&[]);
     tilt.await_line("a sweep", is_class("obstacles"));
-    // The angles end with the simulator. Scans continue from another simulator.
+    // The angles end when their simulator exits. Another simulator then continues the scans.
     drop(hall.simulator.take().map(|simulator| simulator.end(INT)));
     hall.simulator = Some(hall.env.simulator(&["front"], &["--world=room", "--baud=500000"]));
     let report = tilt.await_line("no angles", |line| is_class("angles")(line) && line["problem"] == "silent");

@@ -1,5 +1,5 @@
-//! Tests of the topics that mounts and `tilt` publish, from a program next to a hub: every reader reports the same
-//! values, on this machine, on another one and in a recording.
+//! Tests of the topics that mounts and `tilt` publish. A program next to a hub publishes them here. Every reader
+//! reports the same values, on the same machine, on another machine and in a recording.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -16,7 +16,7 @@ use crate::testkit::{
     INT, Outcome, Program, Recording, TestEnv, client_python, in_a_network, number, wait_until,
 };
 
-/// Publisher of a mount's angle and of clouds and obstacles, in one program.
+/// Publisher of the mount's angles and of the clouds and obstacles from `tilt`, in one program.
 pub(crate) struct TiltedPublisher {
     tilt: Publication<Tilt>,
     cloud: Publication<Cloud>,
@@ -26,8 +26,8 @@ pub(crate) struct TiltedPublisher {
     pub(crate) round_count: u32,
 }
 
-/// Number of points per sample. It equals the maximum number of beams of an LMS, so a sample does not fit into one
-/// datagram.
+/// Number of points in a sample of topic `cloud`. It is the maximum number of beams of an LMS. A sample with this
+/// number of points does not fit into one datagram.
 const POINT_COUNT: u16 = 401;
 
 impl TiltedPublisher {
@@ -41,7 +41,7 @@ impl TiltedPublisher {
         TiltedPublisher { tilt: mount.topic().unwrap(), cloud, obstacles, mount, room, round_count: 0 }
     }
 
-    /// Publishes an angle, obstacles and two clouds that differ in each round.
+    /// Publishes an angle, obstacles and two clouds. Their values are different in each round.
     pub(crate) fn publish_round(&mut self) {
         let (sweep, k) = (self.round_count, self.round_count as f32 / 8.0);
         let at = |header: Header, sensor| Header { sensor, ..header };
@@ -82,8 +82,8 @@ impl TiltedPublisher {
         self.round_count += 1;
     }
 
-    /// Publishes rounds until each of `programs` has printed lines of every class. Then publishes more rounds until
-    /// each of `programs` has printed lines of every class from these rounds.
+    /// Publishes rounds until each of `programs` has printed lines of every class in [`CLASSES`]. Then continues until
+    /// each program has also printed lines of every class that belong to the additional rounds.
     fn publish_until_received(&mut self, programs: &mut [&mut Program]) {
         for since in [0, 1] {
             let since = since * u64::from(self.round_count);
@@ -109,12 +109,13 @@ pub(crate) fn round_of(line: &Value) -> u64 {
 pub(crate) const CLASSES: [&str; 3] = ["tilt", "cloud", "obstacles"];
 pub(crate) const TOPICS: [&str; 3] = ["mount/tilt", "room/cloud", "room/obstacles"];
 
-/// Starts a hub whose port does not exist.
+/// Starts a hub whose only port does not exist.
 pub(crate) fn hub(env: &TestEnv) -> Program {
     env.hub(&[env.link("front")])
 }
 
-/// Asserts that lines of `class` that both programs printed agree in `keys`. Returns the number of these lines.
+/// Asserts that the lines of `class` that both programs have printed have the same values for `keys`. Returns the
+/// number of these lines.
 fn assert_same_lines(first: &Outcome, other: &Outcome, class: &str, keys: &[&str]) -> usize {
     let others = other.of_class(class);
     let mut same = 0;
@@ -163,7 +164,8 @@ fn echo_python_and_recording_have_equal_samples() {
             assert!(assert_same_lines(&echo, &subscriber, class, &keys) >= 2, "{class}");
         }
     }
-    // All subscribers were attached before the first sample, so the recording has the samples that `echo` printed.
+    // All subscribers were attached before the first sample was published, so the recording has the same samples as
+    // `echo` has printed.
     let recording = Recording::read_complete(file.as_ref());
     let [tilt, clouds, obstacles] = TOPICS.map(|topic| recording.of(topic));
     for (i, line) in echo.of_class("cloud").iter().enumerate() {
@@ -181,7 +183,7 @@ fn echo_python_and_recording_have_equal_samples() {
     assert!(tilt.len() >= 2 && Tilt::default().unpack(tilt[0].payload()));
 }
 
-/// Tests clouds that take several datagrams. `listen --publish` publishes the same values as the other machine.
+/// A cloud takes several datagrams. On the other machine, `listen --publish` must publish the same values.
 #[test]
 fn remote_machine_receives_equal_tilted_samples() {
     in_a_network("tilted::remote_machine_receives_equal_tilted_samples", || {

@@ -1,5 +1,5 @@
-//! Tests of `scanhub track` and `scanhub site`, from telegrams to tracks: one person who walks from room to room,
-//! identical tracks from a replay, a site file with an unknown sensor, and a plan that is drawn once.
+//! Tests of `scanhub track` and `scanhub site`, from telegrams to tracks. A person walks from room to room, a replay
+//! gives identical tracks, a site file names an unknown sensor, and a plan is drawn only once.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -55,7 +55,7 @@ speed_mm_s = 1000
 from_s = 12
 "#;
 
-/// Records what both sensors see during this number of seconds, and returns the file.
+/// Writes a recording of both sensors that covers this number of seconds, and returns its path.
 pub(crate) fn record_people(env: &TestEnv, seconds: u64) -> String {
     record_world(env, WORLD, seconds)
 }
@@ -134,7 +134,7 @@ fn track_and_record(env: &TestEnv, site: &str, file: &str) -> (Program, Program)
     (track, record)
 }
 
-/// Waits until the tracker `house` publishes and is subscribed to the sensors.
+/// Waits until the tracker `house` publishes its topics and is subscribed to those of the sensors.
 fn await_tracker(env: &TestEnv) {
     wait_until("the tracker publishes", || {
         let listed = env.run(&["list", "--json"]).of_class("topic");
@@ -145,12 +145,12 @@ fn await_tracker(env: &TestEnv) {
     }
 }
 
-/// Wall clocks and payloads of a tracker's samples.
+/// Wall-clock stamps and payloads of the samples of a tracker's topic.
 type PublishedSamples = Vec<(u64, Vec<u8>)>;
 
-/// Plays `file` to a tracker. Plays each telegram only when the tracker has nearly caught up, so that the tracker
-/// misses nothing however busy the machine is. Returns the tracks and events that the tracker published in the first
-/// twenty seconds of the world.
+/// Plays `file` to a tracker. Plays each telegram only when the tracker has nearly processed the earlier ones, so that
+/// the tracker misses nothing, however busy the machine is. Returns the tracks and the events that the tracker
+/// published for the first twenty seconds of the world.
 fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [PublishedSamples; 2] {
     let sources = Sources { set: vec!["background.scans=100".to_owned()], ..Sources::default() };
     let play = PlaybackOptions { is_paused: true, ..PlaybackOptions::default() };
@@ -200,19 +200,19 @@ fn track_locally_and_remotely(env: &TestEnv, site: &str, file: &str) -> [Publish
     })
 }
 
-/// Time that the tracker waits for scans of other sensors, in ns.
+/// Time that the tracker waits for scans of other sensors, in nanoseconds.
 const DELAY_NS: u64 = 300_000_000;
-/// Lead of the played scans over the tracker's samples in ns. It is less than [`DELAY_NS`] and more than the interval
-/// of the tracker's samples (40 ms).
+/// Time in nanoseconds by which the played scans may be ahead of the tracker's last sample, in addition to
+/// [`DELAY_NS`]. It is less than [`DELAY_NS`] and more than the interval of the tracker's samples (40 ms).
 const LEAD_NS: u64 = 160_000_000;
-/// Lead before the tracker's first sample in ns, while no sample shows what the tracker has received. The sum of this
-/// lead and [`DELAY_NS`] is long enough for that sample. It is less than the 16 foregrounds that can wait for the
-/// tracker (426 ms).
+/// Time in place of [`LEAD_NS`] before the tracker's first sample, in nanoseconds. In this time, no sample shows what
+/// the tracker has received. The sum of this time and [`DELAY_NS`] is long enough for the first sample. It is shorter
+/// than the time of the 16 foregrounds that can be buffered for the tracker (426 ms).
 const FIRST_LEAD_NS: u64 = 100_000_000;
-/// End of the compared span, in ns from the start of the world.
+/// End of the time whose samples are compared, in nanoseconds from the start of the world.
 const END_NS: u64 = 20_000_000_000;
 
-/// Ends the player even after a panic, because the test joins the hub's thread.
+/// Ends the player when it is dropped, even in a panic. Otherwise the test would wait forever for the hub's thread.
 struct StopPlayerOnDrop(Arc<Player>);
 
 impl Drop for StopPlayerOnDrop {
@@ -250,7 +250,7 @@ fn replay_gives_identical_tracks_and_events() {
         let [tracks_again, events_again] = track_locally_and_remotely(&env, &site, &file);
         assert!(tracks == tracks_again, "{} and {} tracks", tracks.len(), tracks_again.len());
         assert_eq!(events, events_again);
-        // The samples have the same content as the lines.
+        // The samples must have the same content as the lines that the tracker has printed.
         let is_door = |(_, payload): &&(u64, Vec<u8>)| {
             let mut event = Event::default();
             assert!(event.unpack(payload));
@@ -266,7 +266,7 @@ fn replay_gives_identical_tracks_and_events() {
     });
 }
 
-/// Compares the output of the page's program with the lines of `track` while both run.
+/// Compares the output of the program on the page with the lines of `track`, while both run.
 #[test]
 fn python_program_gets_all_events_live_and_in_order() {
     let env = TestEnv::new();

@@ -1,4 +1,5 @@
-//! Tests docs/tracks.md: its site with a remote sensor in it, its commands, and the output that it shows.
+//! Tests of docs/tracks.md: the site on the page, which has a remote sensor, the commands, and the output that the page
+//! shows.
 
 use crate::pages::text_on;
 use crate::recorded_world::recorded_world;
@@ -7,8 +8,8 @@ use scanhub_sim::world::World;
 
 const PAGE: &str = "docs/tracks.md";
 
-/// World of the page's site: two rooms and a corridor between them, through which the first person walks from `hall` to
-/// `kitchen`. There is a sensor in the middle of each outer wall.
+/// World that matches the site on the page: two rooms and a corridor between them. The first person walks through the
+/// corridor from `hall` to `kitchen`. A sensor is in the middle of the outer wall of each room.
 const WORLD: &str = r#"
 [[sensor]]
 pose = [0, 2500, 0]
@@ -34,7 +35,8 @@ speed_mm_s = 1000
 from_s = 12
 "#;
 
-/// Replays the recording of `sensor`. The replay acts as the hub of the robot or of the machine in the kitchen.
+/// Replays the recording of `sensor`. The replay takes the place of a hub, on the robot or on the machine in the
+/// kitchen.
 fn play(env: &TestEnv, file: &str, sensor: &str) -> Program {
     let flags = ["--json", "--paused", "--hold"];
     env.start(&[&["replay", file, "--sensor", sensor][..], &flags].concat()).ready()
@@ -51,8 +53,8 @@ fn commands_of_the_page_print_its_output() {
         let world = World::of_toml("world.toml", WORLD).expect("a world");
         let file = recorded_world(&robot, &world, &["front", "rear"], 30);
         let _played = [play(&robot, &file, "front"), play(&kitchen, &file, "rear")];
-        // The recordings are still paused, so the sensor sends no samples. With a key, the listener publishes the
-        // sensor anyway.
+        // The recordings are still paused, so no samples arrive from the sensor in the kitchen. Because the listener
+        // has a key, it publishes the sensor without waiting for samples.
         let made = robot.run(&["key", "new", &robot.path_argument("key")]);
         assert_eq!(made.exit_code, Some(0), "{made}");
         let key = format!("--key-file={}", robot.path_argument("key"));
@@ -63,7 +65,8 @@ fn commands_of_the_page_print_its_output() {
         let mut listen = robot.start(&["listen", "--publish", "--json", &name, &key]).ready();
         listen.await_line("the sensor in the kitchen", |line| line["sensor"] == "kitchen.rear");
 
-        // Two of the commands on the page. Both wait longer than the page says, because the machine may be busy.
+        // Start two of the commands on the page. Unlike on the page, they have a longer `--delay`, because the machine
+        // may be busy.
         let mut track = robot.start(&["track", "--site", &site, "--delay=2s"]);
         let count = robot.start(&["track", "--site", &site, "--count", "left", "--delay=2s"]);
         wait_until("subscriptions to all sensors", || {

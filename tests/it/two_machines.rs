@@ -1,5 +1,5 @@
-//! Tests of a hub and its gateway on one machine and listeners on others, with a relay between them that loses,
-//! duplicates and reorders datagrams and logs which.
+//! Tests of a hub and its gateway on one machine, and of listeners on other machines. A relay between them drops,
+//! duplicates and reorders datagrams, and logs the datagrams that it forwards.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,10 +11,10 @@ use scanhub_schema::Topic;
 use scanhub_schema::datagram::Announce;
 use serde_json::Value;
 
-/// Number of datagrams that are sent while the network is faulty, which takes some seconds.
+/// Number of datagrams that the relay forwards while it is faulty, which takes some seconds.
 const ROUGH_DATAGRAMS: usize = 2000;
 
-/// Numbers of a sensor and of a topic.
+/// A sensor's number and a topic's number.
 type StreamKey = (u8, u8);
 
 /// Starts a gateway that sends all topics of all sensors.
@@ -45,7 +45,7 @@ fn stream(line: &Value, names: &BTreeMap<String, u8>) -> StreamKey {
     (names[text("sensor")], topic)
 }
 
-/// Returns the numbers of the sensors that are announced in `log`, by name.
+/// Returns the numbers of the sensors that are announced in `log`, by the name of the sensor.
 fn announced_names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
     let announce = |bytes: &Vec<u8>| {
         let datagram = decode_datagram(bytes);
@@ -56,13 +56,13 @@ fn announced_names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
     log.iter().filter_map(announce).collect()
 }
 
-/// Computes the counters of a listener that received `log`, as docs/datagram.md defines them. Unlike a listener, it
-/// uses the whole log and sets.
+/// Computes the counters of a listener that received `log`, as docs/datagram.md defines them. Unlike a listener, this
+/// function has the whole log and uses sets of numbers.
 fn expected_counters(log: &[Vec<u8>]) -> BTreeMap<StreamKey, [u64; 4]> {
     #[derive(Default)]
     struct StreamLog {
         numbers: BTreeSet<u32>,
-        /// Next sequence number in the first announcement, if that arrived before any sample.
+        /// Next sequence number in the first announcement, if the announcement arrived before any sample of the stream.
         announced_first: Option<u32>,
         announced_last: u32,
         duplicate: u64,
@@ -123,7 +123,7 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
         let late = listener(&env, &["--stats"]);
         let before_late = relay.connect(&third);
         wait_until("the other half", || relay.forwarded().len() > before_late + ROUGH_DATAGRAMS / 2);
-        // Let the last announcement through, so that listeners can count the losses before it.
+        // Let the last announcement through, so that listeners can count the datagrams that were lost before it.
         relay.set_faulty(false);
         let sent = gateway.end(TERM);
         assert_eq!(sent.exit_code, Some(0), "{sent}");
@@ -141,7 +141,7 @@ fn listeners_count_exactly_the_datagrams_they_lost() {
             expected_counters(&log[before_late..]),
             "losses must be counted from the first datagram"
         );
-        // A listener that ran from the start can account for all that was sent.
+        // A listener that ran from the start must count every datagram that was sent as received or lost.
         assert_eq!(early_counters.len(), sent.len());
         for (stream, [received, lost, ..]) in &early_counters {
             assert_eq!(received + lost, sent[stream], "{stream:?}");
@@ -184,7 +184,7 @@ fn remote_sensor_works_like_a_local_one() {
         let mut there = robot.env.echo(&["front/scan"]);
         let mut here = env.echo(&[&front, &rear]);
         here.await_lines(40, "scans", is_class("scan"));
-        // On a busy machine, each of the two subscribers may miss scans that the other one received.
+        // On a busy machine, each of the two subscribers may miss scans that the other one has received.
         let received_by_both = || {
             let scan = here.await_line("a scan", is_class("scan"));
             there.await_line("this scan or a later one", |line| line["seq"].as_u64() >= scan["seq"].as_u64());
@@ -197,7 +197,8 @@ fn remote_sensor_works_like_a_local_one() {
         let rate =
             hz.await_line("a rate", |line| line["class"] == "hz" && line["received"].as_u64() > Some(30));
         assert_eq!(rate["missed"], 0, "{rate}");
-        // The hub and then the gateway end. Subscribers of the remote sensor receive a notice.
+        // Now the hub exits, and then the gateway and the listener. Subscribers of the remote sensor receive the
+        // verdict `unknown`, and then a notice.
         drop(there.end(INT));
         assert_eq!(robot.take_hub().end(TERM).exit_code, Some(0));
         here.await_line("an unknown verdict", |line| line["verdict"] == "unknown");

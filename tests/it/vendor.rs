@@ -1,8 +1,9 @@
 //! Comparison of the simulated RPLIDARs with an independent implementation: the vendor's driver, in the Python package
-//! `pyrplidarsdk`. It connects, reads model, health and modes, and its scans match the simulated room.
+//! `pyrplidarsdk`. The driver connects and reads the model, the health and the modes. The scans that it receives match
+//! the simulated room.
 //!
-//! The scanner has its own virtual time, which advances while the driver reads. On a busy machine it measures later,
-//! and nothing is lost.
+//! The scanner has its own virtual time, which advances only while the driver reads. On a busy machine, the scanner
+//! measures later, and no bytes are lost.
 
 use std::thread;
 use std::time::Duration;
@@ -18,7 +19,8 @@ use serde_json::Value;
 
 use crate::testkit::{Program, python_for};
 
-/// World with walls around a sensor that is off the center, and a pillar, in mm. It has no symmetry.
+/// World with walls around a sensor that is off the center, and with a pillar. It has no symmetry. Lengths are in
+/// millimeters.
 const ROOM_WORLD: &str = "
 [noise]
 sigma_mm = 0
@@ -49,7 +51,7 @@ fn distance_from_walls(x: f64, y: f64) -> f64 {
     walls.into_iter().fold(pillar, f64::min)
 }
 
-/// Simulates `unit` at the other end of `pty` until `driver` ends.
+/// Simulates `unit` at the scanner's end of `pty` until `driver` ends.
 fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
     let mut now = 0;
     let mut unread = Vec::new();
@@ -72,12 +74,12 @@ fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
         }
         match unit.poll_timeout().filter(|_| unread.is_empty()) {
             Some(due) => now = now.max(due),
-            // `poll` returns at once for a pty that no process has open.
+            // If no process has the pty open, `poll` returns at once. Sleep instead.
             None if !pty.is_open() => thread::sleep(POLL_INTERVAL),
             None => {
                 let expected = if unread.is_empty() { PollFlags::IN } else { PollFlags::IN | PollFlags::OUT };
                 let mut line = [PollFd::from_borrowed_fd(pty.wait_fd(), expected)];
-                // An interrupted wait is only a shorter wait.
+                // If a signal interrupts the wait, the wait is only shorter.
                 let _ = poll(&mut line, Some(&Timespec::try_from(POLL_INTERVAL).expect("a valid time")));
             }
         }
@@ -123,10 +125,10 @@ fn vendor_driver_reads_the_room_in_all_packet_forms() {
                 .map(|number| number.as_f64().expect("a number"))
                 .collect()
         };
-        // The first scan may have begun in the middle of a revolution.
+        // Leave out the first scan, which may have begun in the middle of a revolution.
         for scan in &scans[1..] {
             let (angles, ranges) = (numbers(&scan[0]), numbers(&scan[1]));
-            // Angles are clockwise from ahead, which is along y.
+            // Angles are clockwise from the direction ahead, which is the y axis.
             let at =
                 |(angle, range): (&f64, &f64)| distance_from_walls(range * angle.sin(), range * angle.cos());
             let max_error_m = angles.iter().zip(&ranges).map(at).fold(0.0, f64::max);
@@ -137,5 +139,5 @@ fn vendor_driver_reads_the_room_in_all_packet_forms() {
     }
 }
 
-/// Interval between checks whether the driver has ended.
+/// Interval at which the simulator checks whether the driver has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(10);

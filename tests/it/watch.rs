@@ -1,5 +1,5 @@
-//! Tests of `scanhub watch` on a terminal: it follows the hub, the keys and the size of the window, and restores the
-//! terminal however it ends.
+//! Tests of `scanhub watch` on a terminal: the picture follows the hub, the keys and the size of the window. However
+//! the program ends, it restores the terminal.
 
 use std::fs::{self, File};
 use std::process::Command;
@@ -60,12 +60,12 @@ fn watch_reacts_to_hub_keys_and_window_size() {
     });
     assert!(watch.text().contains("\x1b[38;5;1"), "a stop is red");
 
-    // After a change of size, everything is drawn again.
+    // When the size of the window changes, the program draws everything again.
     watch.resize((110, 30));
     watch.await_rows("keys in the last row", |rows| rows[29].starts_with("q quit"));
     watch.await_rows("sensor with its marks", |rows| rows[28].contains("marks 1  objects"));
 
-    // Layers, help, hold.
+    // Keys hide the marks, show and hide the help, and hold the picture.
     watch.press("m?");
     watch.wait_for_text("┌ scanhub watch ");
     watch.press("? ");
@@ -73,7 +73,7 @@ fn watch_reacts_to_hub_keys_and_window_size() {
     watch.await_rows("picture without marks", |rows| !rows[1..28].concat().contains('*'));
     watch.press(" ");
 
-    // The hub computes lines only while they have a subscriber. A key shows the position of the cursor, and another one
+    // The hub computes lines only while they have a subscriber. A key shows the position of the cursor, and another key
     // lists the counters.
     assert_eq!(env.subscribers("front/lines"), 0);
     watch.press("e");
@@ -84,7 +84,7 @@ fn watch_reacts_to_hub_keys_and_window_size() {
     watch.wait_for_text(" m from the robot, x ");
     watch.press("x");
     watch.await_rows("nothing is read out", |rows| !rows.concat().contains("from the robot"));
-    // A click, in SGR encoding, shows the position as well. Escape ends that.
+    // A click of the mouse (in SGR encoding) shows the clicked position, too. The Escape key hides it again.
     watch.press("\x1b[<0;40;12M\x1b[<0;40;12m");
     watch.wait_for_text(" m from the robot, x ");
     watch.press("\x1b");
@@ -94,7 +94,7 @@ fn watch_reacts_to_hub_keys_and_window_size() {
     watch.wait_for_text("bytes_in_telegrams");
     watch.press("n");
 
-    // Requests to the hub, and their results.
+    // Keys send requests to the hub, and the program shows their results.
     watch.press("F");
     watch.wait_for_text("front: background is frozen");
     watch.wait_for_text("missed 0  frozen");
@@ -105,7 +105,7 @@ fn watch_reacts_to_hub_keys_and_window_size() {
     watch.press("R");
     watch.wait_for_text("front: background is learned again");
 
-    // There are two runs of the hub. While the picture is held, the verdict is still current.
+    // Kill the hub, and start another one. While the picture is held, the verdict must still be the current one.
     watch.press(" ");
     watch.wait_for_text(" STOP  HELD  front");
     drop(hub.end(KILL));
@@ -139,7 +139,7 @@ fn watch_restores_the_terminal_after_every_exit() {
         watch.press(key);
         assert_eq!(watch.finish(), (Some(0), String::new(), true), "{key:?}");
     }
-    // As for all verbs that subscribe, a run with a time limit needs a hub.
+    // As with all verbs that subscribe, a run with a time limit fails without a hub.
     let (code, below, is_whole) = start_session(&env, &["--for=5s"]).finish();
     assert!(code == Some(3) && below.contains("scanhub: no hub in domain") && is_whole, "{code:?} {below:?}");
     let _hub = env.hub(&[env.link("front")]);
@@ -204,7 +204,7 @@ fn closed_terminal_ends_watch_without_error() {
     let _sensor = env.simulator(&["front"], &["--seed=73", "--baud=500000"]);
     for streams in [false, true] {
         let _hub = streams.then(|| env.hub(&[env.link("front")]));
-        // With SIGHUP, as from a shell's terminal, and without it.
+        // Close the terminal with SIGHUP, as a shell's terminal does, and without SIGHUP.
         for has_controlling_terminal in [true, false] {
             let errors = env.path("errors");
             let file = File::create(&errors).expect("a file");
@@ -229,12 +229,12 @@ fn closed_terminal_ends_watch_without_error() {
 #[test]
 fn tmux_shows_picture_help_and_narrow_windows() {
     let env = TestEnv::new();
-    // If the test is killed, the programs end after a while.
+    // If the test is killed, the commands in the window end on their own after a while.
     let program = env!("CARGO_BIN_EXE_scanhub");
     let line = format!("{program} demo --for=60s; echo ended with $?; sleep 20");
     let Some(tmux) = Tmux::start(&env, &line, (80, 30)) else { return };
     let is_picture = |rows: &[String]| rows[1..].iter().flat_map(|row| row.chars()).any(is_braille);
-    // The sensors have the order in which the hub created their topics.
+    // The list shows the sensors in the order in which the hub created their topics, which may vary.
     let streams = |rows: &[String], sensor: &str| {
         let mut of_sensor = rows.iter().filter(|row| row.starts_with("1 ") || row.starts_with("2 "));
         of_sensor.any(|row| row[2..].starts_with(sensor) && row.contains("streaming"))
@@ -255,7 +255,7 @@ fn tmux_shows_picture_help_and_narrow_windows() {
     tmux.resize((140, 30));
     tmux.await_rows("a wide window", |rows| !fits(rows) && both(rows));
     tmux.press(&["q"]);
-    // The exit code shows that it was interrupted before its time elapsed.
+    // The exit code 130 shows that the demo was interrupted before its time had elapsed.
     let rows = tmux.await_rows("end", |rows| rows.iter().any(|row| row == "ended with 130"));
     assert!(!is_picture(&rows), "the terminal still shows the picture:\n{}", rows.join("\n"));
     assert_eq!(rows.iter().filter(|row| row.contains(" 0 lost in ")).count(), 2, "{}", rows.join("\n"));

@@ -1,5 +1,5 @@
-//! Tests of the server of `web` with viewers and strangers: Foxglove's protocol, access control, and the limit of
-//! viewers.
+//! Tests of the server of `web`, with viewers and with clients that have no access. They check Foxglove's protocol,
+//! access control, and the maximum number of viewers.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
 
-/// Starts a server with these flags, and returns it with its `HOST:PORT`.
+/// Starts a server with these flags, and returns the server and its address as `HOST:PORT`.
 pub(crate) fn web(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut server = env.start(&[&["web", "--json", "--listen", "127.0.0.1:0"], flags].concat());
     let ready = server.await_line("the address of the page", is_class("ready"));
@@ -47,7 +47,7 @@ pub(crate) fn connect_viewer(
     connect_viewer_with(host, path, origin, "foxglove.sdk.v1")
 }
 
-/// Like [`connect_viewer`], with this name of the protocol.
+/// Connects like [`connect_viewer`], with `protocol` as the name of the WebSocket protocol.
 pub(crate) fn connect_viewer_with(
     host: &str,
     path: &str,
@@ -77,7 +77,7 @@ pub(crate) fn text(socket: &mut WebSocket<TcpStream>) -> Value {
     }
 }
 
-/// Waits until the channels of `topics` are advertised, and returns them. Other messages are dropped meanwhile.
+/// Waits until the channels of `topics` are advertised, and returns them. Discards other messages.
 pub(crate) fn channels<const N: usize>(viewer: &mut WebSocket<TcpStream>, topics: [&str; N]) -> [Value; N] {
     let give_up_at = Instant::now() + WAIT_TIMEOUT;
     let mut advertised: Vec<Value> = Vec::new();
@@ -146,7 +146,7 @@ fn viewer_gets_foxglove_messages_despite_hostile_one() {
     let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
     server.await_line("a connected viewer", |line| line["class"] == "viewer" && line["connected"] == true);
     assert_eq!(text(&mut viewer)["op"], "serverInfo");
-    // The next viewer sends hostile frames, which must not affect this one.
+    // The next viewer sends hostile frames, which must not affect the first viewer.
     let mut hostile = connect_viewer(&host, "/", None).expect("an accepted viewer");
     hostile.send(Message::text("[".repeat(60_000))).expect("a sent message");
     hostile.send(Message::binary(vec![1; 60_000])).expect("a sent message");

@@ -1,5 +1,5 @@
-//! Tests of the web page for users who cannot use a mouse, use a screen reader, or prefer reduced motion. Contrasts are
-//! checked where the colors are (`clients/viewer/src/server/page.rs`).
+//! Tests of the web page for users who cannot use a mouse, use a screen reader, or prefer reduced motion. A test next
+//! to the colors, in `clients/viewer/src/server/page.rs`, checks contrasts.
 
 use serde_json::{Value, json};
 
@@ -28,7 +28,7 @@ const FOCUSED_ELEMENT: &str = "(document.activeElement === document.body ? 'BODY
 fn page_is_usable_with_the_keyboard_alone() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
-    // Tab must reach every element that can be pressed, and each must show the focus.
+    // Tab must reach every element that can be pressed, and each element must show that it has the focus.
     let mut reached: Vec<String> = Vec::new();
     for _ in 0..40 {
         page.press("Tab");
@@ -65,7 +65,7 @@ fn page_is_usable_with_the_keyboard_alone() {
     page.await_true(&pressed("#sensors button"));
     page.press("0");
     page.await_true(&format!("!({})", pressed("#sensors button")));
-    // Keys move the view as a mouse or touch does. The first key stops the automatic fit.
+    // Keys move the view, as a mouse or touch does. The first of these keys stops the automatic fit.
     page.press("ArrowUp");
     page.await_true(&format!("!({})", pressed("[data-do=fit]")));
     let moves =
@@ -86,7 +86,7 @@ fn page_is_usable_with_the_keyboard_alone() {
     assert_eq!(page.ask(keys), "s i f t b z m e o v g");
     page.await_true("document.querySelector('#scale').innerText.startsWith('0') && !document.querySelector('#scale').hidden");
     page.await_true("[...document.querySelectorAll('#layers button')].every((one) => one.ariaLabel && one.offsetHeight > 0)");
-    // A dialog takes the focus and returns it.
+    // A dialog takes the focus, and gives it back when it is closed.
     page.ask("document.querySelector('[data-do=layers]').focus()");
     page.press("?");
     page.await_true("document.querySelector('#help').contains(document.activeElement)");
@@ -95,7 +95,7 @@ fn page_is_usable_with_the_keyboard_alone() {
     assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
 }
 
-/// Returns role and name of each node that a screen reader finds on the page.
+/// Returns the role and the name of each node that a screen reader finds on the page.
 fn tree(page: &mut Browser) -> Vec<(String, String)> {
     let tree = page.call("Accessibility.getFullAXTree", json!({}));
     let nodes = tree["nodes"].as_array().expect("nodes").iter().filter(|node| node["ignored"] != true);
@@ -113,7 +113,7 @@ fn screen_readers_get_names_states_and_the_verdict() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
     let words = ["SLOW", "CLEAR", "STOP"];
-    // On a busy machine, the verdict may be unknown and a sensor without a status for a moment.
+    // On a busy machine, the verdict may be unknown for a short time, and a sensor may have no status.
     let mut nodes = Vec::new();
     wait_until("the tree has a verdict and a sensor that streams", || {
         nodes = tree(&mut page);
@@ -139,8 +139,8 @@ fn screen_readers_get_names_states_and_the_verdict() {
 fn reduced_motion_disables_animations() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = open_page(&env, Appearance::LAPTOP) else { return };
-    // Script that follows the view on its way back from a larger scale. It returns the number of different scales until
-    // the view is unchanged for 20 frames.
+    // Script that observes the view while it moves back from a larger scale. The script returns the number of different
+    // scales that it has seen. It ends when the scale has not changed for 20 frames.
     let places = "new Promise((done) => {
         const scales = new Set();
         let [last, still] = [0, 0];

@@ -1,6 +1,6 @@
-//! Tests of all channels of `web`, subscribed as by Foxglove's own library, with one message for each. Messages are
-//! decoded by the schema that the server sends, CDR by ROS messages and JSON by JSON Schema, and equal the lines of
-//! `echo --json` for the same samples.
+//! Tests of all channels of `web`. A viewer subscribes as Foxglove's own library does, with a separate message for each
+//! channel. The test decodes messages with the schema that the server sends: CDR with definitions of ROS messages, and
+//! JSON with JSON Schema. The values must equal those that `echo --json` prints for the same samples.
 
 use std::collections::HashMap;
 use std::net::TcpStream;
@@ -14,10 +14,10 @@ use tungstenite::{Message, WebSocket};
 use crate::testkit::{INT, Outcome, TestEnv, WAIT_TIMEOUT, is_class, number, wall_ns};
 use crate::web::{connect_viewer_with, text, web};
 
-/// Pose of the sensor: meters ahead and to the left, and yaw in radians.
+/// Pose of the sensor: distances ahead and to the left in meters, and yaw in radians.
 const SENSOR_POSE: (f64, f64, f64) = (0.3, -0.1, 0.4);
 const TOPICS: [&str; 7] = ["scan", "foreground", "marks", "zones", "lines", "background", "status"];
-/// World with a person who appears in front of the background and inside the zones, and a reflector in a corner.
+/// World in which a person appears in front of the background, inside the zones. A reflector is in a corner.
 const WORLD: &str =
     "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
 [[thing]]\nradius_mm = 60\npose = [0, 700]\nfrom_s = 9\n
@@ -27,14 +27,14 @@ fn pose() -> Pose {
     Pose { x_m: SENSOR_POSE.0, y_m: SENSOR_POSE.1, yaw_rad: SENSOR_POSE.2, ..Pose::default() }
 }
 
-/// Time of a message in ns since 1970, and its body.
+/// Time of a message in nanoseconds since 1970, and body of the message.
 type ChannelMessage = (u64, Vec<u8>);
 
 /// A viewer that behaves like npm's `@foxglove/ws-protocol` 0.8.0: it numbers subscriptions from 0, and sends a
-/// separate message for each of them.
+/// separate message for each subscription.
 struct Viewer {
     socket: WebSocket<TcpStream>,
-    /// Channels by the number of their subscription.
+    /// Channels. The index of a channel is the number of its subscription.
     channels: Vec<Value>,
     messages: HashMap<String, Vec<ChannelMessage>>,
 }
@@ -46,7 +46,7 @@ impl Viewer {
         Viewer { socket, channels: Vec::new(), messages: HashMap::new() }
     }
 
-    /// Receives until every advertised channel has sent this number of messages.
+    /// Receives until every advertised channel has sent `count` messages.
     fn receive_messages(&mut self, count: usize) {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
         while self.channels.len() < TOPICS.len() + 1 || self.min_count() < count {
@@ -84,8 +84,8 @@ impl Viewer {
             .collect()
     }
 
-    /// Returns the smallest number of messages per channel. A channel that sends only one message counts as complete
-    /// with it.
+    /// Returns the smallest number of messages per channel. If a channel sends only one message in total, this message
+    /// is enough.
     fn min_count(&self) -> usize {
         let once = ["/tf_static", "/front/background"];
         let enough = |(topic, count): (&str, usize)| {
@@ -138,7 +138,7 @@ fn numbers(values: &[Told]) -> Vec<f64> {
         .collect()
 }
 
-/// Returns the ranges of a line in meters, or `None` for beams without one.
+/// Returns the ranges of a line in meters, with `None` for a beam without a range.
 fn ranges_m(line: &Value, unit: &str, in_m: f64) -> Vec<Option<f64>> {
     let unit = line[unit].as_f64().expect("a unit") * in_m;
     line["ranges"].as_array().expect("ranges").iter().map(|range| Some(range.as_f64()? * unit)).collect()
@@ -149,14 +149,14 @@ fn angle_rad(line: &Value, beam: usize) -> f64 {
     (degrees("first_angle_deg") + beam as f64 * degrees("step_deg")).to_radians()
 }
 
-/// Returns the lines of a topic by the wall clock of their samples.
+/// Returns the lines of `class`, by the wall-clock stamp of their samples.
 fn by_stamp(lines: &Outcome, class: &str) -> HashMap<u64, Value> {
     let lines = lines.of_class(class).into_iter();
     lines.filter_map(|line| Some((line["wall_ns"].as_u64()?, line))).collect()
 }
 
-/// Asserts that most messages have a line, and that `is_same` returns true for each of these messages and its line. A
-/// reader may miss some samples.
+/// Asserts that `lines` has a line for more than half of the messages, and that `is_same` returns true for each of
+/// these messages and its line. The other messages may have no line, because a reader may miss some samples.
 fn check_each_equals_a_line(
     topic: &str,
     messages: &[ChannelMessage],
@@ -190,7 +190,8 @@ fn is_scan(body: &[u8], line: &Value) -> bool {
         && ranges.iter().zip(&expected).all(is_range)
 }
 
-/// Compares points in the sensor's frame. `scan` supplies the angles.
+/// Returns whether a message has the points of a line of class `foreground`, in the sensor's frame. `scan` is the scan
+/// with the angles of the beams.
 fn is_foreground(body: &[u8], line: &Value, scan: &Value) -> bool {
     let message = read(&POINT_CLOUD, body).expect("a PointCloud2");
     let bytes: Vec<u8> =
@@ -215,7 +216,7 @@ fn object(body: &[u8]) -> Value {
     serde_json::from_slice(body).expect("JSON")
 }
 
-/// Returns all items of one kind in a SceneUpdate.
+/// Returns all items of `kind` in a SceneUpdate, from all entities.
 fn all(update: &Value, kind: &str) -> Vec<Value> {
     let entities = update["entities"].as_array().expect("entities").iter();
     entities.flat_map(|entity| entity[kind].as_array().expect("a list").clone()).collect()
@@ -234,8 +235,8 @@ fn list<'a>(line: &'a Value, key: &str) -> impl Iterator<Item = &'a Value> {
     line[key].as_array().expect("a list").iter()
 }
 
-/// Compares messages that show the latest state. Each relevant message must equal some line of `class`. If `echo`
-/// missed samples, at least half of the relevant messages must.
+/// Compares messages that show the latest state, and not one sample. Each relevant message must equal some line of
+/// `class`. If `echo` missed samples, only half of the relevant messages must equal a line.
 fn check_each_equals_some_line(
     class: &str,
     messages: &[ChannelMessage],
@@ -407,7 +408,7 @@ fn every_channel_equals_the_output_of_echo() {
         viewer.receive_messages(5);
         viewer
     });
-    // Wait for lines of later samples. `echo` has then printed the samples that the viewers received.
+    // Wait until `echo` prints later samples. It has then printed all samples that the viewers have received.
     let now = wall_ns();
     for class in ["scan", "foreground", "marks", "zones", "lines"] {
         echo.await_line(class, |line| line["class"] == class && line["wall_ns"].as_u64() > Some(now));

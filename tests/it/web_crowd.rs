@@ -1,7 +1,7 @@
-//! Tests of the server of `web` with many, slow and hostile viewers: it serves well-behaved viewers, and its memory and
-//! CPU time stay small. When a resource of the system runs out, the server reports this and waits.
-//! `clients/viewer/tests/crowd.rs` tests that no viewer misses a message because of others, because messages can be
-//! counted there.
+//! Tests of the server of `web` with many, slow and hostile viewers: the server serves well-behaved viewers, and uses
+//! little memory and CPU time. When a resource of the system runs out, the server reports this and waits. Messages can
+//! be counted only in `clients/viewer/tests/crowd.rs`. That file tests that no viewer misses a message because of other
+//! viewers.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -24,7 +24,7 @@ fn subscribe_to(viewer: &mut WebSocket<TcpStream>, topic: &str) {
     subscribe(viewer, &[(1, &channel["id"])]);
 }
 
-/// Sets the flag when it is dropped, even in a panic.
+/// Sets its flag when it is dropped, even in a panic.
 struct SetOnDrop<'a>(&'a AtomicBool);
 
 impl Drop for SetOnDrop<'_> {
@@ -33,7 +33,7 @@ impl Drop for SetOnDrop<'_> {
     }
 }
 
-/// Waits for `count` messages. For each message, it waits at most until the timeout.
+/// Receives `count` messages. Panics if one of them takes longer than the timeout.
 fn await_messages(viewer: &mut WebSocket<TcpStream>, count: u32) {
     for number in 1..=count {
         let give_up_at = Instant::now() + WAIT_TIMEOUT;
@@ -43,7 +43,7 @@ fn await_messages(viewer: &mut WebSocket<TcpStream>, count: u32) {
     }
 }
 
-/// Returns the resident memory of a process, in kB.
+/// Returns the resident memory of a process in kilobytes.
 fn memory(of: &Program) -> u64 {
     let text =
         fs::read_to_string(format!("/proc/{}/status", of.pid())).expect("the status of a running process");
@@ -71,7 +71,7 @@ fn slow_viewer_and_full_server_do_not_block_others() {
     let idle: Vec<_> = (0..148).map(|_| connect(&host)).collect();
     let mut read = 0;
     for _ in 0..8 {
-        // Read 1 kB for every 12 messages (15 kB).
+        // The slow viewer reads 1 kB while the other viewer reads 12 messages (15 kB).
         await_messages(&mut reader, 12);
         read += slow.get_mut().read(&mut [0; 1000]).expect("an open connection");
     }
@@ -93,7 +93,7 @@ fn hostile_frames_do_not_disturb_other_viewers() {
     subscribe_to(&mut reader, "/front/scan");
     let before = memory(&server);
 
-    // Frames of random bytes: with or without mask, complete or cut, of every opcode.
+    // Send frames of random bytes: with and without a mask, complete and truncated, with every opcode.
     let mut random = fastrand::Rng::with_seed(25);
     for _ in 0..60 {
         let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
@@ -103,7 +103,7 @@ fn hostile_frames_do_not_disturb_other_viewers() {
         }
         let _ = viewer.get_mut().write_all(&bytes);
     }
-    // More subscriptions than allowed, and a message that never ends.
+    // Send more subscriptions than the server allows, and then a message that never ends.
     let mut greedy = connect_viewer(&host, "/", None).expect("an accepted viewer");
     let expected: Vec<_> = (0..400).map(|id| json!({ "id": id, "channelId": 1 })).collect();
     let wish = json!({ "op": "subscribe", "subscriptions": expected });
@@ -113,7 +113,7 @@ fn hostile_frames_do_not_disturb_other_viewers() {
     let part = [&[0x01, 0xFE, 0x40, 0, 0, 0, 0, 0][..], &[b' '; 0x4000]].concat();
     while endless.get_mut().write_all(&part).is_ok() {}
 
-    // A viewer that sends without pause must not starve the others.
+    // A viewer that sends without pause must not keep the server from serving the others.
     let mut talker = connect_viewer(&host, "/", None).expect("an accepted viewer");
     talker.get_ref().set_write_timeout(Some(WAIT_TIMEOUT)).expect("a timeout");
     let (is_served, sent) = (AtomicBool::new(false), AtomicUsize::new(0));
@@ -135,18 +135,18 @@ fn hostile_frames_do_not_disturb_other_viewers() {
     assert!(outcome.exit_code == Some(0) && !outcome.stderr.contains("panicked"), "{outcome}");
 }
 
-/// Lowers the limit of the server, so that it only gets descriptors below `max`.
+/// Lowers the limit of the running server, so that it gets only descriptors below `max`.
 fn limit_descriptors(server: &Program, max: u64) {
     let pid = Pid::from_raw(i32::try_from(server.pid()).expect("a process"));
     let limit = Rlimit { current: Some(max), maximum: getrlimit(Resource::Nofile).maximum };
     prlimit(pid, Resource::Nofile, limit).expect("permission to set the limit");
 }
 
-/// Topics that the server subscribes to without a request for lines.
+/// Topics to which the server subscribes as long as no viewer requests lines.
 const SERVER_TOPICS: [&str; 6] =
     ["front/scan", "front/marks", "front/zones", "front/foreground", "front/background", "front/status"];
 
-/// Returns the lowest descriptor that is not open.
+/// Returns the lowest descriptor number that the server does not use.
 fn next_descriptor(server: &Program) -> u64 {
     let open = |number: &u64| !Path::new(&format!("/proc/{}/fd/{number}", server.pid())).exists();
     (0..).find(open).expect("an unused descriptor")
@@ -158,7 +158,7 @@ fn cpu_time(server: &Program) -> Duration {
         .expect("the counters of a running process");
     let fields: Vec<&str> = text.rsplit_once(") ").expect("a name").1.split(' ').collect();
     let ticks: u64 = fields[11..13].iter().map(|field| field.parse::<u64>().expect("a number")).sum();
-    // A hundred ticks per second (proc(5)) on all platforms of this project.
+    // There are 100 ticks per second (proc(5)) on all platforms of this project.
     Duration::from_millis(10 * ticks)
 }
 
@@ -171,7 +171,7 @@ fn new_viewer_waits_while_descriptors_are_short() {
     let (mut server, host) = web(&env, &[]);
     let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
     subscribe_to(&mut viewer, "/front/scan");
-    // Subscriptions take descriptors too, so wait for all of them first.
+    // Subscriptions take descriptors, too, so wait for all of them before the limit is lowered.
     wait_until("all subscriptions", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
@@ -183,7 +183,7 @@ fn new_viewer_waits_while_descriptors_are_short() {
     assert!(short["hint"].as_str().is_some_and(|text| text.contains("ulimit -n")), "{short}");
     let (started, before) = (Instant::now(), cpu_time(&server));
     await_messages(&mut viewer, 80);
-    // A server that does not sleep while a connection waits would use all of the CPU time.
+    // While a connection waits for a descriptor, the server must sleep. Otherwise it would use all of the CPU time.
     let (worked, elapsed) = (cpu_time(&server) - before, started.elapsed());
     assert!(worked < elapsed / 2, "{worked:?} of {elapsed:?}");
     limit_descriptors(&server, 1024);
@@ -206,7 +206,7 @@ fn descriptor_shortage_of_a_topic_spares_others() {
     wait_until("all subscriptions", || SERVER_TOPICS.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
-    // The server subscribes to lines as soon as a viewer requests them.
+    // When a viewer requests lines, the server subscribes to topic `lines`, for which it now lacks descriptors.
     subscribe(&mut viewer, &[(2, &lines["id"])]);
     let short = server.await_line("the report of a shortage", is_class("web_short"));
     assert!(
@@ -231,7 +231,7 @@ fn server_exits_without_descriptors() {
     let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
     subscribe_to(&mut viewer, "/front/scan");
     await_messages(&mut viewer, 5);
-    // The server cannot even wait without descriptors, so it ends.
+    // Without any descriptor, the server cannot even wait, so it ends.
     limit_descriptors(&server, 1);
     let outcome = server.wait();
     assert!(outcome.exit_code.is_some_and(|code| code != 0), "{outcome}");

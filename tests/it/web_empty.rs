@@ -1,5 +1,4 @@
-//! Tests of pages without data: the page states the reason and the remedy, and its colors show how serious the reason
-//! is.
+//! Tests of pages without data: the page shows the reason and the remedy, and colors show how serious the reason is.
 
 use serde_json::Value;
 
@@ -9,7 +8,7 @@ use crate::testkit::{INT, Program, TestEnv, in_a_network, is_class};
 use crate::web::web;
 use crate::web_page::browse;
 
-/// Returns the color that the page's style calls `name`.
+/// Returns the value of the color that the style of the page calls `name`.
 fn color(page: &mut Browser, name: &str) -> Value {
     page.ask(&format!(
         "(() => {{ const probe = document.createElement('i'); document.body.append(probe); \
@@ -17,7 +16,7 @@ fn color(page: &mut Browser, name: &str) -> Value {
     ))
 }
 
-/// Waits until the page gives a reason that contains `description`, with a remedy that contains `remedy`.
+/// Waits until the page shows a reason that contains `description`, and a remedy that contains `remedy`.
 fn wait_for_reason(page: &mut Browser, description: &str, remedy: &str) {
     let reason = "document.querySelector('#reason')";
     let has_text =
@@ -90,7 +89,8 @@ fn lossy_sensor_is_amber_with_its_loss_rate() {
          .test({card}?.querySelector('.problem').innerText)"
     ));
     let amber = color(&mut page, "slow");
-    // On a busy machine, a card can change its state at any time. Its dot shows the state, too.
+    // On a busy machine, the card of a sensor can change its state at any time. Therefore compare with the dot on the
+    // card, which also shows the state.
     page.await_true(&format!(
         "(card => {{\n\
             const color = (selector, pseudo) => getComputedStyle(card.querySelector(selector), pseudo);\n\

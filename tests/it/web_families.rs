@@ -1,5 +1,6 @@
-//! Tests of sensors of every family and mounting in one picture: equal beams and exact angles, upside down, overlapping
-//! fields of view, and remote sensors. The points on the page are compared with those computed from scans and poses.
+//! Tests of sensors of every family and with every way of mounting, in one picture. Some have equal steps between beams
+//! and some have exact angles. Some are upside down, some have overlapping fields of view, and some are remote. The
+//! tests compare the points on the page with points that they compute from scans and poses.
 
 use serde_json::Value;
 
@@ -14,8 +15,8 @@ use scanhub_viewer::scene::{PointerPosition, Scene};
 const HALL_WORLD: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n
 [[thing]]\nradius_mm = 150\npose = [900, 1300]\n";
 
-/// Returns the points of `sensor` on the page, in the robot's frame in meters. A beam without a point has the
-/// coordinates NaN.
+/// Returns the points of `sensor` on the page, in the robot's frame in meters. Both coordinates are NaN for a beam
+/// without a point.
 fn drawn_points(page: &mut Browser, sensor: &str) -> Vec<(f64, f64)> {
     let points = page.ask(&format!("scanhub.points('{sensor}')"));
     let numbers: Vec<f64> =
@@ -28,7 +29,8 @@ fn pair(value: &Value) -> (f64, f64) {
     (value[0].as_f64().expect("a number"), value[1].as_f64().expect("a number"))
 }
 
-/// Returns the points at which the beams in a line of class `scan` end, in meters. The sensor is at `pose`.
+/// Returns the points at which the beams of a line of class `scan` end, in the robot's frame in meters. `pose` is the
+/// pose of the sensor.
 fn measured_points(scan: &Value, pose: &Pose) -> Vec<(f64, f64)> {
     let unit_mm = number(scan, "unit_um") as f64 / 1000.0;
     let (first, step) =
@@ -73,7 +75,7 @@ fn scans_of_every_family_are_drawn_in_place() {
         ("top", Pose::default()),
     ];
     for (sensor, pose) in poses {
-        // On a busy machine, a scan may have gaps, and the page removes one that is too old.
+        // On a busy machine, a scan may have gaps, and the page removes a scan that is too old. Therefore try again.
         wait_until(&format!("the sensor {sensor} at its place"), || {
             let outcome = env.run(&["echo", "--json", "-n", "1", &format!("{sensor}/scan")]);
             let scan = outcome.of_class("scan").pop().unwrap_or_else(|| panic!("no scan: {outcome}"));
@@ -112,8 +114,8 @@ fn remote_sensors_are_listed_but_not_on_this_robot() {
         };
         let mut scan = Scan::of(head, &[2000; 181]);
         scan.arrays().upper.fill(77);
-        // Announce the remote sensor and send its samples repeatedly, as a gateway does, so that it is present however
-        // long the other steps took.
+        // Announce the remote sensor and send its samples repeatedly, as a gateway does, so that the sensor does not
+        // become absent, however long the other steps take.
         let mut send_until = |page: &mut Browser, measured_now: &str| {
             wait_until(measured_now, || {
                 sender.announce(&topics);
@@ -126,16 +128,16 @@ fn remote_sensors_are_listed_but_not_on_this_robot() {
         let card = "[...document.querySelectorAll('#sensors h2')].some((one) => /robot1\\.front/.test(one.innerText))";
         send_until(&mut page, card);
         send_until(&mut page, "scanhub.points('robot1.front').length === 362");
-        // It belongs to another robot, so it does not affect the verdict of this one.
+        // The remote sensor belongs to another robot, so it must not affect the verdict of this robot.
         send_until(&mut page, "scanhub.beams > 300 && scanhub.beams <= 361 && scanhub.verdict === 'clear'");
         let number = "[...document.querySelectorAll('#sensors button')].find((one) => /robot1/.test(one.innerText)).click()";
         page.ask(number);
         send_until(&mut page, "scanhub.beams === 181");
-        // The page's read-out equals the text that `watch` shows for the same position.
+        // The page must show the same text for a position as `watch` does, which uses the same code for the scene.
         let mut scene = Scene::default();
         scene.sensor("robot1.front").take_status(&Status::default());
         scene.sensor("robot1.front").take_scan(&Header::default(), &scan, 0);
-        // Check three points and a position without one. Pressing a key stops the automatic fit.
+        // Check three points, and a position without a point. The key stops the automatic fit of the view.
         page.press("-");
         let beam = |degrees: f64| (2.0 * degrees.to_radians().cos(), 2.0 * degrees.to_radians().sin());
         for (x, y) in [beam(0.0), beam(-53.0), beam(90.0), (0.7, 0.4)] {

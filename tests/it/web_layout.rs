@@ -1,4 +1,4 @@
-//! Tests of the page's layout: in every demo and at every width, no box overlaps another one, and no text is cut.
+//! Tests of the page's layout: in every demo and at every width, no box overlaps another box, and no text is cut off.
 
 use std::process::Command;
 
@@ -11,10 +11,11 @@ use crate::web::web;
 use crate::web_page::browse;
 use scanhub_sim::world::World;
 
-/// Widths of a phone, a small laptop and a large one, with their heights.
+/// Window sizes (width and height) of a phone, a small laptop and a large laptop.
 const WINDOW_SIZES: [(u32, u32); 3] = [(390, 844), (1024, 768), (1440, 900)];
 
-/// Script that returns each pair of boxes that overlap, each box that leaves the window, and each text that is cut.
+/// Script that returns each pair of boxes that overlap, each box that is partly outside of the window, and each text
+/// that is cut off.
 const BREACHES_SCRIPT: &str = "(() => {
     const names = ['#verdict', '#people', '#swept', '#hub', '#news', '#readout', '#reason', '#layers', '#player', 'nav', 'article'];
     const boxes = names.flatMap((name) => [...document.querySelectorAll(name)].map((element) =>
@@ -34,7 +35,7 @@ const BREACHES_SCRIPT: &str = "(() => {
     return breaches;
 })()";
 
-/// Starts a demo, and returns it with the address of its page.
+/// Starts a demo, and returns the demo and the address of its page.
 fn demo(world: &str, home: &str) -> (Program, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(["demo", "--world", world]).env_clear().env("XDG_STATE_HOME", home);
@@ -46,16 +47,16 @@ fn demo(world: &str, home: &str) -> (Program, String) {
     }
 }
 
-/// Asserts that the layout is right with and without the list of layers.
+/// Asserts that the layout is right, both with and without the list of layers.
 fn check(page: &mut Browser, description: &str) {
     for layers in ["", ", with layers"] {
-        // A busy browser drops movements of the mouse, so keep moving it.
+        // A busy browser drops movements of the mouse, so move the mouse until the page reacts.
         let mut x = (0..).map(|step| 330.0 + f64::from(step % 2));
         wait_until("the read-out is shown", || {
             page.mouse("mouseMoved", (x.next().expect("an endless sequence"), 330.0), false);
             page.ask("document.querySelector('#readout').innerText !== ''") == true
         });
-        // The page shows the report of missed messages only for a moment, so set it here.
+        // The page shows the report of missed messages only for a short time, so set the text of the report here.
         let report = "62 messages missed: the server was too late, its machine may be busy";
         let script = format!("(document.querySelector('#news').textContent = '{report}', {BREACHES_SCRIPT})");
         assert_eq!(page.ask(&script), Value::Array(Vec::new()), "{description}{layers}");

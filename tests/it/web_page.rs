@@ -1,5 +1,5 @@
-//! Tests of the web page in a browser: it follows the hub, gives a reason when no samples arrive, and recovers on its
-//! own.
+//! Tests of the web page in a browser: the page shows the state of the hub and the reason when no samples arrive, and
+//! it recovers on its own.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ const WORLD: &str =
     "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
 [[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
 
-/// A post next to the robot.
+/// Text that adds a post next to the robot to [`WORLD`].
 const POST_WORLD: &str = "\n[[thing]]\nradius_mm = 60\npose = [0, 450]\n";
 
 /// Starts a scanner in the hall, with `more` added to the world.
@@ -22,7 +22,7 @@ fn sensor(env: &TestEnv, more: &str) -> Program {
     env.simulator(&["front"], &["--seed=71", "--baud=500000", &world])
 }
 
-/// Starts a browser with this appearance. Returns `None`, and reports a skip, if none is installed.
+/// Starts a browser with this appearance. If no browser is installed, skips the test and returns `None`.
 pub(crate) fn browse(env: &TestEnv, appearance: Appearance) -> Option<Browser> {
     let browser = Browser::start(env.path("browser"), appearance);
     if browser.is_none() {
@@ -31,7 +31,8 @@ pub(crate) fn browse(env: &TestEnv, appearance: Appearance) -> Option<Browser> {
     browser
 }
 
-/// Holds the picture while `condition` is true, because on a busy machine the picture may be empty for a moment.
+/// Holds the picture at a time when `condition` is true. On a busy machine, the picture may be empty for a short time,
+/// so this may take several tries.
 pub(crate) fn freeze_page(page: &mut Browser, condition: &str) {
     wait_until("a picture is held", || {
         page.press(" ");
@@ -44,7 +45,7 @@ pub(crate) fn freeze_page(page: &mut Browser, condition: &str) {
     });
 }
 
-/// Starts the server, and returns it with its address.
+/// Starts the server, and returns the server and its address.
 fn web(env: &TestEnv, listen: &str) -> (Program, String) {
     let mut web = env.start(&["web", "--json", "--listen", listen]);
     let ready = web.await_line("the address of the page", |line| line["class"] == "ready");
@@ -66,7 +67,7 @@ fn page_shows_samples_or_the_reason_for_their_absence() {
     page.await_true("/scanhub run/.test(scanhub.reason)");
     let red = page.ask(COLOR_SCRIPT);
 
-    // A link whose scanner does not reply yet gives its own reason.
+    // The scanner of the link does not reply yet, so the page shows the reason of the link.
     let hub = env.hub(&[env.link("front")]);
     page.await_true("/^front: ./.test(scanhub.reason)");
     let empty_hall = sensor(&env, "");
@@ -75,7 +76,7 @@ fn page_shows_samples_or_the_reason_for_their_absence() {
     page.await_true("scanhub.zones === 2 && scanhub.marks > 0 && scanhub.sensors[0].hz > 0");
     page.await_true("document.querySelector('#sensors article').innerText.includes('streaming')");
 
-    // The post is new, and inside the inner zone.
+    // The post was not there when the hub learned the background, and it is inside the inner zone.
     let learned = env.path("state/scanhub").join(env.domain().name()).join("front.background.json");
     wait_until("the background is learned", || learned.exists());
     assert_eq!(empty_hall.end(TERM).exit_code, Some(0));
@@ -83,7 +84,7 @@ fn page_shows_samples_or_the_reason_for_their_absence() {
     page.await_true("scanhub.verdict === 'stop' && scanhub.foreground > 2");
     page.await_true("document.querySelector('#verdict').innerText.startsWith('STOP')");
     page.await_true(&format!("scanhub.verdict === 'stop' && {COLOR_SCRIPT} === {red}"));
-    // While the picture is held, the verdict is still current.
+    // While the picture is held, the verdict must still be the current one.
     freeze_page(&mut page, "scanhub.beams > 100");
     hub.end(KILL);
     page.await_true("scanhub.verdict === 'unknown'");
@@ -123,7 +124,7 @@ fn page_drops_sensors_of_previous_server() {
     page.press("1");
     page.await_true("scanhub.beams > 0 && scanhub.beams <= 361");
 
-    // A frozen picture keeps what it shows, but its sensors are no longer reported as streaming.
+    // A held picture does not change, but the list no longer shows the sensors of the first server as streaming.
     freeze_page(&mut page, "scanhub.beams > 100");
     let address = url.trim_start_matches("http://").trim_end_matches('/').to_owned();
     assert_eq!(server.end(INT).exit_code, Some(0));
@@ -135,7 +136,7 @@ fn page_drops_sensors_of_previous_server() {
     page.press(" ");
     page.await_true(&format!("{titles} === '1  rear' && {states} === 'streaming' && scanhub.beams > 100"));
 
-    // If the picture is not frozen, the page drops the sensors as soon as it has connected.
+    // If the picture is not held, the page removes the sensors of the previous server as soon as it has connected.
     assert_eq!(server.end(INT).exit_code, Some(0));
     page.await_true("/No connection/.test(scanhub.reason)");
     let (server, _) = web(&first, &address);
@@ -180,7 +181,7 @@ fn keys_and_the_mouse_change_the_picture() {
     page.await_true(&format!("{fits} === 'false'"));
     page.press("c");
     page.await_true(&format!("{fits} === 'true'"));
-    // A busy browser drops movements of the mouse, so keep moving it, as a person does.
+    // A busy browser drops movements of the mouse, so move the mouse until the page reacts.
     let mut steps = (0..).map(|step| 195.0 + f64::from(step % 2));
     wait_until("the place under the mouse is read out", || {
         page.mouse("mouseMoved", (steps.next().expect("an endless sequence"), 300.0), false);
@@ -196,23 +197,25 @@ fn keys_and_the_mouse_change_the_picture() {
     page.await_true("document.querySelector('#help').open");
     page.press("Escape");
     page.await_true("!document.querySelector('#help').open");
-    // Nothing is wider than the screen, and every button is large enough for a finger.
+    // No part of the page is wider than the screen, and every button is large enough for a finger.
     page.await_true("document.documentElement.scrollWidth <= 390");
-    // Hidden buttons have no height.
+    // Leave out hidden buttons, which have no height.
     let small = "[...document.querySelectorAll('nav button:not([hidden])')].filter((one) => one.offsetHeight < 40).length";
     assert_eq!(page.ask(small), 0);
     assert!(page.console_errors.is_empty(), "{:?}", page.console_errors);
 }
 
-/// Writes the page to a PNG file, without the read-out of the position under the mouse.
+/// Writes a screenshot of the page to a PNG file. Moves the mouse first, so that the page does not show the position
+/// under the mouse.
 pub(crate) fn save_screenshot(page: &mut Browser, appearance: Appearance, path: &Path) {
-    // The edge of the buttons' box, between its border and the first button.
+    // Move the mouse to the edge of the box of buttons, between the border and the first button.
     page.mouse("mouseMoved", (14.0, f64::from(appearance.height) - 30.0), false);
     page.await_true("document.querySelector('#readout').innerText === ''");
     page.save_screenshot(path);
 }
 
-/// Returns a script that counts the pixels with the color `name` in the first sensor's curve of damage.
+/// Returns a script that counts the pixels with the color `name` in the first sensor's curve of the share of damaged
+/// bytes.
 fn curve(name: &str) -> String {
     format!(
         "(() => {{
@@ -230,8 +233,8 @@ fn curve(name: &str) -> String {
 }
 
 /// Checks the page in the states that the pictures of the documents show. `SCANHUB_PICTURES=docs cargo test --test it
-/// page_shows_documented_states` creates these pictures again, each after a minute. They show a recording, because a
-/// simulator on a busy machine loses bytes.
+/// page_shows_documented_states` creates these pictures again, and takes a minute for each. The pictures show a
+/// recording, because the simulator loses bytes on a busy machine.
 #[test]
 fn page_shows_documented_states() {
     let env = TestEnv::new();
@@ -254,7 +257,7 @@ fn page_shows_documented_states() {
         page.await_true(condition);
         page.await_true("scanhub.zones === 2 && scanhub.marks >= 2 && scanhub.sensors.length === 2");
         page.await_true("document.querySelectorAll('#sensors article.streaming').length === 2");
-        // The recording has no damage, so the curve of the damage is gray.
+        // The recording has no damaged bytes, so the curve of their share is gray.
         page.await_true(&format!("{} > 0 && {} === 0", curve("soft"), curve("slow")));
         page.await_true(
             "/^0–50 Hz, 2 min; p99, 0–[125]0* ms, 2 min; 0–1 %, 2 min$/.test(\

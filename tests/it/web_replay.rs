@@ -1,11 +1,11 @@
-//! Tests of a recording in a browser: time line, pause, single steps and rate, with buttons and keys. Its hub serves
-//! only this page and ends with it.
+//! Tests of a recording in a browser: time line, pause, single steps and rate, with buttons and keys. `web --replay`
+//! runs a hub for this page alone, which ends with the server.
 
 use crate::browser::Appearance;
 use crate::testkit::{INT, Program, TestEnv, is_class, shared_memory};
 use crate::web_page::browse;
 
-/// Starts a web server that shows `file`, and returns it with its address.
+/// Starts a web server that shows `file`, and returns the server and its address.
 fn start_web(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
     let words = ["web", "--json", "--listen", "127.0.0.1:0", "--replay", file];
     let mut web = env.start(&[&words, flags].concat());
@@ -14,10 +14,10 @@ fn start_web(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
     (web, url)
 }
 
-/// Number of scans of a log that plays for two minutes. This is longer than a page takes to load.
+/// Number of scans of a log that plays for two minutes, which is longer than the page takes to load.
 const SCAN_COUNT: u64 = 600;
 
-/// Writes a CARMEN log of a wall that is nearer in every scan, at five scans per second.
+/// Writes a CARMEN log with five scans per second. In each scan, the wall is nearer than in the scan before.
 fn log(env: &TestEnv, scans: u64) -> String {
     let line = |n: u64| {
         let stamp = 1000.0 + 0.2 * n as f64;
@@ -38,7 +38,7 @@ fn page_has_controls_of_the_player() {
     assert!(!shared_memory(&own).is_empty(), "a hub of its own");
     page.await_true("document.querySelector('#line').max > 119 && document.querySelector('#line').value > 0");
 
-    // A key pauses the replay. The picture stays for longer than a scan is valid.
+    // A key pauses the replay. The picture must stay, even after the time for which a scan is valid.
     page.press("p");
     page.await_true("scanhub.player.paused && /paused/.test(document.querySelector('#played').innerText)");
     page.ask("window.pausedAt = performance.now()");
@@ -48,14 +48,14 @@ fn page_has_controls_of_the_player() {
     assert_eq!(page.ask("scanhub.reason"), serde_json::Value::Null);
     assert_eq!(page.ask("scanhub.verdict"), "unknown", "a paused picture must not show a current verdict");
 
-    // A key and a button each step by one telegram.
+    // A key and a button step by one telegram each.
     page.press(".");
     page.await_true(&format!("scanhub.player.telegrams === {}", before + 1));
     page.ask("document.querySelector('[data-order=step]').click()");
     page.await_true(&format!("scanhub.player.telegrams === {} && scanhub.player.paused", before + 2));
     page.await_true("scanhub.beams === 181");
 
-    // Double the rate, then halve it twice.
+    // Keys double the rate, and then halve it twice.
     page.press(">");
     page.await_true("scanhub.player.rate === 2");
     page.press("<");

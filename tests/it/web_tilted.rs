@@ -1,5 +1,5 @@
-//! Tests of three dimensions on the web page and in its channels: channels equal the output of `echo`, and the page
-//! shows sweeps from the side on request.
+//! Tests of three dimensions on the web page and in its channels: the messages of the channels equal the output of
+//! `echo`, and the page shows sweeps from the side on request.
 
 use std::net::TcpStream;
 use std::path::Path;
@@ -30,7 +30,7 @@ fn publish_round(publisher: &mut TiltedPublisher, viewer: &mut WebSocket<TcpStre
     messages.map(Option::unwrap_or_default)
 }
 
-/// Returns whether a point cloud has the points of these lines, which belong to one sweep.
+/// Returns whether a point cloud has exactly the points of these lines, which belong to one sweep.
 fn is_cloud(body: &[u8], lines: &[Value]) -> bool {
     let message = read(&POINT_CLOUD, body).expect("a PointCloud2");
     let byte = |value: &Told| if let Told::Number(byte) = value { *byte as u8 } else { panic!("a byte") };
@@ -127,7 +127,7 @@ fn channels_of_mount_and_sweep_equal_output_of_echo() {
             let expected = &lines("obstacles", number)[0];
             assert!(are_obstacles(&found, expected), "{found} {expected}");
         }
-        // Without a viewer, the server drops its subscriptions.
+        // When the last viewer has left, the server drops its subscriptions.
         drop(viewer);
         wait_until("no subscriber", || seldom.map(|topic| env.subscribers(topic)) == [0, 0]);
     }
@@ -143,7 +143,7 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     let (_server, host) = web(&hall.env, &[]);
     page.open(&format!("http://{host}/"));
     page.await_true("window.scanhub?.beams > 100");
-    // Without sweeps, the page has no view from the side.
+    // As long as no sweep arrives, the page has no view from the side.
     page.press("h");
     let is_plain = format!("{SIDE_BUTTON}.hidden && !scanhub.aside && {SWEPT_TEXT} === ''");
     page.await_true(&is_plain);
@@ -154,8 +154,8 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     page.await_true("scanhub.obstacles > 0 && scanhub.beams > 100");
     page.await_true(&format!("{SIDE_BUTTON}.offsetHeight >= 40"));
     assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
-    // In two dimensions, the floor would be foreground, because the beams of the background had another angle. The page
-    // does not show it.
+    // While the mount tilts, the hub takes the floor for foreground, because the background was learned at another
+    // angle. The page must not show this foreground.
     page.await_true("scanhub.sweeps[0].sweep !== undefined && scanhub.foreground === 0");
     let script = "new Promise((done) => {
         const until = scanhub.scans.front + 40;
@@ -174,18 +174,18 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     assert_eq!(hall.env.subscribers("hall/cloud"), 1);
     page.await_true(&format!("/^hall: [1-9][0-9]* obstacles?, nearest 1\\.[3-5] m/.test({SWEPT_TEXT})"));
     page.await_true("document.querySelector('#map').ariaLabel.includes('from the side')");
-    // The axes have names, and the floor is at the bottom of the free part of the picture.
+    // In this view, the axes have names, and the floor is at the bottom of the free part of the picture.
     page.await_true("scanhub.axes === 2");
     let floor = "document.querySelector('nav').getBoundingClientRect().top - scanhub.screen(0, 0)[1]";
     page.await_true(&format!("{floor} > 20 && {floor} < 120"));
-    // Ahead is to the right, and up is up.
+    // In this view, the direction ahead is to the right, and up is up.
     let place = "scanhub.screen(1, -2).map(Math.round).join() !== scanhub.screen(0, 0).map(Math.round).join() && \
                  scanhub.screen(1, -2)[0] > scanhub.screen(0, 0)[0] && scanhub.screen(1, -2)[1] < scanhub.screen(0, 0)[1]";
     page.await_true(place);
     page.mouse("mouseMoved", (500.0, 400.0), false);
     page.await_true("/above the floor/.test(document.querySelector('#readout').innerText)");
 
-    // Keys toggle layers, rotate the view and reset it.
+    // Keys show and hide layers, rotate the view and reset it.
     page.press("o");
     page.await_true("scanhub.obstacles === 0");
     page.press("o");
@@ -202,7 +202,7 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     page.await_true("scanhub.view.turn > 0.2");
     page.press("c");
     page.await_true("scanhub.view.turn === 0");
-    // A held picture does not change. It then continues.
+    // A held picture does not change. After that, the picture continues.
     freeze_page(&mut page, "scanhub.swept > 1000 && scanhub.sweeps[0].sweep != null");
     let [sweep, points] = ["scanhub.sweeps[0].sweep", "scanhub.swept"].map(|what| page.ask(what));
     page.press("h");
@@ -213,14 +213,14 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     ));
     page.press(" ");
     page.await_true(&format!("scanhub.sweeps[0].sweep !== {sweep}"));
-    // After a switch back to this view, the page waits for the next sweep, which is not a problem.
+    // After a switch to another view and back, the page waits for the next sweep. It must not show this as a problem.
     let waits = "/^Waiting for the next sweep\\s*$/.test(scanhub.reason)";
     page.await_true(&format!(
         "scanhub.sweeps[0].sweep && ({SIDE_BUTTON}.click(), {SIDE_BUTTON}.click(), {waits})"
     ));
     page.await_true("scanhub.swept > 1000 && scanhub.reason === null");
 
-    // When `tilt` has ended, the page removes the sweeps and gives the reason.
+    // After `tilt` has exited, the page removes the sweeps and shows the reason.
     assert_eq!(tilt.end(INT).exit_code, Some(0));
     page.await_true("scanhub.swept === 0 && /hall: no sweep any more/.test(scanhub.reason)");
     page.await_true("/scanhub tilt/.test(scanhub.reason)");
@@ -230,7 +230,7 @@ fn side_view_shows_sweeps_and_subscribes_to_points() {
     end_cleanly(hall);
 }
 
-/// The demo with a mount prints the address of its page, which shows sweeps.
+/// The demo with a mount prints the address of its page, and this page shows sweeps.
 #[test]
 fn demo_page_shows_sweeps() {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
@@ -245,7 +245,7 @@ fn demo_page_shows_sweeps() {
     let mut viewer = connect_viewer(&host, "/", None).expect("an accepted viewer");
     let [cloud] = channels(&mut viewer, ["/hall/cloud"]);
     subscribe(&mut viewer, &[(0, &cloud["id"])]);
-    // A busy machine may send only a part of a sweep.
+    // A busy machine may send only a part of a sweep, so wait for a cloud that is large enough.
     wait_until("a cloud", || {
         let Message::Binary(frame) = viewer.read().expect("an open connection") else { return false };
         read(&POINT_CLOUD, &frame[13..]).expect("a PointCloud2").number("width") > Some(100.0)
@@ -253,8 +253,8 @@ fn demo_page_shows_sweeps() {
     assert_eq!(demo.end(INT).exit_code, Some(0));
 }
 
-/// Checks the page as in the picture of `docs/tilt.md`: its hall with all obstacles. The command in `web_page` that
-/// creates the pictures creates this one too.
+/// Checks that the page shows the picture of `docs/tilt.md`, a hall with all obstacles. The command that creates the
+/// pictures, in `web_page.rs`, also creates this picture.
 #[test]
 fn page_shows_documented_states_from_the_side() {
     let env = TestEnv::new();
@@ -274,12 +274,12 @@ fn page_shows_documented_states_from_the_side() {
     page.press("h");
     page.await_true("scanhub.aside && scanhub.swept > 1000 && scanhub.axes === 2");
     if let Some(directory) = &directory {
-        // A pole, a box, and a walking person.
+        // The hall has a pole, a box, and a walking person. Wait for a complete sweep with at least two near obstacles.
         let condition = "scanhub.swept > 10_000 && scanhub.axes === 2 && scanhub.sweeps[0].complete === 'true' \
                     && scanhub.sweeps[0].obstacles.filter((one) => one.near === 'true').length >= 2 \
                     && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
                     && document.querySelector('#news').innerText === ''";
-        // The page shows the text a moment after the sweep.
+        // Shortly after the page has drawn the sweep, it shows the text about it.
         let is_reported = format!("{SWEPT_TEXT} === `hall: ${{scanhub.sweeps[0].words}}`");
         page.await_true(&format!(
             "{condition} && {is_reported} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"

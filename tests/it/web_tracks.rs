@@ -1,4 +1,5 @@
-//! Tests of people on the web page: the people of `track --as`, with number, trail and room, in the map of the site.
+//! Tests of people on the web page: the page shows the people of `track --as` in the map of the site, each with a
+//! number, a trail and the room.
 
 use serde_json::Value;
 
@@ -8,7 +9,7 @@ use crate::track::{SITE_FILE, record_people, replay};
 use crate::web::web;
 use crate::web_page::{browse, freeze_page};
 
-/// Script that counts the pixels with the color of people in a square around the first person.
+/// Script that counts the pixels that have the color of people, in a square around the first person.
 const GREEN_SCRIPT: &str = "(() => {
     const [x, y] = scanhub.screen(scanhub.people[0].x, scanhub.people[0].y);
     const probe = document.body.appendChild(document.createElement('i'));
@@ -47,7 +48,7 @@ fn people_are_drawn_at_their_tracked_positions() {
         "scanhub.tracks === 1 && document.querySelector('#people').innerText.startsWith('1 person: hall 1')",
     );
     page.await_true("document.querySelector('#people').innerText.startsWith('1 person: kitchen 1')");
-    // A number that is larger than the number of people is explained.
+    // If the number of a person is larger than the number of people, the page explains it.
     page.await_true(
         "scanhub.tracks === 1 && document.querySelector('#people').textContent === \
          '1 person: kitchen 1' + (scanhub.people[0].id > 1 ? `  ·  tracks so far: ${scanhub.people[0].id}` : '')",
@@ -55,7 +56,7 @@ fn people_are_drawn_at_their_tracked_positions() {
     // The position of the robot in the map is unknown, so the page does not show the verdict of its zones.
     page.await_true("document.querySelector('#verdict').hidden && document.title === 'scanhub'");
     page.await_true("scanhub.tracks === 1 && scanhub.people[0].tail.length > 10");
-    // A held picture does not change.
+    // A held picture does not change while the person walks on.
     freeze_page(
         &mut page,
         "scanhub.people[0]?.state === 'confirmed' && scanhub.points('kitchen').length > 100",
@@ -64,7 +65,7 @@ fn people_are_drawn_at_their_tracked_positions() {
     let place = ["x", "y"].map(|axis| number(&mut page, &format!("scanhub.people[0].{axis}")));
     let reach = ["x", "y"].map(|axis| number(&mut page, &format!("scanhub.people[0].reach.{axis}")));
     assert!(reach.iter().all(|half| (0.005..0.5).contains(half)), "{reach:?}");
-    // Sensors are drawn with the poses of the site, and the robot's zones are not drawn.
+    // The page draws the sensors at the poses of the site, and does not draw the robot's zones.
     assert_eq!(page.ask("scanhub.zones"), 0);
     let far = "scanhub.points('kitchen').filter((at, i) => i % 2 === 0 && (at < -0.2 || at > 12.2)).length";
     assert!(number(&mut page, "scanhub.points('kitchen').length") > 100.0);
@@ -78,7 +79,7 @@ fn people_are_drawn_at_their_tracked_positions() {
     };
     track.await_line("where the page draws the person", is_at_drawn_position);
     assert_eq!(track.end(INT).exit_code, Some(0));
-    // People who are no longer reported are removed.
+    // After `track` has exited, the page removes the people.
     page.press(" ");
     page.await_true("scanhub.tracks === 0 && document.querySelector('#people').innerText === ''");
     assert_eq!(hub.end(INT).exit_code, Some(0));

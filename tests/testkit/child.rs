@@ -1,7 +1,7 @@
 //! Child processes of tests: starts them, and ends each one together with all its descendants.
 //!
 //! A child runs in a separate process group, so that dropping its [`Child`] also ends the processes that it has
-//! started, such as the browser of a shell script that does not `exec`. A descendant may leave the group, as a daemon
+//! started, such as a browser that a shell script started without `exec`. A descendant may leave the group, as a daemon
 //! or a program in a new session does. Two environment variables therefore mark all descendants: [`RUN_VARIABLE`] names
 //! the test binary, and [`CHILD_VARIABLE`] names the child.
 
@@ -26,22 +26,22 @@ use rustix::process::{
 };
 
 /// Variable with the target directory, process ID and start time of the test binary, separated by colons. `.ci/run`
-/// also searches for it.
+/// also searches the environments of processes for this variable.
 const RUN_VARIABLE: &str = "SCANHUB_TEST_RUN";
 /// Variable that names the child from which a process descends: the process ID and start time of the test binary and an
-/// index, separated by dots. A test that runs again in another process appends the names of its own children after a
-/// slash.
+/// index, separated by dots. If a test runs again in another process, that process appends a slash and the name of its
+/// child to the value.
 const CHILD_VARIABLE: &str = "SCANHUB_TEST_CHILD";
-/// Variable that `.ci/run` sets to a time in clock ticks since boot. Processes of test binaries that started at this
-/// time or later are not ended, because `.ci/run` itself checks for them.
+/// Variable that `.ci/run` sets to a time in clock ticks since boot. If a test binary started at this time or later,
+/// the processes that it left are not ended here, because `.ci/run` itself checks for them.
 const SINCE_VARIABLE: &str = "SCANHUB_TEST_SINCE";
 
-/// Time that a program has to exit after TERM before it is killed.
+/// Time that a program has to exit after the signal TERM, before it is killed.
 const TERM_TIMEOUT: Duration = Duration::from_secs(2);
-/// Maximum time in which the kernel ends killed processes, even on a busy machine.
+/// Maximum time from killing processes until the kernel has ended them, even on a busy machine.
 const KILL_TIMEOUT: Duration = Duration::from_secs(60);
-/// Maximum time in which a process loads its program. It is short, because the environment of some processes stays
-/// empty.
+/// Maximum time for which a process has an empty environment while it loads its program. The limit is short, because
+/// the environment of some processes stays empty.
 const EXEC_TIMEOUT: Duration = Duration::from_millis(200);
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
@@ -54,8 +54,8 @@ pub(crate) struct Child {
 
 /// Starts `command` in a new process group.
 ///
-/// Set the stdin of `command`: the child must not read from the terminal of the person who runs the tests, because it
-/// is not in that terminal's foreground.
+/// The caller must set the stdin of `command`. The child must not read from the terminal of the person who runs the
+/// tests, because the child is not in that terminal's foreground.
 ///
 /// # Errors
 ///
@@ -70,8 +70,7 @@ pub(crate) fn spawn(mut command: impl BorrowMut<Command>) -> io::Result<Child> {
     let mark = std::env::var(CHILD_VARIABLE).map_or(mark.clone(), |outer| format!("{outer}/{mark}"));
     let command = command.borrow_mut();
     command.env(RUN_VARIABLE, run()).env(CHILD_VARIABLE, &mark);
-    // `setsid` creates a session and a group with its own process ID. It would fork if it already were the leader of a
-    // group.
+    // `setsid` itself creates a session and a group with its own process ID. If it already led a group, it would fork.
     if command.get_program() != "setsid" {
         command.process_group(0);
     }
@@ -103,7 +102,7 @@ pub(crate) fn succeeds(command: impl BorrowMut<Command>) -> bool {
     output(command).is_ok_and(|output| output.status.success())
 }
 
-/// Writes an executable file, for example a shell script. The test may start it at once.
+/// Writes an executable file, for example a shell script. The test may start the file at once.
 ///
 /// A child process writes the file. If this process did, another thread could fork a child that inherits the open
 /// file, and the kernel refuses to execute a file that any process has open for writing ("Text file busy").
@@ -137,8 +136,11 @@ impl Child {
         kill_process(Pid::from_child(&self.process), signal)
     }
 
-    /// Returns whether the program has ended, without reading its exit status. Returns an error if the exit status was
-    /// read before.
+    /// Returns whether the program has ended, without reading its exit status.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the exit status was read before.
     fn has_ended(&self) -> rustix::io::Result<bool> {
         let flags = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
         Ok(waitid(WaitId::Pid(Pid::from_child(&self.process)), flags)?.is_some())
@@ -162,10 +164,11 @@ impl Child {
     /// Ends the program and all its descendants, and waits for their end.
     pub(crate) fn end(&mut self) {
         let id = Pid::from_child(&self.process);
-        // The kernel does not assign the ID of the process and of its group again until the process is reaped.
+        // The kernel does not reuse the ID of the process, which is also that of its group, until the process is
+        // reaped.
         let is_reaped = self.has_ended().is_err();
         if !is_reaped {
-            // TERM first, so that the program can end its children and remove its files.
+            // Send TERM first, so that the program can end its children and remove its files.
             let _ = kill_process(id, Signal::TERM);
             let give_up_at = Instant::now() + TERM_TIMEOUT;
             while self.has_ended() == Ok(false) && Instant::now() < give_up_at {
@@ -187,12 +190,12 @@ impl Child {
         self.living_pids(false).into_iter().map(line).collect()
     }
 
-    /// Returns the process IDs of the running descendants, and of the child itself if it is running. The members of its
-    /// process group count as descendants if `is_group_ours`.
+    /// Returns the process IDs of the running descendants, and of the child itself if it is running. Members of the
+    /// child's process group count as descendants if `is_group_ours` is true.
     fn living_pids(&self, is_group_ours: bool) -> Vec<i32> {
         let id = self.process.id() as i32;
-        // The kernel assigns ascending process IDs until it reaches the maximum. A descendant therefore has a higher
-        // ID, unless the IDs have started again from low numbers.
+        // The kernel assigns ascending process IDs until it reaches the maximum, and then starts again from low
+        // numbers. Unless that has happened since the child started, its descendants have higher IDs than the child.
         let lowest = if newest_process_id().is_some_and(|newest| newest >= id) { id } else { 1 };
         let is_marked = |pid: &i32| {
             let mark = variable(*pid, CHILD_VARIABLE).unwrap_or_default();
@@ -260,8 +263,8 @@ fn end_earlier_runs() {
     end_runs_of(run().rsplitn(3, ':').nth(2).unwrap_or_default(), since);
 }
 
-/// Ends processes of this user whose test binary belongs to the target directory `target`, started before `since`
-/// (clock ticks since boot) and has ended.
+/// Ends processes of this user that a test binary of the target directory `target` left. Only test binaries count that
+/// started before `since` (clock ticks since boot) and have ended.
 pub(crate) fn end_runs_of(target: &str, since: u64) {
     let user = geteuid().as_raw();
     let is_left = |pid: &i32| {
@@ -285,8 +288,8 @@ fn run() -> &'static str {
     static RUN_VARIABLE: OnceLock<String> = OnceLock::new();
     RUN_VARIABLE.get_or_init(|| {
         let program = std::env::current_exe().unwrap_or_default();
-        // Cargo passes a directory in the target directory to integration tests only. Unit tests are in
-        // target/debug/deps.
+        // Cargo passes this variable, a directory in the target directory, to integration tests only. Binaries of unit
+        // tests are in target/debug/deps.
         let target = option_env!("CARGO_TARGET_TMPDIR").map(Path::new).and_then(Path::parent);
         let target = target.or(program.ancestors().nth(3)).unwrap_or(Path::new("/"));
         let own = std::process::id();
@@ -300,16 +303,16 @@ fn process_ids() -> impl Iterator<Item = i32> {
     entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
 }
 
-/// Returns the process ID that the kernel assigned last.
+/// Returns the process ID that the kernel assigned most recently.
 fn newest_process_id() -> Option<i32> {
     fs::read_to_string("/proc/loadavg").ok()?.split_whitespace().last()?.parse().ok()
 }
 
-/// Returns the value of a variable in the environment that a process was started with.
+/// Returns the value of variable `name` in the environment with which the process `pid` was started.
 fn variable(pid: i32, name: &str) -> Option<String> {
     let mut environment = environment(pid)?;
     let give_up_at = Instant::now() + EXEC_TIMEOUT;
-    // The environment of a process is empty for a moment while it starts another program.
+    // The environment of a process is empty for a short time while the process starts another program.
     while environment.is_empty() && has_environment(pid) && Instant::now() < give_up_at {
         thread::sleep(Duration::from_millis(1));
         environment = self::environment(pid)?;
@@ -320,7 +323,8 @@ fn variable(pid: i32, name: &str) -> Option<String> {
 }
 
 /// Returns the first 256 kB of the environment of a process. The result is empty if the process starts another program
-/// between `open` and `read`. A single `read` is used, because several could return a part of the environment.
+/// between `open` and `read`. A single call of `read` is used, because several calls could return only a part of the
+/// environment.
 fn environment(pid: i32) -> Option<Vec<u8>> {
     let mut bytes = vec![0; 1 << 18];
     let len = fs::File::open(format!("/proc/{pid}/environ")).ok()?.read(&mut bytes).ok()?;
@@ -328,7 +332,7 @@ fn environment(pid: i32) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Returns whether a process has an environment, or will have one when its program is loaded.
+/// Returns whether a process has an environment, or will have one as soon as its program is loaded.
 fn has_environment(pid: i32) -> bool {
     let Some(fields) = stat(pid) else { return false };
     let field =
@@ -340,7 +344,7 @@ fn has_environment(pid: i32) -> bool {
 /// Flag of a kernel thread, which never has an environment (linux/sched.h).
 const PF_KTHREAD: u64 = 0x0020_0000;
 
-/// Returns the process group of a process that has not ended.
+/// Returns the process group of the process `pid`, or `None` if the process has ended.
 fn group(pid: i32) -> Option<i32> {
     stat(pid)?.get(2)?.parse().ok()
 }

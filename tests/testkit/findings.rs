@@ -1,5 +1,5 @@
-//! Findings of `scanhub doctor`, and assertions about them. For each expected problem, a line of a table is printed:
-//! the setup, the state, the check and the remedy.
+//! Findings of `scanhub doctor`, and assertions about them. For each expected problem, the assertion prints a line of a
+//! table with the setup, the state, the check and the remedy.
 
 use serde_json::Value;
 
@@ -28,8 +28,8 @@ impl Findings {
         Findings(lines)
     }
 
-    /// Asserts that check `name` has `state` and a remedy that contains `remedy_word`, and prints it as a line of the
-    /// table. `set_up` describes the setup of the test.
+    /// Asserts that check `name` has `state` and a remedy that contains `remedy_word`, and prints the finding as a line
+    /// of the table. `set_up` describes the setup of the test.
     pub(crate) fn assert_problem(&self, set_up: &str, name: &str, state: &str, remedy_word: &str) {
         let is_it = |line: &&Value| {
             let remedy = line["remedy"].as_str().unwrap_or_default();

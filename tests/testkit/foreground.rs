@@ -15,7 +15,7 @@ use scanhub_sim::room::BeamTarget;
 use scanhub_sim::room::Room;
 use scanhub_sim::world::World;
 
-/// A scene of the simulated world: 2000 scans, 53 s.
+/// A scene of the simulated world. It has 2000 scans, which take 53 s.
 #[derive(Clone, Copy)]
 pub(crate) struct Scene {
     /// Name of the scene in tables.
@@ -38,10 +38,10 @@ pub(crate) enum ExpectedAnswer {
     /// Not foreground: the beam meets a surface that existed from the start, a surface that became visible when an
     /// object was removed, or an object that was put down or moved more than [`OLD_AGE_S`] ago.
     Other,
-    /// An object that was put down, moved or opened recently. It is foreground until the method has learned it. Each
-    /// method takes a different time to do so, so both answers are right.
+    /// An object that was put down, moved or opened recently. It is foreground until the method has learned it. The
+    /// methods take different times to learn it, so both answers are right.
     New,
-    /// Not counted: the beam grazes a leg, or has no reading.
+    /// Not counted, because the beam grazes a leg or has no reading.
     Neither,
 }
 
@@ -113,7 +113,7 @@ impl Detector for HubDetector {
     }
 }
 
-/// Numbers of beams. Each beam is counted by its correct answer and by the answer of the method.
+/// Numbers of beams, counted by the correct answer and by the answer of the method.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Score {
     scans: u64,
@@ -166,17 +166,17 @@ impl AddAssign for Score {
     }
 }
 
-/// Number of scans until a surface becomes background: the default for 361 beams.
+/// Number of scans after which a new surface becomes background, which is the hub's default for 361 beams.
 const LEARNING_SCANS: usize = 375;
 
 /// Answers for the beams of two boxes in the room of Fig. 8, over several runs. Box 1 is put down, and box 2 is taken
-/// away. N is [`LEARNING_SCANS`].
+/// away. In the docs of the fields, N is [`LEARNING_SCANS`].
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Boxes {
-    /// Beams that meet box 1, N scans after it was put down. The second number counts those that are still foreground.
+    /// Beams that meet box 1, N scans after the box was put down, and how many of these beams are still foreground.
     new_box: Share,
-    /// Beams that met box 2, N and 2N scans after it was taken away. The second number counts those that would not be
-    /// foreground if the box were put back.
+    /// Beams that met box 2 before it was taken away, and how many of these beams would not be foreground if the box
+    /// were put back. The first entry is N scans after the box was taken away, the second one 2N scans.
     removed_box: [Share; 2],
 }
 
@@ -199,7 +199,8 @@ impl Share {
 }
 
 impl Boxes {
-    /// Adds the answers for a run of `frames`. `make` creates the method with an empty background.
+    /// Adds the answers of a new method for `frames`, which are one run. `make` creates the method with an empty
+    /// background.
     pub(crate) fn add(&mut self, make: impl Fn() -> Box<dyn Detector>, frames: &[LabeledScan]) {
         let first = |is: fn(&BeamTarget) -> bool| {
             frames
@@ -231,8 +232,9 @@ impl Boxes {
         }
     }
 
-    /// Returns three percentages: of the beams of box 1, the share that is foreground N scans after it was put down,
-    /// and of the beams of box 2, the shares that are background N and 2N scans after it was taken away.
+    /// Returns three percentages. The first one is the share of the beams of box 1 that is foreground N scans after the
+    /// box was put down. The other two are the shares of the beams of box 2 that are background N and 2N scans after
+    /// the box was taken away.
     pub(crate) fn percents(&self) -> [f64; 3] {
         [self.new_box.percent(), self.removed_box[0].percent(), self.removed_box[1].percent()]
     }

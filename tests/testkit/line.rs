@@ -18,7 +18,7 @@ use super::WAIT_TIMEOUT;
 pub(crate) struct TestLine(OwnedFd);
 
 impl TestLine {
-    /// Creates a raw pty, and a symlink at `path` to the hub's end of it.
+    /// Creates a raw pty, and a symlink at `path` to the hub's end of the pty.
     pub(crate) fn create(path: &Path) -> TestLine {
         let make = || -> Result<TestLine, Errno> {
             let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
@@ -70,7 +70,7 @@ impl TestLine {
         received
     }
 
-    /// Sends as many of `bytes` as the line has room for, from the first one on.
+    /// Sends the first part of `bytes` for which the line has room, and discards the rest.
     pub(crate) fn offer(&self, bytes: &[u8]) {
         let _ = write(&self.0, bytes);
     }
@@ -99,7 +99,7 @@ const REQUEST_LEN: usize = 7;
 /// Offset of the command byte in a request.
 const COMMAND_OFFSET: usize = 4;
 
-/// Opens the host's end of the line at `path`, raw and with the baud rate `rate`. Reads and writes do not block.
+/// Opens the host's end of the line at `path` in raw mode at `rate` baud. Reads and writes do not block.
 pub(crate) fn open_line(path: &Path, rate: u32) -> std::fs::File {
     let make = || -> Result<OwnedFd, Errno> {
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use super::child::{Child, output, spawn, status};
 
-/// Machine that exists until this value is dropped. Its end of the cable is `eth0`.
+/// Machine that exists until this value is dropped. The machine's end of the cable is the interface `eth0`.
 pub(crate) struct Machine {
     /// Process that keeps the namespace alive.
     holder: Child,
@@ -18,8 +18,8 @@ pub(crate) struct Machine {
 }
 
 impl Machine {
-    /// Creates the machine with this number. The cable's network is 10.76.NUMBER.0/24. The test has address 1 in it,
-    /// and the machine has address 2.
+    /// Creates the machine with this number. The cable's network is 10.76.NUMBER.0/24. In this network, the test has
+    /// the address 10.76.NUMBER.1 and the machine has 10.76.NUMBER.2.
     pub(crate) fn new(number: u8) -> Machine {
         let mut unshare = Command::new("unshare");
         unshare.args(["--net", "sh", "-c", "ip link set lo up && echo up && exec cat"]);
@@ -85,7 +85,7 @@ impl Machine {
         }
     }
 
-    /// Runs a command on the machine. Its words are separated by single spaces.
+    /// Runs a command on the machine. `command` is a program with its arguments, separated by single spaces.
     ///
     /// # Panics
     ///

@@ -63,7 +63,8 @@ pub(crate) use telegrams::{
 pub(crate) use terminal::{TerminalSession, can_open_terminal, terminal};
 pub(crate) use tmux::Tmux;
 
-/// Timeout of every wait. It only ends a test that hangs: no test depends on how long something takes.
+/// Timeout of every wait. A wait lasts this long only in a test that hangs: no test depends on how long something
+/// takes.
 pub(crate) const WAIT_TIMEOUT: Duration = Duration::from_secs(180);
 
 /// Flag of `simulate` with which scanners take as long to reply as real ones.
@@ -71,7 +72,7 @@ pub(crate) const REAL_REPLY_TIME: &str = "--fault=answer=0";
 /// Flag of `simulate` with which scanners reply after 5 ms.
 const SHORT_REPLY_TIME: &str = "--fault=answer=0.005";
 
-/// Variable with the path of the program, for a test in which the directory where it was built is hidden.
+/// Variable with the path of the program. A test that hides the directory with the program sets this variable.
 pub(crate) const PROGRAM_PATH_VARIABLE: &str = "SCANHUB_TEST_PROGRAM";
 
 /// Domain and directory of one test. Dropping it removes the directory and the shared memory of the domain.
@@ -87,7 +88,7 @@ impl TestEnv {
     pub(crate) fn new() -> TestEnv {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
-        // Not TMPDIR: root and prefix of a domain must be short.
+        // The directory is in `/tmp` instead of TMPDIR, because the root and the prefix of a domain must be short.
         let mut builder = tempfile::Builder::new();
         builder.prefix(&domain).rand_bytes(4).permissions(Permissions::from_mode(0o755));
         let directory = builder
@@ -113,7 +114,7 @@ impl TestEnv {
         self.directory.path().join(name)
     }
 
-    /// Returns the same path as [`TestEnv::path`], as an argument of a program.
+    /// Returns the path of the file `name` in the directory of the test, as an argument of a program.
     pub(crate) fn path_argument(&self, name: &str) -> String {
         self.path(name).display().to_string()
     }
@@ -129,8 +130,8 @@ impl TestEnv {
         format!("--link={name}={}", self.path_argument(name))
     }
 
-    /// Returns the flag for a link with `family = "lms"`. A hub that searches for the scanner would also send requests
-    /// of the search.
+    /// Returns the flag for a link with `family = "lms"`. Without a family, the hub would search for the scanner and
+    /// send additional requests.
     pub(crate) fn lms_link(&self, name: &str) -> String {
         format!("{},family=lms", self.link(name))
     }
@@ -140,7 +141,7 @@ impl TestEnv {
         self.command_at(self.directory.path(), arguments)
     }
 
-    /// Returns the same command as [`TestEnv::command`], with the domain in the directory `root`.
+    /// Returns the command that [`TestEnv::command`] returns, but with the domain in the directory `root`.
     pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
         let program = std::env::var(PROGRAM_PATH_VARIABLE).unwrap_or_else(|_| scanhub().into());
         let mut command = match &self.network {
@@ -193,8 +194,8 @@ impl TestEnv {
         Program::start_with(command, stdin)
     }
 
-    /// Starts a gateway with these flags, and waits for its line of class `gateway`. The gateway saves its number in
-    /// this directory.
+    /// Starts a gateway with these flags, and waits for its line of class `gateway`. The gateway saves the number of
+    /// its run in this directory.
     pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         let mut gateway = self.start_gateway(flags);
         gateway.await_line("line of class gateway", is_class("gateway"));
@@ -206,8 +207,8 @@ impl TestEnv {
         self.start(&concat_args(&["gateway", "--json", "--no-system-config"], flags))
     }
 
-    /// Starts a simulator with a port of each of these names, and waits until it is ready. It logs all telegrams that
-    /// it sends in the file `truth`.
+    /// Starts a simulator with one port for each name in `ports`, and waits until the simulator is ready. The simulator
+    /// logs every telegram that it sends in the file `truth`.
     ///
     /// The scanners reply after 5 ms unless `flags` contain a fault or [`REAL_REPLY_TIME`], because few tests need the
     /// real reply time. The lines are lossless: the simulator waits while the hub does not read.
@@ -215,7 +216,8 @@ impl TestEnv {
         self.simulator_on_real_lines(ports, &concat_args(flags, &["--lossless"]))
     }
 
-    /// Starts a simulator like [`TestEnv::simulator`], on lines that lose bytes which the hub does not read in time.
+    /// Starts a simulator like [`TestEnv::simulator`], but on lossy lines: bytes that the hub does not read in time are
+    /// lost.
     pub(crate) fn simulator_on_real_lines<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
         let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.path_argument(port))).collect();
         let truth = format!("--truth={}", self.path_argument("truth"));
@@ -228,15 +230,15 @@ impl TestEnv {
         self.start(&words).ready()
     }
 
-    /// Kills the simulator of one port. The symlink of the port is removed first. Otherwise, the hub could open it
-    /// again after the kernel has given the same terminal to the simulator of another test.
+    /// Kills the simulator of one port. The symlink of the port is removed first. Otherwise, the hub could open the
+    /// symlink again after the kernel has given the same terminal to the simulator of another test.
     pub(crate) fn kill_port_simulator(&self, simulator: Program, port: &str) {
         fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
         assert_eq!(simulator.end(KILL).exit_code, None);
     }
 
-    /// Waits until all of `topics` exist, starts `echo --json` of them, and waits until it is attached to all of them.
-    /// The topics of a remote sensor are created one by one, each with its first datagram.
+    /// Waits until all of `topics` exist, starts `echo --json` with these topics, and waits until `echo` is attached to
+    /// each of them. The topics of a remote sensor are created one by one, each with its first datagram.
     pub(crate) fn echo(&self, topics: &[&str]) -> Program {
         let mut before = Vec::new();
         wait_until("all topics exist", || {
@@ -259,8 +261,8 @@ impl TestEnv {
         self.all_subscribers(&[topic])[0].unwrap_or_else(|| panic!("topic {topic} does not exist"))
     }
 
-    /// Returns the number of subscribers of each of `topics`, all from one run of `list`; `None` for a topic that does
-    /// not exist.
+    /// Returns the number of subscribers for each topic in `topics`, or `None` for a topic that does not exist. All
+    /// numbers come from one run of `list`.
     fn all_subscribers(&self, topics: &[&str]) -> Vec<Option<u64>> {
         let outcome = self.run(&["list", "--json"]);
         let lines = outcome.lines();
@@ -274,8 +276,8 @@ impl TestEnv {
         topics.iter().map(subscribers).collect()
     }
 
-    /// Runs a verb that searches for a scanner, and repeats this while it finds none. On a busy machine, the simulated
-    /// scanner may reply too late.
+    /// Runs a verb that searches for a scanner, and runs it again as long as it finds none. On a busy machine, the
+    /// simulated scanner may reply too late.
     pub(crate) fn search(&self, arguments: &[&str]) -> Outcome {
         const NOT_FOUND: i32 = 3;
         let mut outcome = self.run(arguments);
@@ -296,7 +298,7 @@ impl TestEnv {
         line.clone()
     }
 
-    /// Runs `info` until `is_expected` accepts its line about `sensor`, and returns this line.
+    /// Runs `info` for `sensor` until `is_expected` accepts the line that it prints, and returns this line.
     pub(crate) fn await_info(&self, sensor: &str, is_expected: impl Fn(&Value) -> bool) -> Value {
         let mut last = Value::Null;
         wait_until("info has the expected status", || {
@@ -334,8 +336,8 @@ impl TestEnv {
             .collect()
     }
 
-    /// Returns the files in the shared memory of this domain that have more than 16 bytes. The library always leaves
-    /// shorter ones.
+    /// Returns the files in the shared memory of this domain that have more than 16 bytes. The library for shared
+    /// memory always leaves shorter files.
     pub(crate) fn leftover_files(&self) -> Vec<PathBuf> {
         shared_memory(&format!("sh_{}_", self.domain))
             .into_iter()
@@ -352,7 +354,8 @@ impl Drop for TestEnv {
     }
 }
 
-/// Returns the path of the program. In tests of other crates, Cargo does not build it, so the first call does.
+/// Returns the path of the program. For tests of other crates, Cargo does not build the program, so the first call
+/// builds it.
 fn scanhub() -> &'static str {
     static BUILT: OnceLock<String> = OnceLock::new();
     option_env!("CARGO_BIN_EXE_scanhub").unwrap_or_else(|| {
@@ -387,19 +390,19 @@ pub(crate) fn wait_until(description: &str, mut is_true: impl FnMut() -> bool) {
         }
         let elapsed = started.elapsed();
         assert!(Instant::now() < give_up_at, "timeout while waiting for: {description}");
-        // A check that starts a program may take at most a third of the time. Other programs then get the processor.
+        // A check that starts a program may take at most a third of the time. Other programs then get enough CPU time.
         thread::sleep(pause.max(2 * elapsed).min(Duration::from_millis(100)));
         pause = (2 * pause).min(Duration::from_millis(20));
     }
 }
 
-/// Waits for at least `span`, so that a program notices by its own clock that this time has passed. A test must not
+/// Waits for at least `span`, so that a program measures with its own clock that this time has passed. A test must not
 /// fail if the wait takes longer.
 pub(crate) fn wait_at_least(span: Duration) {
     thread::sleep(span);
 }
 
-/// Returns whether `path` exists. A symlink with a missing target exists, too.
+/// Returns whether `path` exists. A symlink counts as existing even if its target is missing.
 pub(crate) fn exists_or_is_symlink(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }

@@ -6,10 +6,11 @@ use std::sync::OnceLock;
 use super::child::succeeds;
 use super::{own_program, rerun_test, single_test_args, skip};
 
-/// Variable that is set in the process that runs in the namespace.
+/// Variable that is set in the process that runs the test in the namespace.
 const NAMESPACE_VARIABLE: &str = "SCANHUB_TEST_NETWORK";
 
-/// Runs `test`, whose name is `name`, in a new network namespace. Skips it if the system does not allow that.
+/// Runs `test`, whose name is `name`, in a new network namespace. Skips the test if the system does not allow
+/// namespaces.
 pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
     if std::env::var_os(NAMESPACE_VARIABLE).is_some() {
         return test();

@@ -1,4 +1,4 @@
-//! Program that runs as a child of a test. Its output is read line by line.
+//! Program that runs as a child of a test. The test reads the program's output line by line.
 
 use std::fmt;
 use std::io::{BufRead, BufReader, Read};
@@ -23,7 +23,7 @@ pub(crate) const USR1: Signal = Signal::USR1;
 pub(crate) struct Program {
     name: String,
     process: Child,
-    /// Lines of stdout that have not been processed yet. The last one may lack its line feed.
+    /// Lines of stdout that have not been processed yet. The last line may lack its line feed.
     received_lines: Receiver<Vec<u8>>,
     /// Bytes of all lines that were taken from `received_lines`.
     stdout: Vec<u8>,
@@ -38,7 +38,8 @@ pub(crate) struct Outcome {
     pub(crate) stdout: Vec<u8>,
     /// Complete stderr of the program.
     pub(crate) stderr: String,
-    /// Command lines of the descendants that were still running when the program exited. They have been ended since.
+    /// Command lines of the descendants that were still running when the program exited. These processes have been
+    /// ended since.
     pub(crate) leftover_processes: Vec<String>,
     name: String,
 }
@@ -120,14 +121,15 @@ impl Program {
         }
     }
 
-    /// Returns whether `is_expected` accepts one of the lines received so far. Does not receive more lines.
+    /// Returns whether `is_expected` accepts one of the lines that the test has received so far. Does not receive more
+    /// lines.
     pub(crate) fn has_printed(&self, is_expected: impl Fn(&Value) -> bool) -> bool {
         let lines = self.stdout.split(|byte| *byte == b'\n');
         lines.filter_map(|line| serde_json::from_slice(line).ok()).any(|line| is_expected(&line))
     }
 
-    /// Receives the lines that the program has written by now. Returns whether `is_expected` accepts one of all
-    /// received lines.
+    /// Receives the lines that the program has written by now. Returns whether `is_expected` accepts one of these lines
+    /// or of the lines received before.
     pub(crate) fn prints(&mut self, is_expected: impl Fn(&Value) -> bool) -> bool {
         while self.receive(Instant::now()).is_ok() {}
         self.has_printed(is_expected)
@@ -233,7 +235,7 @@ impl Program {
     }
 
     fn fail_wait(&mut self, description: &str, why: RecvTimeoutError) -> ! {
-        // End the descendants too, because any of them keeps stderr open.
+        // End the descendants too. Any of them keeps stderr open, and the thread that reads stderr would not end.
         self.process.end();
         let errors = self.errors.take().and_then(|errors| errors.join().ok()).unwrap_or_default();
         let out = String::from_utf8_lossy(&self.stdout);

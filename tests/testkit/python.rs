@@ -10,13 +10,14 @@ use super::{output, skip};
 #[path = "../../clients/python/sources.rs"]
 mod sources;
 
-/// Returns a command that starts a Python interpreter with `modules`: the one in the variable `SCANHUB_PYTHON`, or the
-/// one that `.ci/run` installs. If there is none, skips the test and returns `None`.
+/// Returns a command that starts a Python interpreter that has `modules`. It is the interpreter in the variable
+/// `SCANHUB_PYTHON`, or else the one that `.ci/run` installs. If the modules are missing, skips the test and returns
+/// `None`.
 pub(crate) fn python(modules: &str) -> Option<Command> {
     python_for("python-packages", modules)
 }
 
-/// Returns the same as [`python`]. If there is no interpreter with `modules`, skips the test because of `need`.
+/// Does the same as [`python`], but names `need` as the missing requirement if the test is skipped.
 pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
     let made = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/venv/bin/python");
     let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);
@@ -31,7 +32,7 @@ pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
 }
 
 /// Returns a command that starts a Python interpreter with the package `scanhub` that was built from these sources. If
-/// there is none, skips the test and returns `None`.
+/// the package was not built, skips the test and returns `None`.
 pub(crate) fn client_python() -> Option<Command> {
     static CLIENT_PYTHON: OnceLock<(String, String)> = OnceLock::new();
     let command = python_for("python-packages", "numpy")?;

@@ -19,12 +19,12 @@ pub(crate) struct Receiver {
 }
 
 impl Receiver {
-    /// Receives on the interface with this address, at the default port of the groups.
+    /// Creates a receiver on the interface with this address, at the default port of the groups.
     pub(crate) fn new(interface: Ipv4Addr) -> Receiver {
         Receiver::at(interface, PORT)
     }
 
-    /// Receives on the interface with this address, at `port`.
+    /// Creates a receiver on the interface with this address, at `port`.
     pub(crate) fn at(interface: Ipv4Addr, port: u16) -> Receiver {
         let socket = Receiver::socket(interface, port);
         let (datagrams, stop) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
@@ -56,8 +56,8 @@ impl Receiver {
             let group = Ipv4Addr::new(GROUP_PREFIX[0], GROUP_PREFIX[1], GROUP_PREFIX[2], last);
             socket.join_multicast_v4(&group, &interface).expect("the group can be joined");
         }
-        // The buffer lets a test that is not scheduled for a second receive everything. A user without the privilege
-        // for this size may miss datagrams.
+        // This buffer is large enough for the datagrams of a second in which the test is not scheduled. A user without
+        // the privilege for this size may miss datagrams.
         let _ = set_socket_recv_buffer_size_force(&socket, 8 << 20);
         socket.set_read_timeout(Some(Duration::from_millis(50))).expect("the read timeout can be set");
         socket

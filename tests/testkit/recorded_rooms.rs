@@ -24,14 +24,14 @@ pub(crate) const SENSORS: [(&str, &str); 2] = [("front", "fig8"), ("rear", "demo
 /// Setting with which the hub learns the background after 40 scans, within the recording.
 pub(crate) const SHORT_LEARNING: &str = "background.scans=40";
 
-/// Returns the time from one scan to the next.
+/// Returns the time from the start of a scan to the start of the next one, in nanoseconds.
 pub(crate) fn scan_period() -> Nanos {
     Variant::HALF.revolutions() * MIRROR_PERIOD
 }
 
 /// Drives a hub in `domain` in virtual time. Each sensor sends a telegram with its mode and then `scans` scans. Writes
-/// each sample that the hub publishes to `file`, and passes it to `keep` with the index of the sensor. Before scan
-/// number `silence`, no byte of a sensor arrives for a second.
+/// each sample that the hub publishes to `file`, and passes it to `keep` with the index of the sensor. Just before the
+/// scan with the index `silence`, no sensor sends a byte for a second.
 pub(crate) fn record(
     domain: &Domain,
     file: &Path,
@@ -83,7 +83,7 @@ pub(crate) fn record(
     writer.finish().expect("the recording can be finished");
 }
 
-/// Sample as it was published, with its payload packed.
+/// A sample with the header and the packed payload with which it was published.
 #[derive(Debug, PartialEq)]
 pub(crate) struct PublishedSample {
     pub(crate) topic: Topic,

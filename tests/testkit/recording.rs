@@ -27,8 +27,8 @@ pub(crate) struct RecordedMessage {
 }
 
 impl Recording {
-    /// Reads a recording that was finished normally. Asserts that it has an end and an index with the right number of
-    /// messages.
+    /// Reads a recording that was finished normally. Asserts that the file has an end record, and an index with the
+    /// right number of messages.
     pub(crate) fn read_complete(path: &Path) -> Recording {
         let bytes = file_bytes(path);
         let summary =
@@ -110,11 +110,11 @@ impl RecordedMessage {
     }
 }
 
-/// Returns the `topic_seq` of each of `messages`, which belong to one topic.
+/// Returns the `topic_seq` of each of `messages`. All of them must belong to one topic.
 ///
 /// # Panics
 ///
-/// Panics if there is a gap.
+/// Panics if a number is missing between two messages.
 pub(crate) fn contiguous_topic_seqs(messages: &[&RecordedMessage]) -> Vec<u64> {
     let numbers: Vec<u64> = messages.iter().map(|message| message.topic_seq()).collect();
     for pair in numbers.windows(2) {

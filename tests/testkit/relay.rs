@@ -1,6 +1,6 @@
 //! Relay for datagrams between machines. It can drop, delay and duplicate datagrams at random.
 //!
-//! The relay waits while the receive buffer of a machine is filling up, so that the kernel drops nothing when a
+//! The relay waits while the receive buffer of a machine is filling up, so that the kernel drops no datagram while a
 //! listener is not scheduled. The datagrams in `forwarded` are therefore exactly those that the machines receive.
 
 use std::net::{Ipv4Addr, UdpSocket};
@@ -30,7 +30,8 @@ struct RelayState {
     received: Vec<Vec<u8>>,
     /// All datagrams that were forwarded, in the order in which they were sent.
     forwarded: Vec<Vec<u8>>,
-    /// Datagrams that are forwarded later. The number is the count of datagrams that must arrive before.
+    /// Datagrams that are forwarded later. The number is the count of datagrams that must arrive before this one is
+    /// forwarded.
     delayed: Vec<(usize, Vec<u8>)>,
     rng: fastrand::Rng,
     is_faulty: bool,
@@ -42,12 +43,13 @@ const LOSS_PERCENT: u8 = 5;
 const DELAY_PERCENT: u8 = 5;
 /// Percentage of the arriving datagrams that are forwarded at once and again later.
 const DUPLICATE_PERCENT: u8 = 2;
-/// Maximum delay of a datagram, as the number of datagrams that arrive during the delay. It corresponds to several
-/// scans.
+/// Maximum delay of a datagram, as the number of datagrams that arrive during the delay. 80 datagrams correspond to
+/// several scans.
 const MAX_DELAY_DATAGRAMS: usize = 80;
 
 impl Relay {
-    /// Starts a relay for the datagrams that the machine `from` sends. `seed` determines the faults.
+    /// Starts a relay for the datagrams that the machine `from` sends. `seed` is the seed of the random numbers that
+    /// decide which datagrams get a fault.
     pub(crate) fn new(from: &Machine, seed: u64) -> Relay {
         let socket = Receiver::socket(from.test_address(), PORT);
         let inner = Arc::new(Mutex::new(RelayState {
@@ -71,8 +73,8 @@ impl Relay {
         Relay { inner, stop, thread: Some(thread) }
     }
 
-    /// Forwards to the machine `to` from now on, too, and returns the number of datagrams forwarded before. Listeners
-    /// on that machine must have started already.
+    /// Adds the machine `to` to those that receive the forwarded datagrams. Returns the number of datagrams that were
+    /// forwarded before. Listeners on `to` must have started already.
     pub(crate) fn connect(&self, to: &Machine) -> usize {
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).expect("a UDP port is free");
         set_ip_multicast_if(&socket, &to.test_address()).expect("the interface of the cable exists");
@@ -82,7 +84,8 @@ impl Relay {
         inner.forwarded.len()
     }
 
-    /// Sets whether datagrams are dropped, delayed and duplicated. If not, forwards all delayed datagrams at once.
+    /// Sets whether datagrams are dropped, delayed and duplicated. If `is_faulty` is false, forwards all delayed
+    /// datagrams at once.
     pub(crate) fn set_faulty(&self, is_faulty: bool) {
         let mut inner = self.state();
         inner.is_faulty = is_faulty;
@@ -146,8 +149,8 @@ impl RelayState {
     }
 }
 
-/// Number of queued bytes at a socket at which the relay starts to wait. It is a fraction of the smallest receive
-/// buffer of a listener.
+/// Number of bytes in a socket's receive buffer at which the relay starts to wait. It is a fraction of the smallest
+/// receive buffer of a listener.
 const MAX_QUEUED_BYTES: u64 = 64 << 10;
 
 /// Returns the largest number of bytes that are queued at one of the UDP sockets in the file `sockets` (proc(5),

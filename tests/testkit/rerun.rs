@@ -19,7 +19,7 @@ pub(crate) fn single_test_args(name: &str) -> [&str; 3] {
 ///
 /// # Panics
 ///
-/// Panics if the test fails there, or if no test has this name.
+/// Panics if the test fails in the new process, or if no test has this name.
 pub(crate) fn rerun_test(name: &str, mut command: Command) {
     command.stdin(Stdio::null()).stdout(Stdio::piped());
     let mut child =
@@ -37,8 +37,9 @@ pub(crate) fn rerun_test(name: &str, mut command: Command) {
     );
 }
 
-/// Runs `test`, whose name is `name`, in a separate process. This is for a test that depends on descriptor numbers or
-/// on the number of open descriptors. It is also for a test whose descriptors children of other tests must not inherit.
+/// Runs `test`, whose name is `name`, in a separate process. A test needs this if it depends on descriptor numbers or
+/// on the number of open descriptors. A test also needs it if its descriptors must not be inherited by children of
+/// other tests.
 ///
 /// # Panics
 ///

@@ -28,8 +28,8 @@ pub(crate) struct TestGateway {
     pub(crate) counter: u32,
     /// Stamp of the samples, in nanoseconds since 1970.
     pub(crate) stamp_ns: u64,
-    /// Number of samples that [`prove_delivery`](TestGateway::prove_delivery) has sent. A listener counts them as
-    /// `unnamed`.
+    /// Number of samples that [`prove_delivery`](TestGateway::prove_delivery) has sent. A listener counts these samples
+    /// as `unnamed`.
     pub(crate) delivery_proofs: u32,
 }
 
@@ -119,8 +119,8 @@ impl TestGateway {
         datagram
     }
 
-    /// Sends a status of another sensor of the same gateway. The other sensor is never announced. A listener that
-    /// receives these samples for a second concludes that the network works and that the sensor under test is silent.
+    /// Sends a sample of topic `status` for another sensor, which the gateway never announces. A listener that receives
+    /// these samples for a second concludes that the network works and that the sensor under test is silent.
     pub(crate) fn prove_delivery(&mut self) {
         let status = usize::from(Topic::Status.number());
         let sensor = std::mem::replace(&mut self.sensor, UNANNOUNCED_SENSOR);
@@ -130,7 +130,8 @@ impl TestGateway {
         self.sensor = sensor;
     }
 
-    /// Announces `topics` until `listener`, which needs no key, publishes the sensor. Returns its notice.
+    /// Announces `topics` until `listener` publishes the sensor, and returns the line in which the listener reports
+    /// this. The listener must run without a key.
     pub(crate) fn wait_until_published(&mut self, listener: &mut Program, topics: &[Topic]) -> Value {
         let (hub, name) = (format!("{:016x}", self.hub), format!(".{}", self.name));
         let is_it = |line: &Value| {
@@ -146,13 +147,13 @@ impl TestGateway {
         notice
     }
 
-    /// Sends an empty payload of the topic with this number.
+    /// Sends a datagram with an empty payload for the topic with this number.
     pub(crate) fn send_empty(&mut self, number: u8) {
         let datagram = self.seal(number, &mut [0; HEADER_LEN], 0);
         self.send_to_group(Announce::GROUP, &datagram);
     }
 
-    /// Sends these bytes to the group that ends in `group`.
+    /// Sends these bytes to the group whose address ends in `group`.
     pub(crate) fn send_to_group(&self, group: u8, bytes: &[u8]) {
         let [a, b, c] = GROUP_PREFIX;
         let sent = self.socket.send_to(bytes, (Ipv4Addr::new(a, b, c, group), PORT));
@@ -163,7 +164,7 @@ impl TestGateway {
         self.head(topic).seal(buffer, len).expect("the payload fits into a datagram").to_vec()
     }
 
-    /// Returns the header of the next sample of the topic with this number, and increases the sequence number.
+    /// Returns the header of the next sample of the topic with this number, and increases the topic's sequence number.
     fn head(&mut self, topic: u8) -> Head {
         let next = &mut self.next[usize::from(topic)];
         let head = Head {

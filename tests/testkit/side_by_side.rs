@@ -8,7 +8,7 @@ use std::thread;
 ///
 /// # Panics
 ///
-/// Continues the panic of the first item whose call panicked.
+/// Panics with the panic of the first item whose call panicked.
 pub(crate) fn run_concurrently<T: Send, R: Send>(
     items: impl IntoIterator<Item = T>,
     each: impl Fn(T) -> R + Sync,

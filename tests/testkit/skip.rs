@@ -1,7 +1,7 @@
-//! Requirements of tests that a machine may not meet. A test whose requirement is missing is skipped and prints the
-//! reason. It fails instead if the variable `SCANHUB_REQUIRE` lists the requirement. `.ci/run` sets this variable to
-//! names that are separated by commas.
-#![allow(dead_code)] // Each test binary uses only a part of it.
+//! Requirements of tests that a machine may not meet. A test whose requirement is missing prints the reason and is
+//! skipped. The test fails instead if the variable `SCANHUB_REQUIRE` lists the requirement. `.ci/run` sets this
+//! variable to a list of names that are separated by commas.
+#![allow(dead_code)] // Each test binary uses only a part of this module.
 
 use std::fmt::Display;
 use std::io::Write;
@@ -14,13 +14,13 @@ const NEEDS: [&str; 27] = [
     "cmake",
     "pkg-config",
     "valgrind",
-    // Version 3.9 or later.
+    // Python of version 3.9 or later.
     "python",
-    // Modules that programs on the pages import, and readers of recordings from other projects.
+    // Modules that the Python programs in the docs import, and readers of recordings from other projects.
     "python-packages",
-    // An example draws a picture with it.
+    // A Python module with which an example draws a picture.
     "matplotlib",
-    // An event loop that replaces the one of asyncio.
+    // A Python module with an event loop that replaces the one of asyncio.
     "uvloop",
     // The vendor's driver for RPLIDARs, which is not built for every version of Python.
     "rplidar-driver",
@@ -36,16 +36,16 @@ const NEEDS: [&str; 27] = [
     "netns",
     // A pair of interfaces in a network namespace.
     "veth",
-    // A queue in a network namespace that `tc` limits.
+    // A queue whose length `tc` limits, in a network namespace.
     "tc",
-    // A version of IGMP that can be selected in a network namespace.
+    // A network namespace in which the version of IGMP can be selected.
     "igmp",
     "ipv6",
     // Permission to mount file systems in a new namespace.
     "mounts",
     // The user root, who can start programs as other users.
     "root",
-    // A directory of the program in which other users can start it.
+    // A directory that other users may enter, so that they can start the program in it.
     "open-directory",
     // An x86-64 machine on which a process may trace its children.
     "ptrace",
@@ -53,8 +53,8 @@ const NEEDS: [&str; 27] = [
     "recordings",
 ];
 
-/// Prints that the test, or the rest of it, is skipped because `need` is missing, and the reason `why`. The caller then
-/// returns from the test.
+/// Prints that the test, or the rest of the test, is skipped because `need` is missing. `why` is the text of the
+/// reason. The caller then returns from the test.
 ///
 /// # Panics
 ///
@@ -62,7 +62,7 @@ const NEEDS: [&str; 27] = [
 pub(crate) fn skip(need: &str, why: impl Display) {
     let required = std::env::var("SCANHUB_REQUIRE").unwrap_or_default();
     match verdict(&required, need, &why.to_string()) {
-        // libtest captures `eprintln!`, but not this.
+        // libtest captures the output of `eprintln!`, but not that of `writeln!` to stderr.
         Ok(line) => drop(writeln!(std::io::stderr(), "{line}")),
         Err(line) => panic!("{line}"),
     }

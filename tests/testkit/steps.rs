@@ -1,10 +1,11 @@
 //! Tracer that single-steps a thread of another process by ptrace, and counts the instructions and system calls of each
 //! telegram. `benches/path` and `tests/it/path_cost.rs` use it.
 //!
-//! The cost of a telegram starts with the sleep after the previous telegram was published. It ends before the first
-//! sleep after a doorbell has rung for this telegram. Single steps take so long that the thread may fall behind.
-//! [`Stepper::run_past_telegram`] then runs it until telegrams arrive in time again.
-#![allow(dead_code)] // The test uses only a part of it.
+//! The cost of a telegram covers all steps between two sleeps. The first sleep is the one after the previous telegram
+//! was published. The second one is the first sleep after a doorbell has rung for this telegram. Single steps take so
+//! long that the thread may fall behind the line. [`Stepper::run_past_telegram`] then runs the thread until telegrams
+//! arrive in time again.
+#![allow(dead_code)] // The test uses only a part of this module.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
@@ -17,21 +18,22 @@ use nix::sys::signal::Signal;
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::Pid;
 
-/// Thread under ptrace. Only the thread that attached to it can step it. It runs freely again after
-/// [`Stepper::detach`].
+/// Thread under ptrace. Only the thread that called [`Stepper::attach`] can step the traced thread. The traced thread
+/// runs freely again after [`Stepper::detach`].
 pub(crate) struct Stepper {
     thread: Pid,
-    /// Kind of the instruction at each address that was executed.
+    /// Kind of each instruction that was executed, by its address.
     kinds: HashMap<u64, InstructionKind>,
     /// Functions that were called since the first step and have not returned, outermost first.
     calls: Vec<Call>,
     /// Number of the system call that the thread has entered, after [`Stepper::run_past_telegram`].
     entered: Option<u64>,
-    /// Number of bytes that were read for the next telegram; negative if bytes of an earlier one are missing.
+    /// Number of bytes that were read for the next telegram. It is negative if an earlier telegram was counted before
+    /// all of its bytes were read.
     read: i64,
     /// Whether a doorbell has rung for the next telegram.
     has_rung: bool,
-    /// Number of the last system call.
+    /// Number (not count) of the system call that the thread made last.
     last_call: u64,
 }
 
@@ -45,18 +47,20 @@ pub(crate) struct Call {
 }
 
 /// Cost of a telegram, without repeated waits. At 9,600 baud, a telegram takes 0.7 s to arrive, and the hub interrupts
-/// its wait every 50 ms to check for requests. At the usual 500,000 baud, the hub waits once.
+/// its wait every 50 ms to check for requests. These extra waits do not count. At the usual 500,000 baud, the hub waits
+/// once per telegram.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct TelegramCost {
-    /// Number of telegrams that the cost covers: more than 1 if the next telegram was complete before the thread read.
+    /// Number of telegrams that the cost covers. It is more than 1 if the next telegram was complete before the thread
+    /// read the first one.
     pub(crate) telegrams: u64,
     pub(crate) instructions: u64,
     /// Number of system calls, by the number of the call.
     pub(crate) system_calls: BTreeMap<u64, u64>,
-    /// Ranges of step indexes that are repeated waits: from one sleep to the next without another system call in
-    /// between.
+    /// Ranges of step indexes that are repeated waits. Each range goes from one sleep to the next one, without another
+    /// system call in between.
     pub(crate) repeats: Vec<Range<u64>>,
-    /// Time that the steps after the last read took. The thread falls behind by this time.
+    /// Time from the last read of the telegram to the end of its steps. The thread falls behind the line by this time.
     pub(crate) lag: Duration,
 }
 
@@ -69,10 +73,11 @@ enum InstructionKind {
 
 /// Length in bytes of a telegram with 361 beams.
 const TELEGRAM_LEN: i64 = 732;
-/// Result of a system call that has not returned, `-ENOSYS`.
+/// Result register of a system call that has not returned: `-ENOSYS`.
 const NOT_RETURNED: u64 = -38_i64 as u64;
 
-/// Timeout for a telegram. It only ends a test that hangs: on a busy machine, the steps of a telegram take minutes.
+/// Timeout for a telegram. It is long, because on a busy machine the steps of a telegram take minutes. It only ends a
+/// test that hangs.
 const TELEGRAM_TIMEOUT: Duration = Duration::from_secs(900);
 
 /// Number of the system call `read` on x86-64.
@@ -89,7 +94,7 @@ impl Stepper {
     ///
     /// # Errors
     ///
-    /// Returns the reason if this process may not trace it.
+    /// Returns the reason if this process may not trace the thread.
     pub(crate) fn attach(thread: i32) -> Result<Stepper, String> {
         let thread = Pid::from_raw(thread);
         let refused = |error: Errno| format!("ptrace is not allowed: {error}");
@@ -108,8 +113,8 @@ impl Stepper {
         Ok(stepper)
     }
 
-    /// Runs the thread until it has published a telegram for which it had to wait, and sleeps again. `interval` is the
-    /// time between two telegrams.
+    /// Runs the thread until it has waited for a telegram, has published that telegram, and sleeps again. `interval` is
+    /// the time between two telegrams.
     pub(crate) fn run_past_telegram(&mut self, interval: Duration) -> Result<(), String> {
         loop {
             let started = Instant::now();
@@ -121,8 +126,8 @@ impl Stepper {
         }
     }
 
-    /// Runs the thread until the end of a telegram, and counts its system calls. Unlike single steps, this hardly
-    /// delays the thread, so it makes the same calls as without tracing.
+    /// Runs the thread until the end of a telegram, and counts its system calls. Unlike single steps, counting hardly
+    /// delays the thread, so the thread makes the same calls as without tracing.
     pub(crate) fn run_telegram(&mut self) -> Result<TelegramCost, String> {
         self.calls.clear();
         let (started, mut signal) = (Instant::now(), None);
@@ -152,8 +157,9 @@ impl Stepper {
         }
     }
 
-    /// Single-steps through one telegram. Calls `on_step` before each instruction with its address, the functions in
-    /// which it runs, outermost first, and the number of the system call that it makes, if any.
+    /// Runs the thread through one telegram in single steps. Calls `on_step` before each instruction with three
+    /// arguments: the address of the instruction, the functions in which it runs (outermost first), and the number of
+    /// the system call that it makes, if any.
     pub(crate) fn step_telegram(
         &mut self,
         mut on_step: impl FnMut(u64, &[Call], Option<u64>),
@@ -161,7 +167,7 @@ impl Stepper {
         let mut cost = TelegramCost::default();
         let started = Instant::now();
         let mut last_read = started;
-        // Index of the next step, and of the one after the last sleep.
+        // Index of the next step, and index of the first step after the last sleep.
         let (mut index, mut slept) = (0, 0);
         if let Some(call) = self.entered.take() {
             *cost.system_calls.entry(call).or_default() += 1;
@@ -220,12 +226,13 @@ impl Stepper {
         let _ = ptrace::detach(self.thread, None);
     }
 
-    /// Handles the start of a system call. Returns the number of telegrams that end before it.
+    /// Handles the start of a system call. Returns the number of telegrams whose cost ends before this call, or 0 if no
+    /// telegram ends.
     fn enter_call(&mut self, call: u64, operation: u64) -> u64 {
         if call == FUTEX_CALL && WAKE_OPERATIONS.contains(&(operation & 0x7f)) {
             self.has_rung = true;
         }
-        // The thread may have read a part of the next telegram.
+        // The thread may already have read a part of the next telegram, so the quotient is rounded.
         let telegrams = (self.read + TELEGRAM_LEN / 2) / TELEGRAM_LEN;
         if !SLEEP_CALLS.contains(&call) || !self.has_rung || telegrams < 1 {
             return 0;
@@ -238,12 +245,12 @@ impl Stepper {
     /// Handles the end of a system call.
     fn leave_call(&mut self, call: u64, result: u64) {
         if call == READ_CALL {
-            // A negative result is an error.
+            // A negative result is an error code, not a number of bytes.
             self.read += (result as i64).max(0);
         }
     }
 
-    /// Executes one instruction. Delivers signals that arrive before it.
+    /// Executes one instruction. Delivers signals that arrive before the instruction.
     fn step(&mut self) -> Result<(), String> {
         let mut signal = None;
         loop {
@@ -274,7 +281,7 @@ impl Stepper {
         let word = ptrace::read(self.thread, address as ptrace::AddressType).map_err(trace_error)?;
         let kind = match word.to_le_bytes() {
             [0x0f, 0x05, ..] => InstructionKind::SystemCall,
-            // call rel32, and call r/m64 with and without a prefix.
+            // `call rel32`, and `call r/m64` with and without a prefix.
             [0xe8, ..] => InstructionKind::Call,
             [0xff, form, ..] | [0x40..=0x4f, 0xff, form, ..] if form >> 3 & 7 == 2 => InstructionKind::Call,
             _ => InstructionKind::Other,

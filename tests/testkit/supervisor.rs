@@ -21,7 +21,8 @@ pub(crate) struct Supervisor {
     stored_descriptor: Option<(String, OwnedFd)>,
     /// Lines of all notifications from all hubs.
     pub(crate) messages: Vec<String>,
-    /// Lines of the last hub that the test has not waited for yet. Threads of the hub notify in no particular order.
+    /// Lines from the last hub for which the test has not waited yet. They have no fixed order, because each thread of
+    /// the hub sends its own notifications.
     unread_messages: Vec<String>,
 }
 
@@ -38,15 +39,16 @@ impl Supervisor {
         }
     }
 
-    /// Returns the command that starts `hub` as a service, and the stdin that passes the stored descriptor to it.
-    /// `watchdog` is the watchdog interval.
+    /// Returns a command that starts `hub` as a service, and the stdin for this command. The stdin is the stored
+    /// descriptor, if any. `watchdog` is the watchdog interval.
     pub(crate) fn service(&mut self, hub: &Command, watchdog: Option<Duration>) -> (Command, Stdio) {
-        // Messages that the previous hub sent at its end must not count as messages of the new hub.
+        // Discard messages that the previous hub sent at its end, so that they do not count as messages of the new hub.
         self.socket.set_nonblocking(true).expect("a socket");
         while self.receive().is_ok() {}
         self.socket.set_nonblocking(false).expect("a socket");
         self.unread_messages.clear();
-        // Only a shell can set its own process ID before it starts the program in the same process.
+        // The environment of a service contains its own process ID. Only a shell can set this variable before it
+        // replaces itself with the program.
         let mut command = Command::new("/bin/sh");
         command.args([
             "-c",
@@ -66,7 +68,7 @@ impl Supervisor {
         (command, line.into())
     }
 
-    /// Waits until the hub has sent the line `message`. Each call uses up one line.
+    /// Waits until the hub has sent the line `message`, and removes this line from the unread ones.
     pub(crate) fn wait_for_message(&mut self, message: &str) {
         self.socket.set_read_timeout(Some(WAIT_TIMEOUT)).expect("a socket");
         while !self.unread_messages.iter().any(|line| line == message) {

@@ -11,7 +11,7 @@ use super::Outcome;
 /// Command of a measured-value telegram.
 pub(crate) const MEASURED_VALUES: u64 = 0xB0;
 
-/// Telegram as the simulator reports it.
+/// Telegram that the simulator has sent, as its log describes it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct SimulatedTelegram {
     pub(crate) is_reply: bool,
@@ -33,7 +33,7 @@ impl SimulatedTelegram {
         }
     }
 
-    /// Returns whether it is a scan that the simulator sent without a fault.
+    /// Returns whether the telegram is a scan that the simulator sent without a fault.
     pub(crate) fn is_intact_scan(&self) -> bool {
         !self.is_reply && self.fault.is_none()
     }
@@ -45,7 +45,7 @@ pub(crate) fn hash(bytes: &[u8]) -> String {
 }
 
 /// Returns the bytes of the telegram in a line of class `telegram`. Asserts that its checksum is right and that the
-/// line has the right command and address.
+/// command and the address in the line match the bytes.
 pub(crate) fn bytes_of(line: &Value) -> Vec<u8> {
     let text = line["data"].as_str().unwrap_or_else(|| panic!("no data in {line}"));
     let pair =
@@ -64,12 +64,12 @@ pub(crate) fn scan(seed: u16) -> Vec<u8> {
     lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
 }
 
-/// Returns the number with the key `key` in a line.
+/// Returns the number that a JSON line has under the key `key`.
 pub(crate) fn number(line: &Value, key: &str) -> u64 {
     line[key].as_u64().unwrap_or_else(|| panic!("no number {key} in {line}"))
 }
 
-/// Returns the numbers with the key `key` in `lines`, and asserts that they have no gap.
+/// Returns the numbers that `lines` have under the key `key`. Asserts that each number is the previous one plus 1.
 pub(crate) fn contiguous_numbers(lines: &[Value], key: &str) -> Vec<u64> {
     let numbers: Vec<u64> = lines.iter().map(|line| number(line, key)).collect();
     for pair in numbers.windows(2) {
@@ -78,8 +78,8 @@ pub(crate) fn contiguous_numbers(lines: &[Value], key: &str) -> Vec<u64> {
     numbers
 }
 
-/// Returns the `topic_seq` of the samples of `topic` that a client printed. Asserts that they are in order and that the
-/// client reported every gap as missed samples, because a client on a busy machine may miss some.
+/// Returns the `topic_seq` of the samples of `topic` that a client printed. Asserts that the numbers are in order and
+/// that the client reported every gap as missed samples. A client on a busy machine may miss samples.
 pub(crate) fn checked_topic_seqs(outcome: &Outcome, topic: &str) -> Vec<u64> {
     let lines = outcome.of_class(topic);
     // The line with which a client reports a silence has no `topic_seq`.

@@ -48,7 +48,7 @@ pub(crate) struct TerminalSession {
     terminal: OwnedFd,
     initial_modes: Termios,
     output: Arc<Mutex<Vec<u8>>>,
-    /// Reads the output of the program until `closed` is set.
+    /// Thread that reads the output of the program until `closed` is set.
     reader: Option<JoinHandle<()>>,
     closed: Arc<AtomicBool>,
     size: (u16, u16),
@@ -104,7 +104,7 @@ impl TerminalSession {
                 if poll(&mut fds, Some(&POLL_INTERVAL)).unwrap() == 0 {
                     continue;
                 }
-                // Reading fails once no process has the terminal open.
+                // Reading fails as soon as no process has the terminal open.
                 let Ok(len @ 1..) = from.read(&mut piece) else { return };
                 to.lock().unwrap().extend_from_slice(&piece[..len]);
             }
@@ -170,7 +170,7 @@ impl TerminalSession {
         self.process.signal(signal).unwrap();
     }
 
-    /// Closes the terminal and waits until the program exits. Returns its exit code.
+    /// Closes the test's side of the terminal and waits until the program exits. Returns its exit code.
     pub(crate) fn hang_up(mut self) -> Option<i32> {
         self.closed.store(true, Ordering::Relaxed);
         self.reader.take().map(JoinHandle::join).transpose().unwrap();
@@ -215,7 +215,7 @@ impl TerminalSession {
                 self.initial_modes.output_modes,
                 self.initial_modes.local_modes,
             );
-        // A mark after the output shows that all of it has been read.
+        // This mark is written after the output of the program. Once the mark has been read, all output has been read.
         let mark = "\u{1}end";
         File::from(self.terminal.try_clone().unwrap()).write_all(mark.as_bytes()).unwrap();
         while !self.text().ends_with(mark) {

@@ -1,5 +1,6 @@
-//! Window of tmux in which a test runs a program, to check its output with an independent implementation of a terminal.
-//! The tmux server has its socket in the directory of the test, and ends with the test.
+//! Window of tmux in which a test runs a program. Tmux is an independent implementation of a terminal, so its window
+//! shows whether the program's output is right. The tmux server has its socket in the directory of the test, and ends
+//! with the test.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -12,7 +13,7 @@ use super::{TestEnv, WAIT_TIMEOUT, skip};
 /// Session with one window.
 pub(crate) struct Tmux {
     socket: PathBuf,
-    /// Command that created the session. The server descends from it.
+    /// Command that created the session. The tmux server is a descendant of this command.
     _session: Child,
 }
 
@@ -33,7 +34,7 @@ impl Tmux {
         Some(Tmux { socket, _session: session })
     }
 
-    /// Types `keys`, which are names of keys in tmux.
+    /// Sends `keys`, which are the names that tmux has for keys, to the program.
     pub(crate) fn press(&self, keys: &[&str]) {
         self.run_tmux(&[&["send-keys"], keys].concat());
     }

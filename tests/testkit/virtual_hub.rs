@@ -1,7 +1,7 @@
 //! Hub in virtual time, which can drive many sensors faster than in real time.
 //!
-//! The test passes bytes with the time at which they arrived. The same code as for a line publishes the topics in
-//! shared memory. Bytes that a session sends to its scanner are stored until the test takes them.
+//! The test passes bytes with the time at which they arrived. The topics in shared memory are published by the same
+//! code as for a serial line. Bytes that a session sends to its scanner are stored until the test takes them.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -18,16 +18,16 @@ use scanhub_schema::{DoorbellWord, Failure, Nanos, WakeEvent};
 use scanhub_shm::{Domain, HubLock, resource_limits};
 use scanhub_shm::{Node, Payload, SharedMemory, WakeSender};
 
-/// Link in virtual time. Its port must be a recording in the configuration, so that the session expects a stream from
-/// the start and reads scans in the configured mode.
+/// Link in virtual time. In the configuration, its port must be a recording (`file:`). The session then expects scans
+/// from the start, and decodes them in the configured mode.
 pub(crate) struct VirtualLink<'a> {
     platform: &'a VirtualPlatform<'a>,
     link: LiveLink<'a, VirtualPlatform<'a>>,
     due_ns: Nanos,
 }
 
-/// Creates the links of `config` in `domain`, and passes them to `drive`. Their ports are not opened. The links end
-/// when `drive` returns.
+/// Creates the links of `config` in `domain`, and passes them to `drive`. Does not open the ports of the links. The
+/// links end when `drive` returns.
 ///
 /// # Errors
 ///
@@ -54,8 +54,8 @@ pub(crate) fn virtual_hub<T>(
 }
 
 impl VirtualLink<'_> {
-    /// Passes `bytes` that arrived in one read at `now`. The link first publishes everything that became due before,
-    /// and then the telegrams that are complete with these bytes. Returns the number of these telegrams.
+    /// Passes `bytes` that arrived in one read at `now`. The link first publishes everything that became due before
+    /// `now`. It then publishes the telegrams that these bytes complete, and their number is returned.
     pub(crate) fn read(&mut self, now: Nanos, bytes: &[u8]) -> usize {
         self.platform.telegrams.set(0);
         while self.due_ns < now {
@@ -93,15 +93,15 @@ struct VirtualPlatform<'a> {
     node: &'a Node,
     waker: WakeSender,
     now: Cell<Nanos>,
-    /// Offset from the clock to nanoseconds since 1970.
+    /// Nanoseconds that are added to the clock to get the wall-clock time since 1970.
     wall_ahead_ns: u64,
     line: Bytes,
-    /// Number of telegrams published since it was set to 0.
+    /// Number of telegrams that the link has published since the last call of [`VirtualLink::read`] began.
     telegrams: Cell<usize>,
 }
 
-/// Port in memory: bytes that have arrived and were not read yet, baud rates that the port rejects, and bytes that the
-/// session has written.
+/// Port in memory. The fields are the bytes that have arrived but were not read yet, the baud rates that the port
+/// rejects, and the bytes that the session has written.
 #[derive(Clone, Default)]
 struct Bytes(Rc<RefCell<VecDeque<u8>>>, Rc<RefCell<Vec<u32>>>, Rc<RefCell<Vec<u8>>>);
 

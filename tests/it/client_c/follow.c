@@ -1,6 +1,6 @@
 /*
- * Subscribes to a topic and prints a line of JSON for each sample: follow SENSOR TOPIC doorbell|event|spin|poll COUNT. With
- * COUNT 0, it never stops. /proc shows whether the address of a sample lies in shared memory.
+ * Subscribes to a topic and prints a line of JSON for each sample: follow SENSOR TOPIC doorbell|event|spin|poll COUNT. If
+ * COUNT is 0, it runs until it is ended. It uses /proc to find out whether the address of a sample is in shared memory.
  */
 #include <scanhub/attach.h>
 

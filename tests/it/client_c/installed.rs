@@ -1,5 +1,5 @@
-//! The C library, installed as users install it, and the ways in which they build programs with it.
-#![allow(dead_code)] // Each test binary uses only a part of it.
+//! The C library, installed as users install it, and each way in which users build programs with the library.
+#![allow(dead_code)] // Each test binary uses only a part of this module.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ pub(crate) struct InstalledLibrary {
     pub(crate) prefix: PathBuf,
     /// Directory from which the library was installed.
     pub(crate) library: PathBuf,
-    /// Output of the script that installed it.
+    /// Output of the script that installed the library.
     pub(crate) messages: String,
 }
 
@@ -32,7 +32,7 @@ impl InstalledLibrary {
             let _ = std::fs::remove_dir_all(&here);
             let (prefix, library) = (here.join("prefix"), here.join("library"));
             std::fs::create_dir_all(&library).expect("a directory");
-            // Leave out the static library, which has 100 MB.
+            // Leave out the static library, which takes 100 MB.
             let shared = "libscanhub.so";
             std::os::unix::fs::symlink(build_directory().join(shared), library.join(shared))
                 .expect("the link can be created");
@@ -95,13 +95,13 @@ impl InstalledLibrary {
         Some(program.unwrap_or_else(|message| panic!("{message}")))
     }
 
-    /// Builds the project `source` with CMake, once for each way in which CMake can find the package. Returns the build
-    /// directories, or an empty list if a tool is missing.
+    /// Builds the project `source` with CMake, once for each way in which CMake can find the package of the C library.
+    /// Returns the build directories, or an empty list if a tool is missing.
     pub(crate) fn cmake(&self, env: &TestEnv, source: &Path) -> Vec<PathBuf> {
         if !["cmake", "c++"].into_iter().all(is_installed) {
             return Vec::new();
         }
-        // After this move, a package that contains the path of its prefix would not work.
+        // After the installed files have been moved, a package that contains the path of its old prefix would not work.
         let moved = env.path("moved");
         let mut copy = Command::new("cp");
         copy.arg("-a").arg(&self.prefix).arg(&moved);
@@ -165,7 +165,7 @@ impl InstalledLibrary {
     }
 }
 
-/// Returns whether a tool is installed. Skips the test if not.
+/// Returns whether the tool `name` is installed. Skips the test if the tool is missing.
 pub(crate) fn is_installed(name: &str) -> bool {
     let found = output(Command::new(name).arg("--version")).is_ok();
     if !found {
@@ -174,7 +174,7 @@ pub(crate) fn is_installed(name: &str) -> bool {
     found
 }
 
-/// Returns the path of a C program of these tests.
+/// Returns the path of the C program `name` of these tests.
 pub(crate) fn source(name: &str) -> PathBuf {
     repository().join("tests/it/client_c").join(name)
 }

@@ -1,4 +1,5 @@
-//! Layouts of all payloads, and C programs that print the layout and the computed values of the C header.
+//! Layouts of all payloads in C, and generated C programs. The programs print the layouts of the C header, or the
+//! values that it computes from a scan.
 
 use scanhub_schema::{ArrayFlags, Counter, Family, Header, Scan, ScanHead};
 
@@ -39,7 +40,7 @@ fn layouts() -> Vec<Layout> {
     layouts
 }
 
-/// Returns the lines that [`program`] must print.
+/// Returns the lines that the program of [`program`] must print.
 pub(crate) fn expected() -> Vec<String> {
     let mut lines = Vec::new();
     for Layout { name, size, fields } in layouts() {
@@ -113,8 +114,9 @@ pub(crate) fn scans() -> Vec<Box<Scan>> {
     scans
 }
 
-/// Returns a C program that prints the values that the header computes for each beam of `scan` and for three beams
-/// more. The program also checks that the header reads nothing outside of an invalid or a truncated sample.
+/// Returns a C program that prints the values that the header computes for each beam of `scan` and for three beam
+/// indexes after the last one. The program also checks that the header reads nothing outside of an invalid or a
+/// truncated sample.
 pub(crate) fn computed_values_c(header: &Header, scan: &Scan) -> String {
     let bytes = scan.bytes();
     let list: Vec<String> = bytes.iter().map(u8::to_string).collect();

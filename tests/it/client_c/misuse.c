@@ -1,4 +1,4 @@
-/* Calls the library in every wrong way and checks its errors: misuse SENSOR. Needs a running hub. */
+/* Misuses each function of the library and checks the errors that it returns: misuse SENSOR. It needs a running hub. */
 #include <scanhub/attach.h>
 
 #include <poll.h>
@@ -19,7 +19,7 @@
             exit(EXIT_FAILURE);                                                                      \
         }                                                                                            \
     } while (0)
-/* Timeout of a wait, in milliseconds. It only ends a program that hangs. */
+/* Timeout of a wait, in milliseconds. It is so long that it only ends a program that hangs. */
 #define PATIENCE_MS 60000
 #define SAYS(text) MUST(strstr(scanhub_error(), text) != NULL)
 
@@ -135,7 +135,7 @@ static void *publishes_elsewhere(void *publication)
 {
     refused_as_a_publication(publication);
     MUST(scanhub_unpublish(publication) == SCANHUB_REFUSED_ARGUMENT);
-    /* The publication ends with its thread. */
+    /* The publication ends with the thread that created it. */
     publish("third");
     return NULL;
 }
@@ -188,7 +188,7 @@ static void publications(const char *sensor)
     MUST(scanhub_unpublish(mount) == 0 && scanhub_unpublish(NULL) == 0);
     refused_as_a_publication(mount);
     MUST(scanhub_unpublish(mount) == SCANHUB_REFUSED_ARGUMENT);
-    /* The name is free again. `second` remains published until the process exits. */
+    /* The name `mount` is free again. The publication `second` remains until the process exits. */
     MUST(scanhub_unpublish(publish("mount")) == 0);
 }
 
@@ -255,7 +255,7 @@ static void children(const char *sensor)
     MUST(scanhub_close(handle) == 0);
 }
 
-/* poll still reports samples that scanhub_wait has reported before. */
+/* After scanhub_wait has reported a sample, poll still reports it until it is taken. */
 static void polls(const char *sensor)
 {
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
@@ -294,7 +294,7 @@ static void samples(const char *sensor)
     MUST(scanhub_release(&copy) == SCANHUB_REFUSED_ARGUMENT);
 }
 
-/* The memory to which a robot's verdict points stays valid until the verdict is released. */
+/* The memory to which the verdict of a robot points stays valid until the program releases the verdict. */
 static void robots(const char *sensor)
 {
     struct scanhub_attachment *handle;
@@ -351,7 +351,7 @@ int main(int argc, char **argv)
     robots(sensor);
     publications(sensor);
     signals();
-    /* The attachment and its sample are released when the process exits. */
+    /* Leave an attachment open with a sample. Both are released when the process exits. */
     struct scanhub_attachment *left = open_scans(sensor, SCANHUB_WAIT_EVENT);
     struct scanhub_sample sample;
     MUST(scanhub_wait(left, PATIENCE_MS) == 1 && scanhub_take(left, &sample) == 1);

@@ -1,5 +1,5 @@
-/* Publishes the angles of a mount: publish NAME. Each line of stdin is a sample with angle, rate and stamp (0 for now).
- * Prints a line when it starts to publish and after each sample. Exits at the end of stdin. */
+/* Publishes the angles of a mount: publish NAME. Each line of stdin has the angle, the rate and the stamp (0 for now) of
+ * a sample. Prints a line when it starts to publish and after each sample. Exits at the end of stdin. */
 #include <scanhub/attach.h>
 
 #include <inttypes.h>

@@ -1,4 +1,4 @@
-/* Subscribes to the verdict of a robot and prints a line of JSON for each one:
+/* Subscribes to the combined verdict of a robot and prints a line of JSON for each verdict:
  * robot doorbell|event|spin|poll [SENSORS [early]]. */
 #include <scanhub/attach.h>
 

@@ -1,5 +1,6 @@
 /* Subscribes to scans and prints a line of JSON ten times a second, with the reason for the silence and the existing names:
- * silence SENSOR doorbell|event. With `event`, it waits by poll for half a second, and the line has the number of wake-ups. */
+ * silence SENSOR doorbell|event. With `event`, it prints a line only after a timeout of poll, which is half a second. The line
+ * has the number of wake-ups without a sample. */
 #include <scanhub/attach.h>
 
 #include <inttypes.h>

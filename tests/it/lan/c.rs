@@ -1,4 +1,5 @@
-//! C header for datagrams, compared with the golden datagrams and with `schema`. Skipped if there is no C compiler.
+//! C header for datagrams, compared with the golden datagrams and with `schema`. The tests are skipped if no C compiler
+//! is installed.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -7,8 +8,8 @@ use crate::testkit::{output, skip};
 
 use super::readers::{self, Reader};
 
-/// Compiles the reader with strict warnings, and with checks of its memory if the compiler has them. Skips the test and
-/// returns `None` if there is no C compiler.
+/// Compiles the reader with strict warnings, and with memory checks if the compiler has them. If no C compiler is
+/// installed, skips the test and returns `None`.
 fn reader() -> Option<PathBuf> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("lan-reader");

@@ -1,4 +1,4 @@
-//! Captures of UDP datagrams, and their fields as tshark shows them with the project's dissector.
+//! Captures of UDP datagrams, and the fields that tshark shows for them with the project's dissector.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -12,7 +12,7 @@ pub(crate) struct Capture {
     packets: Vec<u8>,
 }
 
-/// Returns whether tshark is installed. Skips the test if not.
+/// Returns whether tshark is installed. Skips the test if it is missing.
 pub(crate) fn has_tshark() -> bool {
     let found = succeeds(Command::new("tshark").arg("--version"));
     if !found {
@@ -28,7 +28,7 @@ impl Capture {
         let ip_len = 20 + udp_len;
         let len = u32::from(ip_len).to_le_bytes();
         self.packets.extend([[0; 4], [0; 4], len, len].concat());
-        // Version and header length, length, TTL 1, UDP, no checksum.
+        // IPv4 header: version and header length, total length, TTL 1, protocol UDP, no checksum.
         self.packets.extend([0x45, 0]);
         self.packets.extend(ip_len.to_be_bytes());
         self.packets.extend([0, 0, 0, 0, 1, 17, 0, 0]);
@@ -45,7 +45,7 @@ impl Capture {
         self.fields_with(name, fields, &[])
     }
 
-    /// Returns the same as [`fields`](Self::fields), with these settings of the dissector.
+    /// Does the same as [`fields`](Self::fields), with these settings of the dissector.
     pub(crate) fn fields_with(
         &self,
         name: &str,
@@ -59,8 +59,8 @@ impl Capture {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/wireshark/scanhub.lua");
         let mut tshark = Command::new("tshark");
         tshark.arg("-X").arg(format!("lua_script:{}", script.display())).arg("-r").arg(&path);
-        // Dissect twice, as Wireshark does: the second pass must show the same. Use a home directory without other
-        // settings and without an installed copy of the dissector.
+        // Dissect each packet twice, as Wireshark does, because the second pass must show the same values as the first.
+        // Use a home directory without other settings and without an installed copy of the dissector.
         tshark.args(["-2", "-T", "fields"]).env("HOME", env!("CARGO_TARGET_TMPDIR"));
         tshark.env("XDG_CONFIG_HOME", env!("CARGO_TARGET_TMPDIR"));
         settings.iter().for_each(|setting| {
@@ -85,5 +85,5 @@ impl Capture {
     }
 }
 
-/// Field with the error of a Lua script.
+/// Field in which tshark reports the error of a Lua script.
 const LUA_ERROR: &str = "_ws.lua.error";

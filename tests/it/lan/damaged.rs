@@ -1,4 +1,4 @@
-//! Datagrams with a damaged content and a right checksum, and the result of `schema` for each.
+//! Datagrams with damaged content but a right checksum, and the result with which `schema` reads each of them.
 
 use fastrand::Rng;
 use scanhub_schema::Topic;
@@ -25,7 +25,7 @@ pub(crate) fn datagrams(count: u32) -> Vec<(Vec<u8>, Value)> {
     datagrams
 }
 
-/// Returns the result of `schema` for a datagram, in the format of the list of golden datagrams.
+/// Returns the result with which `schema` reads a datagram, in the format of the list of golden datagrams.
 pub(crate) fn expected(bytes: &[u8]) -> Value {
     let sound = Datagram::read(bytes).and_then(|datagram| datagram.check_payload().map(|_| datagram));
     match sound {
@@ -34,14 +34,14 @@ pub(crate) fn expected(bytes: &[u8]) -> Value {
     }
 }
 
-/// Changes a few bytes of header and payload, or the length of the payload. Does not change texts and other values that
-/// are not numbers, because languages show them differently.
+/// Changes a few bytes of header and payload, or the length of the payload. Leaves texts and other values that are not
+/// numbers as they are, because languages print these differently.
 fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
     let mut payload = datagram.payload.to_vec();
     let is_spared = |at: usize| match Topic::of_number(datagram.head.topic) {
         Some(Topic::Status) => (24..336).contains(&at) || at >= 560,
         None => (40..64).contains(&at),
-        // The positions of texts depend on the counts, so do not change the counts, either.
+        // Do not change the number of tracks, either, because it determines where the texts are.
         Some(Topic::Tracks) => {
             at < 2 || !(8..8 + 80 * usize::from(datagram.payload[0])).contains(&at) || at % 80 >= 56
         }
@@ -49,7 +49,7 @@ fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
         Some(_) => false,
     };
     for _ in 0..random.usize(..4) {
-        // The counts are at the start, so half of the changes are made there.
+        // The start of a payload has most of its counts, so half of the changes are limited to the first 48 bytes.
         let end = if random.bool() { payload.len() } else { payload.len().min(48) };
         let at = random.usize(..end.max(1));
         if at < payload.len() && !is_spared(at) {

@@ -1,20 +1,20 @@
-//! Golden datagrams with a MAC, and the result for each one. The receiver has the key and receives the datagrams in
-//! order.
+//! Golden datagrams with a MAC, and the result with which a receiver handles each of them. The receiver has the key,
+//! and receives the datagrams in the order of the list.
 
 use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
 
-/// Key and datagrams of the list.
+/// Key, and datagrams of the list in `tests/vectors/keyed.json`.
 pub(crate) struct KeyedVectors {
     /// Key of the receiver, in hexadecimal digits.
     pub(crate) key: String,
-    /// Datagrams in the order in which they arrive.
+    /// Datagrams in the order in which the receiver gets them.
     pub(crate) steps: Vec<Step>,
 }
 
-/// One datagram and its result.
+/// One datagram, and the result with which the receiver handles it.
 pub(crate) struct Step {
     /// Purpose of the datagram.
     pub(crate) name: String,
@@ -22,9 +22,9 @@ pub(crate) struct Step {
     pub(crate) at_s: u64,
     /// Bytes of the datagram.
     pub(crate) bytes: Vec<u8>,
-    /// State of its MAC: `right`, `wrong` or `none`.
+    /// State of the MAC: `right`, `wrong` or `none`.
     pub(crate) mac: String,
-    /// Result: `taken`, `duplicate`, `part` (other parts are missing), or the reason why it is refused.
+    /// Result: `taken`, `duplicate`, `part` (other parts are missing), or the reason why the datagram is refused.
     pub(crate) outcome: String,
 }
 

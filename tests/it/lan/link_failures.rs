@@ -1,5 +1,5 @@
-//! Faults of networks and programs, observed at the other end of the cable: the gateway survives them, counts each
-//! datagram that it cannot send, and sends again afterwards.
+//! Faults of networks and programs, observed at the other end of the gateway's cable. The gateway survives each fault,
+//! counts the datagrams that it cannot send, and sends again after the fault has ended.
 
 use crate::testkit::{
     INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, decode_datagram,
@@ -14,7 +14,7 @@ fn is_scan(datagram: &Datagram<'_>) -> bool {
     datagram.head.topic == Topic::Scan.number()
 }
 
-/// Waits until the gateway reports this state of a destination.
+/// Waits until the gateway reports that the destination `to` has the state `state`.
 fn await_link(gateway: &mut Program, to: &str, state: &str) {
     let is_it = |line: &Value| line["class"] == "lan_link" && line["to"] == to && line["state"] == state;
     gateway.await_line(state, is_it);
@@ -29,7 +29,7 @@ fn await_failures(gateway: &mut Program, to: &str, min_increase: u64) {
     gateway.await_line("failures", |line| count(line).is_some_and(|failed| failed >= before + min_increase));
 }
 
-/// Returns how many datagrams to `to` were sent, and how many failed.
+/// Returns the number of datagrams to `to` that were sent, and the number of those that could not be sent.
 fn sent_and_failed(outcome: &Outcome, to: &str) -> (u64, u64) {
     assert_eq!(outcome.exit_code, Some(0), "{outcome}");
     let last = outcome.of_class("lan_to").into_iter().rfind(|line| line["to"] == to);
@@ -37,7 +37,7 @@ fn sent_and_failed(outcome: &Outcome, to: &str) -> (u64, u64) {
     (number(&last, "sent"), number(&last, "send_failed"))
 }
 
-/// Returns how many datagrams a receiver received, and how many it counts as lost.
+/// Returns the number of datagrams that a receiver has received, and the number that it counts as lost.
 fn count_received_and_lost(received: &[Vec<u8>]) -> (u64, u64) {
     let mut table = Box::new(GatewayTable::new(&Topic::ALL));
     received.iter().for_each(|bytes| assert!(table.receive(bytes, 1, 0).is_ok()));
@@ -70,9 +70,9 @@ fn gateway_counts_losses_without_cable_or_address() {
         let (sent, failed) = sent_and_failed(&outcome, "eth0");
         let (received, lost) = count_received_and_lost(&receiver.finish());
         assert_eq!(received + lost, sent + failed, "each number was received, lost or failed");
-        // Either number may be greater. When the link fails, the kernel accepts a few datagrams and drops them. When
-        // the link is back, the gateway counts datagrams as failed until it checks the link again, up to a second
-        // later.
+        // Either `failed` or `lost` may be greater. When the link fails, the kernel accepts a few datagrams and drops
+        // them. When the link is back, the gateway counts datagrams as failed until it checks the link again, up to a
+        // second later.
         assert!(failed >= 300 && lost >= 300, "{lost} lost, {failed} counted");
     });
 }
@@ -90,14 +90,14 @@ fn full_send_queue_counts_failed_datagrams() {
         }
         await_link(&mut gateway, "eth0", "failing");
         await_failures(&mut gateway, "eth0", 100);
-        // Replacing the queue drops the datagrams in it.
+        // Replacing the queue of the interface drops the datagrams in the old queue.
         robot.machine.run_command("tc qdisc change dev eth0 root tbf rate 1gbit burst 100kb limit 1mb");
         receiver.wait_for_datagrams(20, is_scan);
         await_link(&mut gateway, "eth0", "recovered");
         let outcome = gateway.end(TERM);
         let (sent, failed) = sent_and_failed(&outcome, "eth0");
-        // The kernel delivered all datagrams that it accepted, and the gateway counted all others, so no loss is
-        // unreported.
+        // The kernel delivered all datagrams that it accepted, and the gateway counted all others as failed. Every lost
+        // datagram is therefore reported.
         assert_eq!(count_received_and_lost(&receiver.finish()), (sent, failed));
         assert!(failed >= 100, "{failed}");
     });
@@ -141,7 +141,7 @@ fn counters_are_right_after_killed_hubs_and_gateways() {
         relay.connect(&second);
         let env = TestEnv::on(&second);
         let mut listener = env.start(&["listen", "--json", "--topic=scan"]).ready();
-        // Wait for scans of another run of the hub or the gateway.
+        // Waits for scans with another value of `key`, which belong to another run of the hub or the gateway.
         let mut await_new = |description: &str, key: &str, before: &Value| {
             let line =
                 listener.await_line(description, |line| line["class"] == "scan" && line[key] != before[key]);

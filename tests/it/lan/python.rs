@@ -1,5 +1,5 @@
-//! Python module for datagrams, compared with the golden datagrams and with `schema`. Skipped if there is no python3.
-//! The part that needs numpy is skipped separately.
+//! Python module for datagrams, compared with the golden datagrams and with `schema`. The tests are skipped if python3
+//! is not installed. The part that needs numpy is skipped separately.
 
 use std::path::Path;
 use std::process::Command;

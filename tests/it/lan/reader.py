@@ -1,8 +1,8 @@
 """Reads datagrams with clients/python/scanhub_lan.py.
 
-Each line of stdin has the hexadecimal digits of a datagram, after the digits of a key and a colon if there is one. For each
-datagram, prints a line of JSON in the format of the list of golden datagrams. If the key is followed by `@` and the second at
-which the datagram arrives, the line has the outcome instead, which depends on earlier datagrams.
+Each line of stdin has the hexadecimal digits of a datagram. The digits of a key and a colon may precede them. For each
+datagram, prints a line of JSON in the format of the list of golden datagrams. If `@` and the second at which the
+datagram arrives follow the key, the printed line has the outcome instead, which depends on earlier datagrams.
 """
 
 import dataclasses
@@ -37,10 +37,10 @@ def says(datagram):
     if datagram.topic == "announce":
         out["boot"] = f"{payload.boot:016x}"
     if datagram.topic == "telegram":
-        # The list has the number of the family in the head.
+        # The list of golden datagrams has the family as a number in the head, not in the payload.
         assert out.pop("family") == scanhub_lan.FAMILIES[datagram.family]
     if datagram.topic == "scan":
-        # The list has the values that are computed from these.
+        # The list has the values that are computed from these fields instead of the fields.
         for name in ("payload", "first_beam_ns", "turns", "turn_ns", "exact"):
             del out[name]
         out["codes"], out["times_ns"], out["upper"] = payload.codes(), payload.times_ns(), list(payload.upper)

@@ -1,5 +1,5 @@
-//! Readers of datagrams in other languages, compared with the reader in `schema` for golden datagrams and for damaged
-//! ones with a right checksum.
+//! Readers of datagrams in other languages. The tests compare them with the reader in `schema`, for golden datagrams
+//! and for damaged datagrams with a right checksum.
 
 use std::io::{BufRead, BufReader, Write};
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
@@ -12,7 +12,7 @@ use crate::testkit::{Child, spawn};
 
 use super::{damaged, keyed_vectors, vectors};
 
-/// Program that replies to a datagram in hexadecimal digits with a line of JSON.
+/// Program that reads a datagram in hexadecimal digits from stdin and replies with a line of JSON.
 pub(crate) struct Reader {
     child: Child,
     input: ChildStdin,
@@ -26,7 +26,8 @@ impl Reader {
         Reader { child, input, output: BufReader::new(output) }
     }
 
-    /// Returns the program's line for a datagram. `key` has hexadecimal digits.
+    /// Sends a datagram to the program and returns its reply. `key` is the text that precedes the datagram in the
+    /// program's input: the digits of the key, `@` and the second of the arrival.
     pub(crate) fn read(&mut self, key: Option<&str>, datagram: &[u8]) -> Value {
         let digits: String = datagram.iter().map(|byte| format!("{byte:02x}")).collect();
         self.request(&key.map_or(digits.clone(), |key| format!("{key}:{digits}")))
@@ -47,7 +48,8 @@ impl Reader {
 }
 
 /// Asserts that the reader's result for each golden datagram equals the result in the list. If the result in the list
-/// depends on earlier datagrams or on a key, the reader must agree with `schema`, which reads the datagram alone.
+/// depends on earlier datagrams or on a key, the reader's result must instead equal that of `schema` for this datagram
+/// alone.
 pub(crate) fn check_vectors(reader: &mut Reader) {
     for vector in vectors::vectors() {
         let says = vector.description.as_object().expect("an object");
@@ -58,8 +60,8 @@ pub(crate) fn check_vectors(reader: &mut Reader) {
     }
 }
 
-/// Asserts that the reader with the key accepts and refuses the same datagrams as the receiver in Rust, including
-/// repeated ones.
+/// Asserts that the reader, if it has the key, accepts and refuses the same datagrams as the receiver in Rust. The list
+/// contains repeated datagrams, too.
 pub(crate) fn check_keyed_vectors(reader: &mut Reader) {
     let keyed = keyed_vectors::read_vectors();
     for step in keyed.steps {
@@ -83,7 +85,7 @@ fn assert_same(name: &str, bytes: &[u8], mut reported: Value, expected: &Value) 
         let expected: Vec<_> = (0..scan.beams()).map(|i| scan.distance_m(i)).collect();
         assert_eq!(metres, as_read_from_json(&json!(expected)), "{name}: {bytes:02x?}");
     }
-    // This reader reports counters without their names.
+    // If the reader reports the counters as a list without names, add the names.
     if let Some(counters) = reported["payload"]["counters"].as_array() {
         let names = Counter::ALL.iter().map(|counter| counter.name().to_owned());
         let named: Map<String, Value> = names.zip(counters.iter().cloned()).collect();
@@ -94,7 +96,8 @@ fn assert_same(name: &str, bytes: &[u8], mut reported: Value, expected: &Value) 
     }
 }
 
-/// Converts a value to text and back, because parsing may change the last bit of a number with many digits.
+/// Converts a value to text and back, so that it has the same rounding as a value from a reader: parsing may change the
+/// last bit of a number with many digits.
 fn as_read_from_json(value: &Value) -> Value {
     serde_json::from_str(&value.to_string()).expect("JSON")
 }

@@ -5,13 +5,14 @@ use std::path::Path;
 
 use serde_json::Value;
 
-/// Golden datagram.
+/// One datagram of the list, whose bytes and values must not change.
 pub(crate) struct Vector {
     pub(crate) name: String,
     pub(crate) bytes: Vec<u8>,
-    /// `head` and `payload` of an accepted datagram, or `refusal` of a refused one. If the receiver needs a history,
-    /// this also has `with_key`, `after` (names of the datagrams that it received before), `after_hubs` (number of
-    /// other hubs that delivered for a second before), or `from_another` (another sender sent the datagrams before).
+    /// Result for the datagram: `head` and `payload` if it is accepted, or `refusal` if it is refused. Some results
+    /// depend on a key of the receiver, or on earlier datagrams. The description of such a result also has `with_key`,
+    /// `after` (names of the datagrams that the receiver received before), `after_hubs` (number of other hubs that sent
+    /// for a second before), or `from_another` (another sender sent the datagrams before).
     pub(crate) description: Value,
 }
 
@@ -36,9 +37,10 @@ fn unhex(text: &str) -> Vec<u8> {
     digits.chunks(2).map(|pair| (pair[0] << 4 | pair[1]) as u8).collect()
 }
 
-/// Returns the whole list: `vectors`, and `key`, the key of the datagrams that have a MAC, as hex digits.
+/// Returns the whole list. It has two fields: `vectors`, and `key`, which is the key of the datagrams with a MAC in
+/// hexadecimal digits.
 pub(crate) fn read_list() -> Value {
-    // Crates at several depths of the source tree include this file.
+    // Crates at several depths of the source tree include this file, so search upward for the root of the tree.
     let mut above = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
     let top =
         above.find(|folder| folder.join("tests/vectors").is_dir()).expect("the root of the source tree");

@@ -1,5 +1,5 @@
 //! Dissector for Wireshark, tested on captures: it shows every field of the golden datagrams, and marks faults in a
-//! sequence. Skipped if there is no tshark.
+//! sequence of datagrams. The tests are skipped if tshark is not installed.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,8 +10,9 @@ use scanhub_schema::datagram::{DatagramPayload, HEADER_LEN, Head};
 use scanhub_schema::{EventKind, Family, PointClass, State, Topic, TrackState, Verdict, Zones};
 use serde_json::Value;
 
-/// Returns the values of the payload `description`, which is from the list. The key is the dissector's name of a field.
-/// The values are in order and in the format in which the dissector shows them.
+/// Returns the fields that the dissector must show for a payload, by the dissector's name of the field. `description`
+/// is the payload in the list of golden datagrams. The values of each field are in the order and in the format in which
+/// the dissector shows them.
 fn fields(topic: &str, description: &Value) -> BTreeMap<String, Vec<String>> {
     let mut fields = BTreeMap::new();
     flatten(topic, "", description, &mut fields);
@@ -20,7 +21,7 @@ fn fields(topic: &str, description: &Value) -> BTreeMap<String, Vec<String>> {
 
 fn flatten(topic: &str, name: &str, description: &Value, fields: &mut BTreeMap<String, Vec<String>>) {
     match description {
-        // Times are computed from other fields, so the dissector does not show them.
+        // The list has times that are computed from other fields. The dissector does not show these.
         Value::Object(items) => items
             .iter()
             .filter(|(key, _)| *key != "times_ns")
@@ -36,7 +37,8 @@ fn flatten(topic: &str, name: &str, description: &Value, fields: &mut BTreeMap<S
             };
             items.iter().for_each(|item| flatten(topic, single, item, fields));
         }
-        // A missing value is encoded as a special number.
+        // The list has `null` for a missing value, which a datagram encodes as a special number. The test does not
+        // compare missing values.
         Value::Null => {}
         value => {
             let field = match name {
@@ -74,8 +76,8 @@ fn shown_field(name: &str, value: &Value) -> String {
     }
 }
 
-/// Rounds values of angles, lines, motions and similar fields, because the dissector shows them with a different number
-/// of digits.
+/// Rounds values of angles, lines, motions and similar fields, because the dissector shows fewer or more digits of them
+/// than the list.
 fn shown_value(name: &str, values: &str) -> String {
     let is_angle = ["angle", "step", "spacing"].iter().any(|word| name.ends_with(word))
         || ["lines", "motion", "tracks", "tilt", "cloud", "obstacles"]
@@ -116,7 +118,7 @@ fn golden_datagrams_are_shown_field_by_field() {
                 target.insert("scanhub.refused".to_owned(), Vec::new());
                 target.insert("scanhub.crc_status".to_owned(), vec!["good".to_owned()]);
             }
-            // The dissector marks a part, and does not show the content of its sample.
+            // For a part of a sample, the dissector shows only that it is a part, and not the content of the sample.
             Some("payload") if vector.name.starts_with("scan_part_") => {
                 let part = vector.name.trim_start_matches("scan_part_");
                 for (field, value) in [("part", part), ("parts", "3"), ("crc_status", "good")] {
@@ -124,7 +126,7 @@ fn golden_datagrams_are_shown_field_by_field() {
                 }
                 target.insert("scanhub.refused".to_owned(), Vec::new());
             }
-            // These results depend on a key or on earlier datagrams. The capture has neither.
+            // These results depend on a key or on datagrams that the capture does not contain.
             Some("unauthenticated" | "mac" | "epoch" | "twin" | "stale" | "capacity") => {}
             Some(refusal) => {
                 target.insert("scanhub.refused".to_owned(), vec![refusal.to_owned()]);
@@ -162,7 +164,7 @@ fn damaged_datagrams_are_shown_as_refused() {
     assert_eq!(shown.len(), damaged.len());
     for ((datagram, expected), shown) in damaged.iter().zip(&shown) {
         let refusal = expected["refusal"].as_str().unwrap_or_default();
-        // A part alone is not a valid payload, but the dissector shows it as a part.
+        // A single part is not a valid payload, so `schema` refuses it. The dissector shows it as a part.
         let is_part = refusal == "payload" && datagram[34] > 1;
         let refusal = if is_part { "" } else { refusal };
         assert_eq!(shown["scanhub.refused"], refusal, "{datagram:02x?}");

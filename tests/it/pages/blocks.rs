@@ -1,5 +1,6 @@
-//! Blocks of code in README.md, in `docs/` and in the pages of the Python and C libraries, with location and language.
-#![allow(dead_code)] // Each test uses only some items.
+//! Blocks of code in README.md, in `docs/` and in the pages of the Python and C libraries, each with its location and
+//! its language.
+#![allow(dead_code)] // Each test uses only some items of this module.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,9 +8,9 @@ use std::path::{Path, PathBuf};
 /// A block of code on a page.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Block {
-    /// Page and line of its fence as `PAGE:LINE`, the form that compilers use.
+    /// Page and line of the opening fence as `PAGE:LINE`, the form in which compilers print locations.
     pub(crate) location: String,
-    /// Language after the fence, such as `sh`, `rust` or `python`. May be empty.
+    /// Language after the opening fence, such as `sh`, `rust` or `python`. Empty if the fence names none.
     pub(crate) language: String,
     /// Lines between the fences, each with a line feed.
     pub(crate) text: String,

@@ -1,5 +1,5 @@
-//! Tests of the blocks that are not programs: configurations, worlds, sites and lines of JSON. Blocks of plain text are
-//! listed with the test that checks them.
+//! Tests of the blocks that are not programs: configurations, worlds, sites and lines of JSON. A list names each block
+//! of plain text and the test that checks it.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,8 @@ use super::blocks::{Block, blocks};
 use super::is_program;
 use crate::testkit::{TERM, TestEnv, output};
 
-/// Blocks of plain text: page, beginning, and how they are checked or why they are not.
+/// Blocks of plain text. Each entry has the page, the beginning of the block, and the test that checks the block or the
+/// reason why no test does.
 const TEXT_BLOCKS: [(&str, &str, &str); 8] = [
     ("README.md", " LMS 291 ──RS-422", "a drawing"),
     ("docs/datagram.md", " 0  53485542", "schema/tests/datagram.rs compares it with the golden datagram"),
@@ -25,7 +26,7 @@ const TEXT_BLOCKS: [(&str, &str, &str); 8] = [
 /// The CMake project of the examples in C and C++.
 const EXAMPLES: &str = include_str!("../../../clients/c/examples/CMakeLists.txt");
 
-/// Returns what is wrong with a block that is not a program, if anything.
+/// Returns what is wrong with a block that is not a program, or `None` if nothing is wrong.
 fn error_in_block(block: &Block) -> Option<String> {
     match block.language.as_str() {
         "toml" => error_in_toml(block),
@@ -37,7 +38,7 @@ fn error_in_block(block: &Block) -> Option<String> {
             (!TEXT_BLOCKS.iter().any(is_named)).then(|| "no test checks this text".to_owned())
         }
         "sh" => None,
-        // Lines of the examples' project, which `client_c.rs` builds.
+        // Lines of the CMake project of the examples, which `client_c.rs` builds.
         "cmake"
             if block.text.lines().all(|line| EXAMPLES.contains(line.split("  ").next().unwrap_or(line))) =>
         {
@@ -49,14 +50,14 @@ fn error_in_block(block: &Block) -> Option<String> {
         "rust,no_run" if block.location.starts_with("docs/tilt.md") => None,
         // A program that reads a recording, which `python/read.rs` runs.
         "python,no_run" if block.location.starts_with("docs/python.md") => None,
-        // Uses a crate that clients do not depend on. That crate's doc tests run it.
+        // A program that uses a crate on which clients do not depend. The doc tests of that crate run the program.
         "rust,edition2024" if block.location.starts_with("docs/tilt.md") => None,
         _ if is_program(block) => None,
         other => Some(format!("unknown kind of block: {other:?}")),
     }
 }
 
-/// Returns what is wrong with a TOML block, unless it is a configuration, a world or a site.
+/// Returns what is wrong with a TOML block, or `None` if the block is a configuration, a site or a world.
 fn error_in_toml(block: &Block) -> Option<String> {
     let env = TestEnv::new();
     let file = env.file("page.toml", &block.text);
@@ -64,7 +65,7 @@ fn error_in_toml(block: &Block) -> Option<String> {
     if checked.exit_code == Some(0) {
         return None;
     }
-    // A section without a link becomes a complete configuration with one.
+    // A section of a configuration may lack a link. With a link added, the section must be a complete configuration.
     let with_link = format!("{}\n[[link]]\nname = \"front\"\nport = \"/dev/ttyUSB0\"\n", block.text);
     let completed = env.run(&["config", "check", &env.file("completed.toml", with_link)]);
     if checked.stderr.contains("no link is configured") && completed.exit_code == Some(0) {
@@ -82,7 +83,8 @@ fn error_in_toml(block: &Block) -> Option<String> {
     Some(format!("neither a configuration, a site nor a world: {checked}{}", world.wait()))
 }
 
-/// Returns what is wrong with a line of JSON output, unless docs/output.md lists its class and all of its keys.
+/// Returns what is wrong with a line of JSON output, or `None` if docs/output.md lists the class and all keys of the
+/// line.
 fn error_in_json(line: &str) -> Option<String> {
     let Ok(Value::Object(keys)) = serde_json::from_str(line) else {
         return Some(format!("no object: {line}"));

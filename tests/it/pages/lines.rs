@@ -1,5 +1,6 @@
-//! Tests that run the shell lines of the pages. They run with a hub, a sensor `front`, recordings with the names that
-//! the pages use, and a spare sensor at each port that they name. Commands that cannot run are listed with the reason.
+//! Tests that run the shell lines of the pages. The lines run with a hub, a sensor `front`, and recordings with the
+//! names that the pages use. A spare sensor takes the place of each port that the lines name. A list has the commands
+//! that cannot run here, with the reason.
 
 use std::fs;
 use std::process::Command;
@@ -15,8 +16,8 @@ use crate::testkit::{
 };
 use scanhub_schema::Topic;
 
-/// Commands that are not run: the beginning of the line, and the reason or the test that runs it. `hub/cli.rs` parses
-/// those of `scanhub`.
+/// Commands that are not run here. Each entry has the beginning of the line, and the reason or the test that runs the
+/// command. A test in `hub/cli.rs` parses the `scanhub` commands among them.
 const SKIPPED_COMMANDS: [(&str, &str); 18] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
@@ -37,7 +38,7 @@ const SKIPPED_COMMANDS: [(&str, &str); 18] = [
     ("scanhub tilt", "needs a mount; tests/it/tilt.rs runs it beside one"),
     ("scanhub echo hall/", "follows what that makes; the same"),
 ];
-/// Parts of lines that are not run, with the reason.
+/// If a line contains one of these parts, it is not run. Each part has the reason.
 const NOT_RUN_IF_CONTAINS: [(&str, &str); 1] = [("| ssh ", "needs another machine")];
 
 /// Returns whether `line` is not run.
@@ -59,16 +60,17 @@ fn command_lines() -> Vec<(String, String)> {
     lines.collect()
 }
 
-/// Environment that the pages assume: a running hub, recordings, and `scanhub` in `PATH`.
+/// Environment that the pages assume: a running hub, recordings, and the program `scanhub` in `PATH`.
 struct ShellEnv {
     env: TestEnv,
-    /// Count of lines that were run, which names the next directory.
+    /// Number of lines that were run so far. It names the directory of the next line.
     count: AtomicUsize,
 }
 
-/// Names under which pages use a recording of `front`.
+/// Names of files that pages use for a recording of `front`.
 const RECORDINGS: [&str; 5] = ["walk.mcap", "day-0001.mcap", "cut.mcap", "killed.mcap", "robot.mcap"];
-/// Range of a recording on a page, and the range that replaces it because the recording of this test is shorter.
+/// Time range of a recording on a page, and the time range that replaces it here. The recording of this test is
+/// shorter.
 const SHORTENED_RANGE: (&str, &str) = ("--start 1m --end 90s", "--start 200ms --end 500ms");
 /// Ports that pages name.
 const PORTS: [&str; 5] =
@@ -85,7 +87,7 @@ impl ShellEnv {
         assert_eq!(recorded.exit_code, Some(0), "{recorded}");
         let stream = env.run(&["echo", "front/telegram", "--raw", "-n", "5"]);
         fs::create_dir(env.path("bin")).expect("a directory");
-        // `run` and `replay` use another domain, because a domain has at most one hub.
+        // A domain has at most one hub, so the commands `run` and `replay` use another domain.
         let (name, root) = (env.domain().name().to_owned(), env.path("").display().to_string());
         let script = format!(
             "#!/bin/sh\ncase $1 in run | replay) other=x ;; esac\n\
@@ -98,8 +100,8 @@ impl ShellEnv {
         (ShellEnv { env, count: AtomicUsize::new(0) }, [simulator, hub])
     }
 
-    /// Runs `line` and returns the problem, if any. Repeats a search that finds no scanner, because the simulated
-    /// scanner may reply too late on a busy machine.
+    /// Runs `line` and returns the problem, if any. If `scanhub probe` finds no scanner, runs the line again, because
+    /// the simulated scanner may reply too late on a busy machine.
     fn run(&self, line: &str) -> Option<String> {
         let mut wrong = self.run_once(line);
         wait_until(line, || {
@@ -114,7 +116,8 @@ impl ShellEnv {
         wrong
     }
 
-    /// Runs `line` in a new directory until it ends, or ends it with Ctrl-C. Returns the problem, if there is one.
+    /// Runs `line` in a new directory until the command ends, or ends the command as Ctrl-C does. Returns the problem,
+    /// if there is one.
     fn run_once(&self, line: &str) -> Option<String> {
         let here = self.env.path(&format!("line{}", self.count.fetch_add(1, Ordering::Relaxed)));
         fs::create_dir(&here).expect("a directory");
@@ -135,7 +138,8 @@ impl ShellEnv {
         });
         let typed = typed.replace(SHORTENED_RANGE.0, SHORTENED_RANGE.1);
         let mut shell = Command::new("sh");
-        // A single command replaces the shell, so that signals reach it.
+        // If the line has a single command, this command replaces the shell, so that the test's signals reach the
+        // command.
         let exec = if commands(line).len() == 1 { "exec " } else { "" };
         let path = format!("{}:{}", self.env.path_argument("bin"), std::env::var("PATH").unwrap_or_default());
         shell.arg("-c").arg(format!("{exec}{typed}")).current_dir(&here).env("PATH", path);
@@ -146,7 +150,8 @@ impl ShellEnv {
         let mut words = line.split_whitespace();
         let ends =
             words.next() == Some("scanhub") && words.next().is_some_and(|verb| ENDING_VERBS.contains(&verb));
-        // Any other command may run forever. Interrupt it once it has a handler for SIGINT and has had time to fail.
+        // Any other command may run forever. Interrupt it after it has set a handler for SIGINT and has had time to
+        // fail.
         wait_until(line, || program.has_ended() || !ends && catches_interrupts(group));
         let started = Instant::now();
         wait_until(line, || program.has_ended() || started.elapsed() > TIME_TO_FAIL);
@@ -157,7 +162,7 @@ impl ShellEnv {
             Some(0) => true,
             // A command with `--for` or `-n` exits with 130 when it is interrupted.
             Some(130) => is_ended && is_bounded,
-            // Exit code of `doctor` if a condition is not met, for example on the machine that runs the test.
+            // `doctor` exits with 5 if a condition is not met, for example on the machine on which the test runs.
             Some(5) => line.starts_with("scanhub doctor"),
             _ => false,
         };
@@ -168,10 +173,11 @@ impl ShellEnv {
 /// Verbs that end by themselves. The test waits for them as long as they need.
 const ENDING_VERBS: [&str; 6] = ["doctor", "probe", "list", "info", "convert", "key"];
 
-/// Time in which a command that runs forever may fail. A correct command passes whatever the value.
+/// Time for which the test waits for a failure of a command that may run forever. A shorter time could only hide
+/// failures, and a longer time cannot make a correct command fail.
 const TIME_TO_FAIL: Duration = Duration::from_millis(1200);
 
-/// Returns whether `group` contains a program of this project and each of them has a handler for SIGINT (proc(5),
+/// Returns whether `group` contains a program of this project, and each such program has a handler for SIGINT (proc(5),
 /// `SigCgt`).
 fn catches_interrupts(group: Pid) -> bool {
     let processes = fs::read_dir("/proc").into_iter().flatten().flatten().map(|entry| entry.path());
@@ -192,9 +198,9 @@ fn catches_interrupts(group: Pid) -> bool {
 /// Runs `lines` and returns a description of each failure.
 fn failures(environment: &ShellEnv, lines: &[(String, String)]) -> Vec<String> {
     let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", environment.run(line)?));
-    // These commands share the spare sensor, the domain for another hub, the single slot for a listener, or the state
-    // of the sensor, so they run one after the other. Commands spend most of their time waiting, so the others run in
-    // three concurrent rows.
+    // These commands, and those that name a port, run one after the other, because they share resources. The resources
+    // are the spare sensor, the domain for another hub, the single slot for a listener, and the state of the sensor
+    // `front`. All other commands run in three concurrent rows, because commands wait most of the time.
     const SEQUENTIAL_COMMANDS: [&str; 6] = [
         "scanhub run",
         "scanhub replay",
@@ -227,8 +233,8 @@ fn every_network_line_of_the_pages_runs() {
         let lines: Vec<_> = command_lines().into_iter().filter(|(_, line)| needs_network(line)).collect();
         assert!(lines.len() > 3, "{lines:#?}");
         let (desk, _running) = ShellEnv::new();
-        // Lines that start a listener or a gateway run first. The other lines then run while a listener publishes, as
-        // on the page.
+        // Lines that start a listener or a gateway run first. The other lines then run while a listener publishes,
+        // which the page assumes.
         let (alone, follows): (Vec<_>, Vec<_>) = lines
             .into_iter()
             .partition(|(_, line)| line.contains("scanhub listen") || line.contains("gateway"));
@@ -242,7 +248,7 @@ fn every_network_line_of_the_pages_runs() {
     });
 }
 
-/// Excluded lines still start with listed commands and name existing files.
+/// Each entry in the lists of excluded lines must still be the start of a line, and must name only existing files.
 #[test]
 fn excluded_shell_lines_exist_and_name_existing_files() {
     let lines = command_lines();

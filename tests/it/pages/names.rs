@@ -1,4 +1,5 @@
-//! Checks that no JSON key, configuration key or flag uses a public name that misled or contradicted the glossary.
+//! Checks that no JSON key, configuration key or flag has one of the former public names that were misleading or
+//! contradicted the glossary.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -6,8 +7,8 @@ use std::path::Path;
 
 use crate::testkit::TestEnv;
 
-/// Words that are not used as names, each with the places in which it has an allowed meaning: rows of `docs/output.md`
-/// as `CLASS VERB`.
+/// Words that must not be names. Each word has a list of the places in which its meaning is allowed. A place is a row
+/// of `docs/output.md`, written as `CLASS VERB`.
 const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("self_min", &[]),
     ("i_min", &[]),
@@ -28,7 +29,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("angles_unfit", &[]),
     ("pictures", &[]),
     ("trouble", &[]),
-    // Telegrams and datagrams that did not arrive.
+    // Allowed for telegrams and datagrams that did not arrive.
     ("lost", &["summary demo", "lan listen", "lan_evicted listen", "bridge bridge", "bridge_evicted bridge"]),
     ("lan_given_up", &[]),
     ("bridge_given_up", &[]),
@@ -42,7 +43,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("client", &[]),
     ("came", &[]),
     ("clients", &[]),
-    // Allowed for a topic that the receiver does not support.
+    // Allowed for samples of a topic that the receiver does not support.
     ("skipped", &["lan_refused listen", "bridge_refused bridge"]),
     ("well", &[]),
     // Allowed for people who returned through a door.
@@ -50,7 +51,7 @@ const FORBIDDEN: [(&str, &[&str]); 36] = [
     ("unheard", &[]),
 ];
 
-/// Place in which a name is used, and the name.
+/// A name, and before it the place in which the name is used.
 pub(super) type Used = (String, String);
 
 /// Returns the names among `used` that are forbidden where they are used.
@@ -96,7 +97,7 @@ pub(super) fn of_help(env: &TestEnv) -> Vec<Used> {
         String::from_utf8(outcome.stdout).expect("text")
     };
     let all = help(&["--help"]);
-    // The bridge is another program. Its own test checks its flags.
+    // The bridge is another program, and its own tests check its flags.
     let verbs = verbs_in(&all).into_iter().filter(|verb| !["help", "bridge"].contains(verb));
     let mut used = Vec::new();
     for verb in verbs {

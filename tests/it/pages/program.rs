@@ -1,4 +1,4 @@
-//! An example of a page as a program, built as a reader of the page would build it.
+//! An example of a page as a program, built in the way in which a reader of the page would build it.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ impl Example {
     ///
     /// # Errors
     ///
-    /// The message of the compiler if it rejects the block.
+    /// Returns the message of the compiler if the compiler rejects the block.
     pub(crate) fn build(block: &Block, env: &TestEnv) -> Result<Option<Example>, String> {
         let name = block.location.replace(['/', '.', ':'], "_");
         let source = |ending: &str, text: &str| PathBuf::from(env.file(&format!("{name}.{ending}"), text));
@@ -44,7 +44,7 @@ impl Example {
     /// Returns the command that runs the example in `env` with the hub of `env`.
     pub(crate) fn command(&self, env: &TestEnv) -> Command {
         let mut command = Command::new(&self.program);
-        // Python warnings are errors, except the one for a hub that is still starting.
+        // Python warnings are errors, except for the warning that a hub is still starting.
         command.args(&self.arguments).current_dir(env.path("")).env_remove("XDG_RUNTIME_DIR");
         command.env("SCANHUB_DOMAIN", env.domain().name()).env("PYTHONWARNINGS", "error,default:nothing yet");
         command.env("RUNTIME_DIRECTORY", env.domain().root().parent().expect("a parent directory"));
@@ -53,7 +53,7 @@ impl Example {
     }
 }
 
-/// Returns the text of `block`, inside a main function if it has none.
+/// Returns the text of `block`. If the text has no main function, it is put into one.
 fn with_main(block: &Block) -> String {
     let Block { language, text, .. } = block;
     match language.as_str() {
@@ -105,11 +105,11 @@ fn compile_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     Ok(program)
 }
 
-/// Name of the crate that clients depend on.
+/// Name of the crate that clients in Rust use.
 const LIBRARY_NAME: &str = "scanhub_client";
 
-/// Builds the client library, once per process, and returns its path. It is built alone, because Cargo must not rebuild
-/// this test or the program while they run.
+/// Builds the client library, once per process, and returns its path. Cargo builds only this library, because it must
+/// not rebuild this test or the program while they run.
 fn library() -> &'static Path {
     static LIBRARY_PATH: OnceLock<PathBuf> = OnceLock::new();
     LIBRARY_PATH.get_or_init(build_library)
@@ -136,8 +136,8 @@ fn build_library() -> PathBuf {
     library.clone()
 }
 
-/// Text before each C example that is only a part of a program.
+/// Text that precedes each C example that is only a part of a program.
 const C_PRELUDE: &str = "#include <errno.h>\n#include <poll.h>\n#include <scanhub/attach.h>\n#include <stdio.h>\n#include <unistd.h>\n";
 const CPP_PRELUDE: &str = "#include <cmath>\n#include <cstdio>\n#include <scanhub/attach.hpp>\n";
-/// Makes output available to the test line by line.
+/// Statement with which a C program writes its output line by line, so that the test can read each line at once.
 const LINE_BUFFERING: &str = "setvbuf(stdout, NULL, _IOLBF, BUFSIZ);\n";

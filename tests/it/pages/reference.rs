@@ -1,5 +1,5 @@
-//! Checks that the reference pages are complete: every class and key of `--json`, exit code, configuration key, flag
-//! and field of a datagram is on its page.
+//! Checks that the reference pages are complete: every class and key of `--json`, every exit code, configuration key
+//! and flag, and every field of a datagram is on the right page.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -11,7 +11,7 @@ use super::names::{of_configuration, of_help};
 use crate::testkit::TestEnv;
 use crate::tidy::tree::SourceTree;
 
-/// Pages that describe the flags of a verb. Pages of flags that many verbs have are in [`SHARED_PAGES`].
+/// Verbs, each with the pages that describe its flags. Flags that many verbs have are on [`SHARED_PAGES`] instead.
 const VERB_PAGES: [(&str, &[&str]); 30] = [
     ("run", &["configuration"]),
     ("replay", &["replay"]),
@@ -45,18 +45,18 @@ const VERB_PAGES: [(&str, &[&str]); 30] = [
     ("man", &["verbs"]),
 ];
 
-/// Pages of flags that many verbs have: those of all verbs, and those that change the configuration.
+/// Pages with flags that many verbs have: the flags of all verbs, and the flags that change the configuration.
 const SHARED_PAGES: [&str; 2] = ["output", "configuration"];
 
-/// Serialized structs that are not a part of a line of `--json`, by a part of the path and the name, each with the
-/// reason.
+/// Serialized structs that are not part of a line of `--json`. Each entry has a part of the file's path and the name of
+/// the struct (empty for all structs of the file). Comments give the reasons.
 const OTHER_STRUCTS: [(&str, &str); 4] = [
     // Messages to browsers and Foxglove.
     ("clients/viewer/src/server/", ""),
-    // Key of a configuration, which is checked on its page.
+    // A struct that a configuration contains. The page of the configuration is checked for its keys.
     ("clients/perception/src/tilt/angles.rs", "ReversalDetector"),
     ("hub/config/src/section.rs", ""),
-    // Files of the hub.
+    // Structs in files that the hub saves.
     ("hub/daemon/src/saved_state.rs", ""),
 ];
 
@@ -79,20 +79,20 @@ fn quoted_words(page: &str) -> BTreeSet<String> {
     words
 }
 
-/// Returns whether `text` contains `flag` and not only a longer one.
+/// Returns whether `text` contains `flag` as a whole word, and not only as the start of a longer flag.
 fn has_flag(text: &str, flag: &str) -> bool {
     text.match_indices(flag)
         .any(|(at, _)| !text[at + flag.len()..].starts_with(|c: char| c.is_alphanumeric() || c == '-'))
 }
 
-/// Classes and keys of JSON lines with the file that prints them.
+/// Classes and keys of JSON lines, each with the file that prints it.
 #[derive(Debug, Default)]
 struct Printed {
     classes: BTreeSet<(String, String)>,
     keys: BTreeSet<(String, String)>,
 }
 
-/// Returns the classes and keys that the sources of `tree` print.
+/// Returns the classes and keys that the sources in `tree` print.
 fn printed(tree: &SourceTree) -> Printed {
     let mut printed = Printed::default();
     let is_product = |path: &str| {
@@ -113,7 +113,7 @@ fn printed(tree: &SourceTree) -> Printed {
     printed
 }
 
-/// Returns the classes that `text` names in values of the key `class`.
+/// Returns the classes that occur in `text` as values of the key `class`.
 fn classes(text: &str) -> impl Iterator<Item = String> {
     const BEFORE: [&str; 7] = [
         "class: \"",
@@ -136,7 +136,7 @@ fn classes(text: &str) -> impl Iterator<Item = String> {
 struct Serialized {
     name: String,
     keys: Vec<String>,
-    /// Classes that the variants of an enum determine.
+    /// Classes that the variants of the enum stand for.
     classes: Vec<String>,
 }
 
@@ -206,7 +206,7 @@ fn snake(name: &str) -> String {
     snake
 }
 
-/// Returns a description of each class and key that `page` does not have.
+/// Returns a description of each class and each key that `page` lacks.
 fn missing_output(printed: &Printed, page: &str) -> Vec<String> {
     let rows = page.lines().filter(|line| line.starts_with("| `"));
     let listed: BTreeSet<_> = rows.filter_map(|row| row.split('`').nth(1)).collect();
@@ -272,7 +272,7 @@ const KINDS: [Kind; 20] = [
     Kind::Interrupted,
 ];
 
-/// Returns the kinds whose name is not in the row of their exit code on `page`.
+/// Returns the kinds whose name is missing on `page` in the row of their exit code.
 fn missing_exit_codes(kinds: &[Kind], page: &str) -> Vec<String> {
     let table = page.split("## Exit codes").nth(1).unwrap_or_default();
     let is_listed = |kind: &Kind| {
@@ -298,11 +298,11 @@ fn page_has_every_exit_code() {
     assert_eq!(missing_exit_codes(&KINDS, &planted), ["3 timeout", "66 input"]);
 }
 
-/// Returns the keys of the configuration without a row on `page`, as `SECTION.KEY`.
+/// Returns the keys of the configuration that have no row on `page`. Each key is written as `SECTION.KEY`.
 fn missing_keys(keys: &[(String, String)], page: &str) -> Vec<String> {
     let mut missing = Vec::new();
     for (section, key) in keys {
-        // `background.keep` has a heading of its own below that of `background`.
+        // `background.keep` has its own heading, below the heading of `background`.
         let heading = section.rsplit('.').next().unwrap_or_default();
         let text = page.split(&format!("# {heading}\n")).nth(1).unwrap_or_default();
         let text = text.split("\n## ").next().unwrap_or_default();
@@ -324,7 +324,8 @@ fn page_has_every_configuration_key() {
     assert_eq!(missing_keys(&keys, &page), ["zones.planted"]);
 }
 
-/// Returns the flags that the pages of their verb do not have, as `VERB --FLAG`. `used` has verbs and flags.
+/// Returns the flags that the pages of their verb lack, as `VERB --FLAG`. `used` has the verb and the flag for each
+/// flag of the program.
 fn missing_flags(used: &[(String, String)]) -> Vec<String> {
     let shared: Vec<String> = SHARED_PAGES.iter().map(|name| page(name)).collect();
     let general_flags = ["json", "domain", "root", "help", "version", "for", "timeout", "force"];

@@ -1,5 +1,5 @@
 //! Parser for the shell syntax that examples use: comments, quotes, pipes and redirections.
-#![allow(dead_code)] // Each test uses only some items.
+#![allow(dead_code)] // Each test uses only some items of this module.
 
 /// Returns the lines of a block without comments and empty lines.
 pub(crate) fn lines(text: &str) -> Vec<String> {
@@ -22,8 +22,8 @@ pub(crate) fn commands(line: &str) -> Vec<Vec<String>> {
     commands
 }
 
-/// Returns the words of each `scanhub` command in `line`, including those that `cargo run` starts. Examples of Cargo do
-/// not count.
+/// Returns the words of each `scanhub` command in `line`, including the commands that `cargo run` starts. Commands that
+/// start an example with `cargo run --example` do not count.
 pub(crate) fn scanhub_commands(line: &str) -> Vec<Vec<String>> {
     let of_cargo = |words: &[String]| {
         let at = words
@@ -41,7 +41,8 @@ pub(crate) fn scanhub_commands(line: &str) -> Vec<Vec<String>> {
     ours.collect()
 }
 
-/// Returns the words of `line` that a shell may take for a pattern: zsh refuses a pattern that matches no file.
+/// Returns the words of `line` that a shell may treat as a pattern for file names. They must be quoted, because zsh
+/// refuses a pattern that matches no file.
 pub(crate) fn patterns(line: &str) -> Vec<String> {
     let (mut quote, mut plain) = (None, String::new());
     for sign in without_comment(line).chars() {
@@ -70,7 +71,7 @@ fn without_comment(line: &str) -> &str {
     line
 }
 
-/// Returns the words and operators of `line`, each with whether it was quoted.
+/// Returns the words and operators of `line`. The flag of each is true if it was quoted.
 fn words(line: &str) -> Vec<(String, bool)> {
     let mut words = Vec::new();
     let (mut word, mut quote, mut is_quoted) = (String::new(), None, false);

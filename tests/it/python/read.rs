@@ -1,4 +1,4 @@
-//! Tests that `scanhub.read` returns the samples that a replay of the recording publishes, bit for bit.
+//! Tests that `scanhub.read` returns exactly the samples that a replay of the recording publishes, bit for bit.
 
 use std::path::Path;
 use std::process::Command;
@@ -24,7 +24,7 @@ use crate::replayed::recorded_rooms::{self, SENSORS};
 use crate::replayed::step_through;
 use crate::testkit::{Program, TestEnv, client_python, in_own_process, python_for};
 
-/// Settings with which the background is learned within the recording and zones are violated.
+/// Settings with which the hub learns the background within the recording, and with which people enter the zones.
 const READ_SETTINGS: &str = r#"
 background.scans = 40
 zones.radii = [2.5, 1.5]
@@ -34,7 +34,7 @@ port = "/dev/ttyUSB0"
 zones.radii = [3.0, 2.0]
 "#;
 
-/// Samples of all topics except `status`, in the form in which `read.py` prints them.
+/// Samples of all topics except `status`, in the form in which the script `read.py` prints them.
 #[derive(Default)]
 struct PublishedSamples {
     samples: Vec<Value>,
@@ -101,8 +101,8 @@ impl PublishedSamples {
 }
 
 /// Returns `samples` sorted by sensor, topic and `topic_seq`. Drops statuses, and drops the zones before the first
-/// telegram, because a subscriber of a replay attaches too late for them. Without `has_stamps`, the times come from the
-/// clock of the run and are replaced by null.
+/// telegram, because a subscriber of a replay attaches too late for them. If `has_stamps` is false, the recording has
+/// no stamps, and the times come from the clock of the run. They are then replaced by null.
 fn sorted(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
     let mut samples: Vec<Value> = samples
         .into_iter()
@@ -116,7 +116,8 @@ fn sorted(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
 }
 
 /// Asserts that a replay of `file` with the settings in `config` publishes the samples that [`RecordingReader`]
-/// returns. If `read` is given, `scanhub.read` must return the same samples.
+/// returns. If `read` is given, it is the command that prints what `scanhub.read` returns, which must be the same
+/// samples.
 fn compare(
     env: &TestEnv,
     read: Option<&Command>,
@@ -236,7 +237,7 @@ fn example_plots_a_recording() {
     assert!(picture.starts_with(b"\x89PNG"));
 }
 
-/// Writes a log of a room, with a pause of 1.7 s.
+/// Writes a log of a simulated room. Between two of its scans, there is a pause of 1.7 s.
 fn log(env: &TestEnv) -> String {
     let room = Room::new(&"demo".parse().expect("a world"), 7);
     let line = |scan: u64| {
@@ -250,7 +251,7 @@ fn log(env: &TestEnv) -> String {
     env.file("a.log", (0..110).map(line).collect::<String>())
 }
 
-/// Writes a stream file of a room, with damaged bytes between its telegrams.
+/// Writes a stream file of a simulated room, with damaged bytes between the telegrams.
 fn stream(env: &TestEnv) -> String {
     let room = Room::new(&"demo".parse().expect("a world"), 8);
     let mut bytes = lms::reply::configuration_reply(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
@@ -268,7 +269,7 @@ fn stream(env: &TestEnv) -> String {
     env.file("stream.bin", bytes)
 }
 
-/// Writes the packets of a rotating scanner as they arrive on a line.
+/// Writes a stream file with the packets of a rotating scanner, as they would arrive on a line.
 fn packets(env: &TestEnv) -> String {
     let room = Room::new(&"room".parse().expect("a world"), 7);
     let settings = LdSettings { seed: 7, ..LdSettings::of(ld::Model::Ld19) };

@@ -1,5 +1,5 @@
-//! Sensors on ptys, a hub and subscribers as processes, to which actions are applied. `invariants.rs` checks the
-//! result.
+//! Sensors on ptys, and a hub and subscribers as processes. The test applies the actions of a scenario to them.
+//! `invariants.rs` checks the result.
 
 use std::time::{Duration, Instant};
 
@@ -31,8 +31,8 @@ pub(super) struct RealSpeedEnvironment {
     killed_at: Option<Instant>,
 }
 
-/// Maximum time until the hub has cleaned up after a killed subscriber. The hub cleans up every five seconds. A hub
-/// that ends earlier leaves the cleanup to the next hub.
+/// Maximum time until the hub has cleaned up after a killed subscriber. The hub cleans up every five seconds. If it
+/// ends before that, the next hub cleans up.
 const CLEANUP_INTERVAL: Duration = Duration::from_secs(9);
 
 /// A task that follows from an action.
@@ -66,7 +66,8 @@ impl RealSpeedEnvironment {
         self.started.elapsed().as_nanos() as Nanos
     }
 
-    /// Waits until `at` after the start, and runs the scheduled tasks that are due before.
+    /// Waits until the time `at` (nanoseconds since the start), and runs the scheduled tasks that become due until
+    /// then.
     pub(super) fn wait_until(&mut self, at: Nanos) {
         loop {
             self.scheduled.sort_by_key(|(due, _)| *due);
@@ -84,8 +85,8 @@ impl RealSpeedEnvironment {
         self.scheduled.push((self.now() + span, Box::new(task)));
     }
 
-    /// Applies `action` if a real program allows it. Ignores actions on the machine's clock, disk, memory and
-    /// permissions, and on a sensor's view and quirks.
+    /// Applies `action` if this is possible with real programs. Ignores actions on the machine's clock, disk, memory
+    /// and permissions, and on a sensor's view and quirks.
     pub(super) fn perform(&mut self, action: &Action) {
         let sensor = action.value("sensor") as usize % SENSORS.len();
         let span = action.value("span_ms") * MILLIS;
@@ -138,7 +139,7 @@ impl RealSpeedEnvironment {
 
     fn end_hub(&mut self, signal: Signal, down_time: Nanos) {
         let Some(hub) = self.hub.take() else { return };
-        // A stopped process does not handle SIGTERM.
+        // Continue the process first, because a stopped process does not handle SIGTERM.
         hub.signal(Signal::CONT);
         let outcome = hub.end(signal);
         assert_eq!(outcome.exit_code, (signal == TERM).then_some(0), "{outcome}");
@@ -147,13 +148,15 @@ impl RealSpeedEnvironment {
 
     fn start_hub(&mut self) {
         if self.hub.is_none() {
-            // A hub does not start with a bad configuration, so only a reload may use one.
+            // A hub does not start with a bad configuration, so use one only for a reload. The editions 0 and 1 are
+            // valid.
             self.edition = self.edition.min(1);
             self.hub = Some(self.env.hub(&[self.configuration(), "--no-system-config".to_owned()]));
         }
     }
 
-    /// Writes the hub's configuration of the current edition, valid or not, and returns the flag for it.
+    /// Writes the hub's configuration of the current edition, which may be invalid, and returns the flag that names the
+    /// file.
     fn configuration(&self) -> String {
         let link = |name: &str| {
             format!("[[link]]\nname = \"{name}\"\nport = \"{}\"\n", self.env.path_argument(name))
@@ -163,7 +166,7 @@ impl RealSpeedEnvironment {
         format!("--config={}", self.env.file("scanhub.toml", text))
     }
 
-    /// Starts a subscriber that receives `signal` after `span`.
+    /// Starts a subscriber, and schedules a task that sends `signal` to it after `span`.
     fn attach_subscriber(&mut self, sensor: usize, topic: u64, span: Nanos, signal: Signal) {
         let topic = Topic::ALL[topic as usize % Topic::ALL.len()].name();
         let guest = self.env.start(&["echo", "--json", &format!("{}/{topic}", SENSORS[sensor])]);
@@ -177,7 +180,8 @@ impl RealSpeedEnvironment {
                 if signal == KILL {
                     environment.killed_at = Some(Instant::now());
                 }
-                // A subscriber that has just started may not handle the signal yet.
+                // A subscriber that has just started may not have a handler for the signal yet, so the signal may end
+                // it.
                 assert!(matches!(outcome.exit_code, None | Some(0)), "{outcome}");
             }
         });
@@ -194,7 +198,7 @@ impl RealSpeedEnvironment {
         });
     }
 
-    /// Sends a control request. A hub that is down or stopped does not reply.
+    /// Sends a control request. The hub may not reply, because it may have ended or be stopped.
     fn send_request(&mut self, sensor: usize, verb: &str) {
         self.requests.push(self.env.start(&["control", SENSORS[sensor], verb, "--json"]));
     }

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::testkit::{Outcome, bytes_of, number};
 
-/// Telegrams at the end of a run that arrive without faults.
+/// Number of telegrams that must arrive at the end of a run, after the last fault.
 pub(super) const FAULTLESS_TELEGRAMS: usize = 60;
 
 /// Asserts that every byte that was read is counted in exactly one category.
@@ -17,15 +17,16 @@ pub(super) fn bytes_are_conserved(info: &Value) {
     assert_eq!(count("bytes_read"), known.iter().sum::<u64>(), "{info}");
 }
 
-/// Asserts that every published sample was received or counted as missed. Each run of the hub numbers from 0.
+/// Asserts that every published sample was received or counted as missed. In each run of the hub, `topic_seq` starts at
+/// 0.
 pub(super) fn all_samples_are_counted(received: &[Value], outcome: &Outcome) {
     let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
     let mut published = 0;
     for run in received.chunk_by(|one, next| one["boot"] == next["boot"]) {
         let numbers: Vec<u64> = run.iter().map(|line| number(line, "topic_seq")).collect();
         assert!(numbers.windows(2).all(|pair| pair[0] < pair[1]), "out of order: {numbers:?}");
-        // The subscriber receives every sample of a hub from the first one on. Only the first hub started before the
-        // subscriber.
+        // The subscriber receives the samples of each hub from the first one on. The first hub is an exception, because
+        // it started before the subscriber.
         let first = if published == 0 { numbers[0] } else { 0 };
         published += numbers[numbers.len() - 1] - first + 1;
     }
@@ -35,7 +36,7 @@ pub(super) fn all_samples_are_counted(received: &[Value], outcome: &Outcome) {
     assert_eq!(received.len() as u64 + number(summary, "missed"), published, "{summary}");
 }
 
-/// Asserts that the sensor sent each clean telegram, in this order and each at most once.
+/// Asserts that the sensor has sent each clean telegram that was received, in the same order and no more than once.
 pub(super) fn nothing_is_invented(received: &[Value], sent: &[Record]) {
     let mut rest = sent.iter();
     for line in received.iter().filter(|line| line["quality"] == "clean") {
@@ -44,7 +45,7 @@ pub(super) fn nothing_is_invented(received: &[Value], sent: &[Record]) {
     }
 }
 
-/// Asserts that, without faults, every telegram that reached the port intact is received or counted as missed.
+/// Asserts that, after the last fault, every telegram that reached the port intact was received or counted as missed.
 pub(super) fn nothing_is_lost(received: &[Value], sent: &[Record], outcome: &Outcome) {
     let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
     let calm = &received[received.len() - FAULTLESS_TELEGRAMS..];

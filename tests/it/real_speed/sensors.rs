@@ -1,5 +1,5 @@
-//! Simulated sensors in threads of the test. Events are applied to them while they run, and everything that they send
-//! is recorded.
+//! Simulated sensors in threads of the test. The test applies events to them while they run, and records everything
+//! that they send.
 
 use std::collections::{HashMap, VecDeque};
 use std::os::unix::net::UnixStream;
@@ -26,7 +26,7 @@ pub(super) struct Sensors {
     records: Receiver<Record>,
 }
 
-/// Next events of each port.
+/// Events that were not applied yet, by port.
 type Events = Arc<Mutex<HashMap<PathBuf, VecDeque<Event>>>>;
 
 impl Sensors {
@@ -46,7 +46,7 @@ impl Sensors {
                 &stopped,
                 |_| say_ready.send(()).expect("a waiting test"),
                 |record| {
-                    // The test drops the receiver once it has all records.
+                    // Sending fails if the test has dropped the receiver, because it then needs no more records.
                     let _ = record_sender.lock().expect("an intact mutex").send(record.clone());
                 },
                 |port| event_queue.lock().expect("an intact mutex").get_mut(port)?.pop_front(),

@@ -1,4 +1,5 @@
-//! Tests of the rules between crates: which crates and modules each may use, and how many dependencies it has.
+//! Tests of the rules between crates: which crates and modules each crate may use, and how many dependencies it may
+//! have.
 
 use super::{assert_rule, crates};
 
@@ -352,12 +353,13 @@ fn daemon_is_built_from_few_crates() {
     assert!(crates.len() <= 82, "{} crates: {crates:#?}", crates.len());
 }
 
-/// Besides shared memory, a client needs few crates: no verb, and no crate that only verbs need.
+/// In addition to the crates for shared memory, a client needs few crates. It needs neither the crate of the verbs nor
+/// a crate that only verbs need.
 #[test]
 fn client_is_built_from_few_crates() {
     let mut crates = crates::dependency_tree("scanhub-client", &[]);
-    // Cargo lists a crate outside of this workspace only if it has downloaded everything, including the bridge's
-    // crates.
+    // Compare with `scanhub-shm`, a crate of this workspace. Cargo lists the dependencies of a crate outside of the
+    // workspace only if it has downloaded all crates, including those of the bridge.
     let shared_memory = crates::dependency_tree("scanhub-shm", &[]);
     crates.retain(|name| !shared_memory.contains(name));
     eprintln!("client: {} crates besides those of shared memory", crates.len());
@@ -382,7 +384,7 @@ fn client_is_built_from_few_crates() {
 fn clients_that_do_not_record_need_no_c_compiler() {
     let in_c = |package: &str, features: &[&str]| {
         let crates = crates::dependency_tree(package, features);
-        // `linux-raw-sys` is the exception: it is the kernel's interface in Rust.
+        // `linux-raw-sys` ends with `-sys`, too, but it has no C code: it is the kernel's interface in Rust.
         let is_in_c = |name: &String| name.contains("-sys ") && !name.starts_with("linux-raw-sys");
         crates.into_iter().filter(is_in_c).collect::<Vec<_>>()
     };

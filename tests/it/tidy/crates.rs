@@ -1,11 +1,12 @@
-//! Rules for dependencies between crates, checked with the manifests and with the output of `cargo tree`.
+//! Rules for dependencies between crates. They are checked in the manifests, in the sources and in the output of `cargo
+//! tree`.
 
 use super::tree::{SourceTree, code, find};
 use crate::testkit::output;
 use std::collections::BTreeSet;
 use std::process::Command;
 
-/// Returns the crates of this project that a manifest names in `sections`, such as `dependencies`.
+/// Returns the crates of this project that a manifest lists in `sections`, such as `dependencies`.
 fn own_dependencies(manifest: &toml::Table, sections: &[&str]) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for section in sections {
@@ -23,7 +24,7 @@ pub(crate) fn schema_depends_on_no_other_crate(tree: &SourceTree) -> Vec<String>
     own_dependencies(&tree.members()["scanhub-schema"], &ALL).into_iter().collect()
 }
 
-/// Finds uses of the operating system in `schema`, whose payloads and names are the same on every machine.
+/// Finds uses of the operating system in the crate `schema`. Its payloads and names must be the same on every machine.
 pub(crate) fn schema_uses_no_operating_system(tree: &SourceTree) -> Vec<String> {
     const OF_STD: [&str; 7] = ["env", "fs", "net", "os", "process", "thread", "time"];
     const CRATES: [&str; 4] = ["memmap2", "nix", "rustix", "tempfile"];
@@ -31,7 +32,7 @@ pub(crate) fn schema_uses_no_operating_system(tree: &SourceTree) -> Vec<String> 
     let mut breaches = dependencies_beyond(tree, "scanhub-schema", &known);
     breaches.extend(missing_attributes(tree, "schema/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("schema/src/")) {
-        // Join the lines, because a list of names may have several.
+        // Join the lines, because a list of names in a `use` may have several lines.
         let text: String = code(text).map(|(_, line)| format!("{line} ")).collect();
         breaches.extend(
             text.split(';')
@@ -53,22 +54,22 @@ fn words(text: &str) -> impl Iterator<Item = &str> {
     text.split(|c: char| !c.is_alphanumeric() && c != '_')
 }
 
-/// Finds crates of this project that `shm` and `files` may not use.
+/// Finds crates of this project that `shm` and `files` use but may not use.
 pub(crate) fn shm_and_files_depend_only_on_schema(tree: &SourceTree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] =
         [("scanhub-files", &["scanhub-schema"]), ("scanhub-shm", &["scanhub-files", "scanhub-schema"])];
     forbidden_dependencies(tree, &known)
 }
 
-/// Returns the names of all crates that a manifest depends on, without those of tests.
+/// Returns the names of all crates in the dependencies of a manifest, except those that only tests need.
 fn built_dependencies(manifest: &toml::Table) -> impl Iterator<Item = &String> {
     let sections = ["dependencies", "build-dependencies"].into_iter();
     let tables = sections.filter_map(|section| manifest.get(section).and_then(toml::Value::as_table));
     tables.flat_map(toml::Table::keys)
 }
 
-/// Finds code in the drivers that does more than compute. Time and bytes are arguments, so that the same code runs on a
-/// port, on a recording and in virtual time.
+/// Finds code in the drivers that does more than compute. Drivers get time and bytes as arguments, so that the same
+/// code runs on a port, on a recording and in virtual time.
 pub(crate) fn drivers_only_compute(tree: &SourceTree) -> Vec<String> {
     let mut breaches = dependencies_beyond(tree, "scanhub-drivers", &["scanhub-schema"]);
     breaches.extend(missing_attributes(tree, "hub/drivers/src/lib.rs", &["#![forbid(unsafe_code)]"]));
@@ -76,7 +77,8 @@ pub(crate) fn drivers_only_compute(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds names of one family in the code of another, and names of families in the code that they share.
+/// Finds names of one scanner family in the code of another family, and names of families in the code that all families
+/// share.
 pub(crate) fn no_family_module_uses_another_family(tree: &SourceTree) -> Vec<String> {
     const FAMILIES: [&str; 3] = ["ld", "lms", "rplidar"];
     let mut breaches = Vec::new();
@@ -86,7 +88,8 @@ pub(crate) fn no_family_module_uses_another_family(tree: &SourceTree) -> Vec<Str
         for (path, text) in tree.sources().filter(|(path, _)| is_own(path)) {
             for (number, line) in code(text) {
                 let mut words = line.split(|c: char| !c.is_alphanumeric() && c != '_');
-                // The list of families gives access to any of them.
+                // A line that uses the list of the families is a violation, too, because the list gives access to every
+                // family.
                 let is_list = line.contains("families") || line.contains("crate::Session");
                 if is_list || words.any(|word| word != own && FAMILIES.contains(&word)) {
                     breaches.push(format!("{path}:{number}: {}", line.trim()));
@@ -97,8 +100,8 @@ pub(crate) fn no_family_module_uses_another_family(tree: &SourceTree) -> Vec<Str
     breaches
 }
 
-/// Finds uses of the RPLIDAR's driver in the simulator. If both used one description of the protocol, an error in it
-/// would stay unnoticed.
+/// Finds uses of the RPLIDAR's driver in the simulator. If driver and simulator used one description of the protocol,
+/// tests would not find an error in this description.
 pub(crate) fn rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<String> {
     let mut breaches = Vec::new();
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("hub/sim/src/")) {
@@ -107,7 +110,8 @@ pub(crate) fn rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<String>
         let naming = statements.filter(|statement| {
             let (_, path) = statement.split_once("scanhub_drivers").unwrap_or_default();
             let mut words = path.split(|c: char| !c.is_alphanumeric() && c != '_');
-            // With an alias or through the list of families, code could use the driver without its name.
+            // An alias and the list of the families are violations, too, because through them code could use the driver
+            // without its name.
             words.any(|word| ["rplidar", "scanner"].contains(&word))
                 || path.trim_start().starts_with("as ")
                 || path.starts_with("::{self")
@@ -117,7 +121,7 @@ pub(crate) fn rplidar_simulator_is_independent(tree: &SourceTree) -> Vec<String>
     breaches
 }
 
-/// Finds uses of the operating system in the code in `folder`: clocks, sockets, files, threads, processes, output.
+/// Finds uses of the operating system in the code in `folder`: clocks, sockets, files, threads, processes and output.
 fn forbidden_paths(tree: &SourceTree, folder: &str) -> Vec<String> {
     const HARMLESS: [&str; 4] = ["std::f32", "std::f64", "std::fmt", "std::ops"];
     let below = |path: &str| path.starts_with(folder);
@@ -139,14 +143,14 @@ pub(crate) fn eeprom_writer_only_computes(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds crates that are built with the requests that write the EEPROM, except the two that may be: the one that asks a
-/// person first, and the simulator. Dependencies of tests do not count.
+/// Finds crates that are built with the requests that write the EEPROM, except the two that are allowed: the crate that
+/// asks a person first, and the simulator. Dependencies of tests do not count.
 pub(crate) fn few_crates_can_write_the_eeprom(tree: &SourceTree) -> Vec<String> {
     const ALLOWED_CRATES: [&str; 2] = ["scanhub-tools", "scanhub-sim"];
     let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
     let others =
         tree.members().into_iter().chain([top]).filter(|(name, _)| !ALLOWED_CRATES.contains(&name.as_str()));
-    // The fuzzer's crate is a test.
+    // The crate of the fuzzer is a test, so it is not checked.
     let built = others.filter(|(name, _)| name != "scanhub-fuzz");
     built
         .filter(|(_, manifest)| built_dependencies(manifest).any(|name| name == "scanhub-lms-configure"))
@@ -160,8 +164,9 @@ fn missing_attributes(tree: &SourceTree, path: &str, attributes: &[&str]) -> Vec
     missing.map(|attribute| format!("{path} lacks {attribute}")).collect()
 }
 
-/// Finds code in `preprocess` that does more than compute, and allocations. The crate turns payloads into payloads,
-/// without telegrams, shared memory, the operating system and, after a processor was created, the heap.
+/// Finds code in `preprocess` that does more than compute, and allocations. The crate computes payloads from payloads.
+/// It may not use telegrams, shared memory or the operating system. After a processor was created, it may not use the
+/// heap.
 pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
     const HEAP: [&str; 12] = [
         "Vec<",
@@ -190,8 +195,8 @@ pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
         built_dependencies(manifest).filter(|name| *name != "scanhub-schema").cloned().collect();
     breaches.extend(missing_attributes(tree, "hub/preprocess/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let mut on_heap = find(tree, &HEAP, ours);
-    // A processor allocates its memory once, for the number of its sensor's beams or the cells of a map. Settings with
-    // lists of radii and sectors exist before that.
+    // A processor allocates its memory once, for the number of its sensor's beams or for the cells of a map. The lists
+    // in settings (radii and sectors) are allocated before that.
     on_heap.retain(|place| {
         let (file, line) = place.split_once(": ").unwrap_or_default();
         let is_setting = ["radii_mm: ", "body_mask: ", "pub radii_mm: ", "pub body_mask: "];
@@ -214,8 +219,8 @@ pub(crate) fn preprocess_only_computes(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds processors that use another one. The result of a processor must not depend on which others run. Motion may use
-/// its own instance of the line finder.
+/// Finds processors that use another processor. The result of a processor must not depend on which other processors
+/// run. Motion may use its own instance of the line finder.
 pub(crate) fn no_processor_uses_another(tree: &SourceTree) -> Vec<String> {
     const BELOW: &str = "hub/preprocess/src/";
     const PROCESSORS: [&str; 6] = ["zones", "marks", "lines", "motion", "background", "segments"];
@@ -234,12 +239,12 @@ pub(crate) fn no_processor_uses_another(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds crates of this project that the client library and the crates above it may not use. The client library uses
-/// only `schema` and `shm`. The verbs use it like any client, and `ros` for recordings. The network and the viewer use
-/// the verbs.
+/// Finds crates of this project that the client library, or a crate that uses it, depends on but may not use. The
+/// client library may use only `schema` and `shm`. The verbs may use the client library, as any client does, and `ros`
+/// for recordings. The network and the viewer may use the verbs.
 pub(crate) fn clients_depend_only_on_schema(tree: &SourceTree) -> Vec<String> {
     let known: [(&str, &[&str]); 4] = [
-        // The crate's own tests name it to enable its features.
+        // The client library lists itself as a dependency of its tests, to enable its features.
         ("scanhub-client", &["scanhub-client", "scanhub-schema", "scanhub-shm"]),
         (
             "scanhub-network",
@@ -264,7 +269,8 @@ pub(crate) fn clients_depend_only_on_schema(tree: &SourceTree) -> Vec<String> {
     forbidden_dependencies(tree, &known)
 }
 
-/// Finds modules of `shm` that use a module that does not precede them in the list at the start of the crate.
+/// Finds modules of `shm` that use a module below them in the list at the start of the crate. A module may use only
+/// modules above it in this list.
 pub(crate) fn modules_of_shm_form_layers(tree: &SourceTree) -> Vec<String> {
     const FOLDER: &str = "schema/shm/src/";
     let lib = tree.text("schema/shm/src/lib.rs");
@@ -280,7 +286,7 @@ pub(crate) fn modules_of_shm_form_layers(tree: &SourceTree) -> Vec<String> {
         };
         for (number, line) in code(text) {
             let mut used = line.split("crate::").skip(1).filter_map(|rest| words(rest).next());
-            // A name at the top of the crate may come from any module.
+            // A name directly below `crate::` may come from any module, so it is a violation.
             let is_below = |name: &str| name == module || layers[..layer].contains(&name);
             let is_above = !file.contains('/') && line.contains("super::");
             if is_above || used.any(|name| !is_below(name)) {
@@ -291,7 +297,7 @@ pub(crate) fn modules_of_shm_form_layers(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Returns the crates of this project that each crate in `known` names and may not.
+/// Returns the crates of this project that a crate in `known` depends on, but that its entry does not allow.
 fn forbidden_dependencies(tree: &SourceTree, known: &[(&str, &[&str])]) -> Vec<String> {
     let members = tree.members();
     let others = known.iter().flat_map(|(name, known)| {
@@ -303,8 +309,8 @@ fn forbidden_dependencies(tree: &SourceTree, known: &[(&str, &[&str])]) -> Vec<S
     others.collect()
 }
 
-/// Finds code in `ros` that does more than turn payloads into messages. It uses only `schema`, so that any crate can
-/// use it.
+/// Finds code in `ros` that does more than turn payloads into messages. The crate `ros` may use only `schema`, so that
+/// any crate can use `ros`.
 pub(crate) fn ros_depends_only_on_schema(tree: &SourceTree) -> Vec<String> {
     let mut breaches = dependencies_beyond(tree, "scanhub-ros", &["scanhub-schema", "sha2"]);
     breaches.extend(missing_attributes(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
@@ -313,8 +319,8 @@ pub(crate) fn ros_depends_only_on_schema(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds code in the network's `lan` module that does more than turn samples into datagrams and back. Bytes and time
-/// are arguments, so that a simulation runs the same code as sockets.
+/// Finds code in the network's `lan` module that does more than turn samples into datagrams and back. The module gets
+/// bytes and time as arguments, so that the same code runs in a simulation and with sockets.
 pub(crate) fn network_protocol_modules_only_compute(tree: &SourceTree) -> Vec<String> {
     const FOLDER: &str = "clients/network/src/lan";
     const OF_STD: [&str; 8] = ["array", "cmp", "collections", "fmt", "mem", "num", "ops", "time::Duration"];
@@ -324,13 +330,13 @@ pub(crate) fn network_protocol_modules_only_compute(tree: &SourceTree) -> Vec<St
     let others = built_dependencies(&manifest).filter(|name| !CRATES.contains(&name.as_str()));
     let others: Vec<_> = others.map(|name| name.replace('-', "_")).collect();
     for (path, text) in tree.sources().filter(|(path, _)| path.starts_with(FOLDER)) {
-        // Tests at the end of a file may use more.
+        // Leave out the unit tests at the end of a file, which may use more.
         let text = text.split("\n#[cfg(test)]\nmod tests {").next().unwrap_or_default();
         for (number, line) in code(text).filter(|_| !path.ends_with("/tests.rs")) {
             let mut of_std = line.split("std::").skip(1);
             let is_other_std = of_std.any(|rest| !OF_STD.iter().any(|known| rest.starts_with(known)));
             let is_other_crate = words(line).any(|word| others.iter().any(|other| other == word));
-            // The rest of this crate has clocks and sockets.
+            // Other modules of this crate have clocks and sockets.
             let is_outside = line.split("crate::").skip(1).any(|rest| !rest.starts_with("lan"));
             let is_output = ["extern crate", "println!", "eprint"].iter().any(|word| line.contains(word));
             if is_other_std || is_other_crate || is_outside || is_output {
@@ -341,8 +347,8 @@ pub(crate) fn network_protocol_modules_only_compute(tree: &SourceTree) -> Vec<St
     breaches
 }
 
-/// Finds code in the scene that does more than compute. Samples and times are arguments, so that a terminal and a
-/// browser show the same.
+/// Finds code in the viewer's module `scene` that does more than compute. The module gets samples and times as
+/// arguments, so that a terminal and a browser show the same picture.
 pub(crate) fn scene_only_computes(tree: &SourceTree) -> Vec<String> {
     const HARMLESS: [&str; 5] =
         ["std::collections", "std::fmt", "std::iter", "std::mem", "std::time::Duration"];
@@ -357,8 +363,8 @@ pub(crate) fn scene_only_computes(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds clocks, sockets, files and threads in the code that computes people and points. Time is an argument, so that a
-/// recording gives the same result as a live sensor.
+/// Finds clocks, sockets, files and threads in the modules `track` and `tilt`, which compute people and points. They
+/// get the time as an argument, so that a recording gives the same result as a live sensor.
 pub(crate) fn perception_only_computes(tree: &SourceTree) -> Vec<String> {
     const OUTSIDE: [&str; 17] = [
         "Instant",
@@ -404,9 +410,9 @@ pub(crate) fn perception_only_computes(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Finds code in the web server that could reach a hub, a file or a process, because the server handles input of
-/// strangers. It has lists of allowed crates and modules, so that it cannot subscribe through another module of its
-/// crate either.
+/// Finds code in the web server that could reach a hub, a file or a process. The server handles input of strangers, so
+/// it must not be able to do this. The rule lists the crates and the modules of its own crate that the server may use,
+/// so that it cannot subscribe through another module, either.
 pub(crate) fn viewer_server_depends_on_no_hub(tree: &SourceTree) -> Vec<String> {
     const CRATES: [&str; 9] = [
         "data-encoding",
@@ -437,7 +443,7 @@ pub(crate) fn viewer_server_depends_on_no_hub(tree: &SourceTree) -> Vec<String> 
     breaches
 }
 
-/// Name of a crate and the folder of its sources.
+/// Name of a crate, and folder of the crate's sources.
 struct Sources {
     name: &'static str,
     folder: &'static str,
@@ -445,8 +451,8 @@ struct Sources {
 
 const VIEWER: Sources = Sources { name: "scanhub-viewer", folder: "clients/viewer/src" };
 
-/// Finds uses of other modules of the crate in `module`, a file with a folder of the same name, except `modules`, and
-/// uses of the crate's dependencies except `crates`.
+/// Finds forbidden names in `module` of the crate `of`. A module is a file with a folder of the same name. It may use
+/// only `modules` of its crate, and only `crates` of the crate's dependencies.
 fn forbidden_names(
     tree: &SourceTree,
     of: &Sources,
@@ -464,7 +470,8 @@ fn forbidden_names(
     for (path, text) in tree.sources().filter(|(path, _)| *path == file || path.starts_with(&folder)) {
         for (number, line) in code(text) {
             let line = line.replace("pub(crate)", "pub");
-            // Every mention of the crate must be a path to an allowed module, not an alias and not a list.
+            // After each mention of the crate's name, a path to an allowed module must follow. An alias or a list is a
+            // violation.
             let is_allowed = |rest: &str| {
                 let next = rest.strip_prefix("::").and_then(|rest| words(rest).next()).unwrap_or_default();
                 next == module || modules.contains(&next)
@@ -481,15 +488,16 @@ fn forbidden_names(
     breaches
 }
 
-/// Returns the crates that `package` is built with, except `known`.
+/// Returns the crates in the dependencies of `package`, except those that only tests need and those in `known`.
 fn dependencies_beyond(tree: &SourceTree, package: &str, known: &[&str]) -> Vec<String> {
     let members = tree.members();
     let others = built_dependencies(&members[package]).filter(|name| !known.contains(&name.as_str()));
     others.map(|name| format!("{package} is built with {name}")).collect()
 }
 
-/// Removes the crates of the hub that the Python package is built with only for its feature `read`, which computes the
-/// samples of a replay. They stay if they are not optional, or if another feature names them.
+/// Removes crates of the hub from the manifest of the Python package. The package needs them only for its feature
+/// `read`, which computes the samples of a replay. A crate is not removed if it is not optional, or if another feature
+/// names it.
 fn remove_feature_read(manifest: &mut toml::Table) {
     const OF_READ: [&str; 3] = ["scanhub-config", "scanhub-daemon", "scanhub-recording"];
     let features = manifest.get("features").and_then(toml::Value::as_table).cloned().unwrap_or_default();
@@ -511,8 +519,8 @@ fn remove_feature_read(manifest: &mut toml::Table) {
     }
 }
 
-/// Finds dependencies of the libraries for C and Python besides the client library, and crates that are built with
-/// these libraries.
+/// Finds dependencies that the libraries for C and Python have in addition to the client library. Also finds crates
+/// that depend on these libraries.
 pub(crate) fn c_and_python_libraries_depend_only_on_clients(tree: &SourceTree) -> Vec<String> {
     let mut members = tree.members();
     members.entry("scanhub-python".to_owned()).and_modify(remove_feature_read);
@@ -589,10 +597,11 @@ pub(crate) fn only_the_program_depends_on_all_crates(tree: &SourceTree) -> Vec<S
     breaches
 }
 
-/// Crate of tests that runs all of them in one thread and is part of no program.
+/// Crate of tests that runs hub, clients and simulators in one thread. It may depend on all of them, because no program
+/// contains it.
 const WORLD: &str = "scanhub-world";
 
-/// Finds crates that `cargo test` at the top would not test.
+/// Finds crates that `cargo test` in the project's root would not test.
 pub(crate) fn cargo_test_at_the_top_tests_every_crate(tree: &SourceTree) -> Vec<String> {
     let manifest = tree.manifest("Cargo.toml");
     let list = |key: &str| -> BTreeSet<String> {
@@ -601,7 +610,7 @@ pub(crate) fn cargo_test_at_the_top_tests_every_crate(tree: &SourceTree) -> Vec<
     };
     let mut expected = list("members");
     expected.insert(".".to_owned());
-    // The bridge needs Zenoh and the package needs Python, so they are not default members.
+    // The bridge needs Zenoh and the Python package needs Python, so neither is a default member of the workspace.
     let apart = ["clients/bridge", "clients/python"].map(|member| expected.take(member));
     let mut breaches: Vec<String> = expected
         .difference(&list("default-members"))
@@ -609,7 +618,7 @@ pub(crate) fn cargo_test_at_the_top_tests_every_crate(tree: &SourceTree) -> Vec<
         .collect();
     if apart.iter().all(Option::is_some) {
         breaches.extend(missing_attributes(tree, ".ci/run", &["step cargo test --package scanhub-bridge"]));
-        // The tests of the package use the result of this script.
+        // The tests of the Python package use the result of this script.
         if !tree.text(".ci/run").contains("step clients/python/build.sh") {
             breaches.push(".ci/run does not build clients/python".to_owned());
         }
@@ -633,7 +642,8 @@ pub(crate) fn every_crate_uses_the_workspace_lints(tree: &SourceTree) -> Vec<Str
     breaches
 }
 
-/// Checks that the version of `iceoryx2` is pinned: a hub and clients with different versions cannot share memory.
+/// Checks that the manifest pins the exact version of `iceoryx2`, because a hub and clients with different versions
+/// cannot share memory.
 pub(crate) fn shared_memory_library_version_is_pinned(tree: &SourceTree) -> Vec<String> {
     let manifest = tree.manifest("Cargo.toml");
     let version = manifest["workspace"]["dependencies"]["iceoryx2"]["version"].as_str().unwrap_or_default();
@@ -649,7 +659,7 @@ pub(crate) fn dependency_tree(package: &str, features: &[&str]) -> BTreeSet<Stri
     let output = output(cargo).expect("cargo can be called");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let listing = String::from_utf8(output.stdout).expect("names are text");
-    // Lines are "name v1.2.3 (path or *)". Two versions of a crate count as two.
+    // A line has the form "name v1.2.3 (path or *)". Two versions of a crate count as two crates.
     let names: BTreeSet<String> =
         listing.lines().map(|line| line.split(' ').take(2).collect::<Vec<_>>().join(" ")).collect();
     assert!(names.iter().any(|name| name.starts_with(package)), "{package} is built from {names:?}");

@@ -1,5 +1,5 @@
-//! Tests of the rules for a scanner's EEPROM: which code may name or encode a request that writes it, and which may
-//! give consent to it.
+//! Tests of the rules for a scanner's EEPROM: which code may name or encode a request that writes the EEPROM, and which
+//! code may give consent to this request.
 
 use super::{assert_rule, crates, sources};
 

@@ -1,18 +1,20 @@
-//! Rule for the number of files that name a family of scanners. A new family is one module of the drivers, one of the
-//! simulator, and an entry in each of these files.
+//! Rule for the number of files that name a family of scanners. A new family needs one module of the drivers, one
+//! module of the simulator, and an entry in each file that this rule lists.
 
 use super::assert_rule;
 use super::tree::{SourceTree, code};
 
-/// Files that may name a family, besides its driver, its simulator, tests, benches and pages, each with the reason.
+/// Files that may name a family, each with the reason. The driver and the simulator of the family, tests, benches and
+/// pages may name it, too.
 const ALLOWED_FILES: [&str; 9] = [
-    // The modules of the drivers.
+    // The list of the modules of the drivers.
     "hub/drivers/src/lib.rs",
     // The list of the families.
     "hub/drivers/src/families.rs",
-    // The configuration that users start from, with a section for each.
+    // The configuration that users start from, with a section for each family.
     "hub/config/src/default.toml",
-    // Number and name, in each language that reads scans, and the properties of its packets.
+    // Number and name of each family, in each language in which programs read scans, and the properties of the family's
+    // packets.
     "schema/src/family.rs",
     "schema/src/file/layout.txt",
     "clients/c/include/scanhub/attach.h",
@@ -21,29 +23,29 @@ const ALLOWED_FILES: [&str; 9] = [
     "clients/wireshark/scanhub.lua",
 ];
 
-/// Other words for a family besides the name of its module.
+/// Names of makers and models, which also stand for a family.
 const FAMILY_WORDS: [(&str, &[&str]); 2] = [
     ("ld", &["ldrobot", "ld06", "ld19", "stl19p", "stl27l", "ld14p"]),
     ("rplidar", &["slamtec", "a1m8", "a2m8", "a2m12"]),
 ];
 
-/// Folders with sources of the hub, its configuration, its tools and the program, besides the files directly in `hub/`.
-/// They name no family, not even the LMS. Recordings and clients name the LMS, because its telegrams are a format of
-/// files and topics.
+/// Folders with sources of the hub, its configuration, its tools and the program. These files, and those directly in
+/// `hub/`, may name no family, not even the LMS. Recordings and clients may name the LMS, because its telegrams are a
+/// format of files and topics.
 const HUB_FOLDERS: [&str; 5] = ["hub/config/", "hub/daemon/", "hub/tools/", "hub/cli/", "hub/demo/"];
 
-/// Sources of the hub that name the LMS, each with the reason.
+/// Sources of the hub that may name the LMS, each with the reason.
 const MAY_NAME_LMS: [&str; 4] = [
-    // Changes settings in the EEPROM, which only an LMS has.
+    // Changes settings in the EEPROM. Only an LMS has such settings.
     "hub/tools/src/configure",
-    // Explains telegrams byte by byte, which only an LMS sends.
+    // Explains telegrams byte by byte. Only an LMS sends telegrams.
     "hub/tools/src/telegram",
     // Describes and checks the settings that only an LMS reports on request.
     "hub/tools/src/probe/description.rs",
     "hub/tools/src/doctor/sensor.rs",
 ];
 
-/// Returns an error for each source of the hub that names the LMS and may not.
+/// Returns an error for each source of the hub that names the LMS but may not.
 fn hub_names_no_lms(tree: &SourceTree) -> Vec<String> {
     let others =
         hub_sources_with_lms(tree).filter(|path| !MAY_NAME_LMS.iter().any(|may| path.starts_with(may)));
@@ -64,7 +66,7 @@ fn hub_sources_with_lms(tree: &SourceTree) -> impl Iterator<Item = &str> {
     sources.filter(move |(_, text)| code(text).any(|(_, line)| names_it(line))).map(|(path, _)| path)
 }
 
-/// Returns an error for each file that names a family and may not.
+/// Returns an error for each file that names a family but may not.
 fn few_files_name_a_family(tree: &SourceTree) -> Vec<String> {
     let named = FAMILY_WORDS.iter().flat_map(|(name, words)| files_with_words(tree, name, words));
     let others = named.filter(|path| !ALLOWED_FILES.contains(path));
@@ -82,7 +84,7 @@ fn files_with_words<'a>(tree: &'a SourceTree, name: &str, words: &[&str]) -> Vec
             || path.ends_with(".lock")
     };
     let names_it = |line: &str| {
-        // An example in a help text may name any family.
+        // The examples in help texts may name any family.
         let is_example = line.trim_start().starts_with("scanhub ");
         let line = line.replace("ls -ld", "").to_lowercase();
         let mut named = line.split(|c: char| !c.is_alphanumeric());

@@ -1,10 +1,11 @@
-//! Rules for the number of files that name a key of the configuration (the file with its field and those that use it).
-//! Only the pipeline and the files of `hub/preprocess` may name a processor.
+//! Rule for the number of files that name a key of the configuration. These are the file with the key's field, and the
+//! files that use it. Only the pipeline and the files of `hub/preprocess` may name a processor.
 
 use super::assert_rule;
 use super::tree::{SourceTree, code};
 
-/// Keys of sections and of scanners that are checked, as beginnings of names that nothing else has.
+/// Keys that are checked, for all keys of sections and of scanners. Each entry is the beginning of the key's name,
+/// which no other name contains.
 const CHECKED_KEYS: [&str; 7] = [
     "max_turn",
     "min_overlap",
@@ -18,7 +19,7 @@ const CHECKED_KEYS: [&str; 7] = [
 /// Maximum number of product files that name a key.
 const MAX_FILES: usize = 3;
 
-/// Returns an error for each key that too many files name, or none.
+/// Returns an error for each key that more than [`MAX_FILES`] files name, and for each key that no file names.
 fn few_files_name_a_key(tree: &SourceTree) -> Vec<String> {
     let is_product = |path: &str| {
         ["hub/", "clients/", "schema/"].iter().any(|top| path.starts_with(top)) && !path.contains("tests")
@@ -48,7 +49,7 @@ fn key_is_named_in_few_files() {
     });
 }
 
-/// Types of processors. `hub/preprocess` has a file for each, and its own rules.
+/// Types of processors. `hub/preprocess` has a file for each of them, and other rules apply there.
 const PROCESSORS: [&str; 4] = ["MarkDetector", "LineFinder", "MotionEstimator", "Segmenter"];
 
 /// The file that calls all processors.

@@ -1,35 +1,35 @@
-//! Rule for the number of files that name a topic. It checks topic `motion` for all: the hub publishes it for each
-//! link, and clients only print it.
+//! Rule for the number of files that name a topic. It checks only topic `motion`, as an example of a topic that the hub
+//! publishes for each link and that clients only print.
 
 use super::assert_rule;
 use super::tree::{SourceTree, code};
 
-/// Files that a topic touches, each with the reason. `docs/design.md` has the same list.
+/// Files that have to be changed for a new topic, each with the reason. `docs/design.md` has the same list.
 const TOPIC_FILES: [&str; 6] = [
-    // Its row in the table of topics.
+    // The row of the topic in the table of topics.
     "schema/src/topic.rs",
-    // Its payload.
+    // The payload of the topic.
     "schema/src/motion.rs",
     // The module with the payload.
     "schema/src/lib.rs",
-    // Fills and sends its samples.
+    // Fills and sends the samples of the topic.
     "hub/daemon/src/link_output.rs",
-    // Its lines as JSON and as text.
+    // Print the lines of the topic, as JSON and as text.
     "clients/verbs/src/json/results.rs",
     "clients/verbs/src/text.rs",
 ];
 
-/// Other files that name this topic for a reason that does not apply to every topic.
+/// Other files that name `motion`, for reasons that do not apply to every topic.
 const OTHER_FILES: [&str; 3] = [
-    // The processor that computes it. `keys.rs` counts the files of a processor.
+    // The processor that computes the samples of the topic. `keys.rs` checks which files name a processor.
     "hub/preprocess/",
     "hub/daemon/src/pipeline.rs",
-    // A gateway sends it only on request.
+    // A gateway sends this topic only on request.
     "clients/network/src/forward/selection.rs",
 ];
 
-/// Returns the product files that name the topic, except pages and generated files. The Python package reads shared
-/// memory on its own.
+/// Returns the product files that name the topic, except pages, generated files and the Python package. The Python
+/// package has its own code for each topic.
 fn files_with_topic(tree: &SourceTree) -> Vec<&str> {
     const EXCLUDED_FILES: [&str; 3] =
         ["clients/python/", "schema/src/file/layout.txt", "hub/sim/src/rplidar.rs"];
@@ -46,7 +46,7 @@ fn files_with_topic(tree: &SourceTree) -> Vec<&str> {
     sources.filter(|(_, text)| code(text).any(|(_, line)| names_it(line))).map(|(path, _)| path).collect()
 }
 
-/// Returns an error for each file that names the topic and may not.
+/// Returns an error for each file that names the topic but may not.
 fn few_files_name_a_topic(tree: &SourceTree) -> Vec<String> {
     let may =
         |path: &str| TOPIC_FILES.contains(&path) || OTHER_FILES.iter().any(|also| path.starts_with(also));
@@ -55,7 +55,7 @@ fn few_files_name_a_topic(tree: &SourceTree) -> Vec<String> {
     others.map(|path| format!("{path} names topic motion, but {ask}")).collect()
 }
 
-/// Returns an error for each file of the list that `docs/design.md` does not mention under "A topic".
+/// Returns an error for each file in the list of this rule that `docs/design.md` does not mention under "A topic".
 fn the_page_lists_the_files_of_a_topic(tree: &SourceTree) -> Vec<String> {
     let page = tree.text("docs/design.md");
     let entry = page.split("- **A topic**").nth(1).unwrap_or_default();

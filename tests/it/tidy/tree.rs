@@ -1,10 +1,10 @@
-//! The files of the project as text, and functions that change them in memory, so that a test can prove that a rule
-//! finds violations.
+//! The files of the project as text, and functions that change copies of them in memory. With these copies, a test can
+//! prove that a rule finds violations.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Files by their path relative to the top, with `/` as separator.
+/// Texts of files, by the path of the file relative to the project's root, with `/` as separator.
 #[derive(Clone)]
 pub(crate) struct SourceTree {
     files: BTreeMap<String, String>,
@@ -14,7 +14,7 @@ pub(crate) struct SourceTree {
 pub(crate) type Rule = fn(&SourceTree) -> Vec<String>;
 
 impl SourceTree {
-    /// Loads all text files that are not hidden or built: sources, manifests, pages, units, scripts.
+    /// Loads all text files, except hidden and built ones: sources, manifests, pages, units and scripts.
     pub(crate) fn load() -> SourceTree {
         let mut tree = SourceTree { files: BTreeMap::new() };
         tree.add(Path::new(env!("CARGO_MANIFEST_DIR")), "");
@@ -58,7 +58,7 @@ impl SourceTree {
             .map(|(path, text)| (path.as_str(), text.as_str()))
     }
 
-    /// Returns all Rust files except those of these rules, which contain violations on purpose.
+    /// Returns all Rust files except those of the rules, which contain violations on purpose.
     pub(crate) fn sources(&self) -> impl Iterator<Item = (&str, &str)> {
         self.files(".rs").filter(|(path, _)| !path.starts_with("tests/it/tidy"))
     }
@@ -68,7 +68,7 @@ impl SourceTree {
         self.text(path).parse().unwrap_or_else(|error| panic!("{path}: {error}"))
     }
 
-    /// Returns the manifests of the crates below the top, by the name of the crate.
+    /// Returns the manifests of the crates below the project's root, by the name of the crate.
     pub(crate) fn members(&self) -> BTreeMap<String, toml::Table> {
         self.files("/Cargo.toml")
             .filter_map(|(path, _)| {

@@ -1,15 +1,15 @@
-//! Rule for the number of files that name a verb. It checks verb `hz` for all.
+//! Rule for the number of files that name a verb. It checks only verb `hz`, as an example.
 
 use super::assert_rule;
 use super::tree::{SourceTree, code};
 
-/// Files that a verb touches, each with the reason. `docs/design.md` has the same list.
+/// Files that have to be changed for a new verb, each with the reason. `docs/design.md` has the same list.
 const VERB_FILES: [&str; 3] = [
-    // Its arguments with help and examples, its run, and its text and JSON.
+    // The verb itself: its arguments with help and examples, its `run`, and its text and JSON.
     "clients/verbs/src/hz.rs",
-    // Declares its module.
+    // Declares the module of the verb.
     "clients/verbs/src/lib.rs",
-    // Its row in the table of verbs.
+    // The row of the verb in the table of verbs.
     "hub/cli.rs",
 ];
 
@@ -27,14 +27,14 @@ fn files_with_verb(tree: &SourceTree) -> Vec<&str> {
     sources.filter(|(_, text)| code(text).any(|(_, line)| names_it(line))).map(|(path, _)| path).collect()
 }
 
-/// Returns an error for each file that names the verb and may not.
+/// Returns an error for each file that names the verb but may not.
 fn few_files_name_a_verb(tree: &SourceTree) -> Vec<String> {
     let others = files_with_verb(tree).into_iter().filter(|path| !VERB_FILES.contains(path));
     let ask = "a verb changes no other file: its `run` takes the whole `Context`";
     others.map(|path| format!("{path} names verb hz, but {ask}")).collect()
 }
 
-/// Returns an error for each file of the list that `docs/design.md` does not mention under "A verb".
+/// Returns an error for each file in the list of this rule that `docs/design.md` does not mention under "A verb".
 fn the_page_lists_the_files_of_a_verb(tree: &SourceTree) -> Vec<String> {
     let page = tree.text("docs/design.md");
     let entry = page.split("- **A verb**").nth(1).unwrap_or_default();

@@ -1,10 +1,11 @@
-//! Rule for words that are never right in comments, pages, help and messages: archaic words, missing actors, doc
-//! comments without a subject, British spelling, and words that the glossary replaced.
+//! Rule for words that are never right in comments, pages, help and messages. These are archaic words, words that hide
+//! the actor, British spelling, and words that the glossary has replaced. A doc comment must not start with a word such
+//! as *what*, either.
 
 use super::assert_rule;
 use super::tree::SourceTree;
 
-/// Languages of the files that are checked, by the ending of the path.
+/// Endings of the paths of the files that are checked, each with the language of these files.
 const LANGUAGES: [(&str, Language); 19] = [
     (".md", Language::Page),
     (".html", Language::Page),
@@ -29,38 +30,38 @@ const LANGUAGES: [(&str, Language); 19] = [
 
 #[derive(Clone, Copy, PartialEq)]
 enum Language {
-    /// Prose except for code blocks and quoted code.
+    /// A page, in which everything is prose except blocks of code and quoted code.
     Page,
     Rust,
     Script,
     C,
     Python,
     Lua,
-    /// A file in which only comments are prose. They begin with `#`.
+    /// A file in which only comments are prose. Comments begin with `#`.
     Config,
 }
 
-/// Files that contain such words on purpose: the list of replaced words, and this rule.
+/// Files that contain these words on purpose: the glossary, which lists replaced words, and this rule.
 const EXEMPT_FILES: [&str; 2] = ["docs/glossary.md", "tests/it/tidy/words.rs"];
 
 /// Phrases that are allowed, each with the reason.
 const ALLOWED_PHRASES: [&str; 7] = [
-    // Key of a world file.
+    // A key of a world file.
     "centre = [",
-    // Example of a flag that does not exist: the test is about the error.
+    // An example of a flag that does not exist, in a test of the error for it.
     "--colour",
-    // Name of a flag that was renamed. The error for it names the new one.
+    // The former name of a flag. The error for this name has the new name.
     "--consumers",
-    // Name of a page.
+    // The name of a page.
     "first-consumer",
-    // Name of a value in JSON and in client libraries, and its row in a generated table.
+    // The name of a value in JSON and in client libraries, and the row of this value in a generated table.
     "\"neighbour\"",
     "2 neighbour |",
-    // Former name of a key. The error for it names the new one.
+    // The former name of a key. The error for this name has the new name.
     "consumers = 40",
 ];
 
-/// Words and phrases that are never right, with what to write instead.
+/// Words and phrases that are never right. Each list of words has the advice what to write instead.
 const NEVER: [(&[&str], &str); 6] = [
     (
         &[
@@ -219,7 +220,8 @@ const NEVER: [(&[&str], &str); 6] = [
     ),
 ];
 
-/// Beginnings of British words, and endings of such words that American English writes with a `z`.
+/// Parts of British words, and beginnings of words that American English writes with a `z`. A word with such a
+/// beginning is British if one of [`S_ENDINGS`] follows.
 const BRITISH_STEMS: [&str; 6] = ["neighbour", "colour", "behaviour", "favour", "honour", "labour"];
 const S_STEMS: [&str; 18] = [
     "recognis",
@@ -243,7 +245,7 @@ const S_STEMS: [&str; 18] = [
 ];
 const S_ENDINGS: [&str; 7] = ["e", "es", "ed", "er", "ing", "ation", "ations"];
 
-/// First words of a comment that has no subject.
+/// If a comment begins with one of these words, it has no subject.
 const HEADLESS: [&str; 14] = [
     "what",
     "who",
@@ -261,11 +263,11 @@ const HEADLESS: [&str; 14] = [
     "from whom",
 ];
 
-/// A piece of prose: the words of a comment, paragraph or string, each with the number of its line.
+/// A piece of prose: the words of a comment, paragraph or string, each with the number of the line in which it is.
 struct Piece {
     is_comment: bool,
     words: Vec<(usize, String)>,
-    /// Whether the first sentence is a question.
+    /// Whether the first sentence is a question, which may begin with such a word.
     is_question: bool,
 }
 
@@ -283,7 +285,7 @@ fn words_are_of_today(tree: &SourceTree) -> Vec<String> {
     breaches
 }
 
-/// Returns the number of the line and a description of each mistake in `piece`.
+/// Returns each mistake in `piece`, as the number of its line and a description.
 fn wrong_words(piece: &Piece) -> impl Iterator<Item = (usize, String)> {
     let words = &piece.words;
     let begins_at = |at: usize, phrase: &str| {
@@ -314,7 +316,7 @@ fn wrong_words(piece: &Piece) -> impl Iterator<Item = (usize, String)> {
     wrong.into_iter()
 }
 
-/// Splits `text` into pieces of prose. Code, quoted code and strings without a space are left out.
+/// Splits `text` into pieces of prose. Leaves out code, quoted code, and strings that contain no space.
 fn pieces(text: &str, language: Language) -> Vec<Piece> {
     let mut found: Vec<(usize, Kind, String)> = Vec::new();
     match language {
@@ -346,7 +348,7 @@ fn pieces(text: &str, language: Language) -> Vec<Piece> {
     pieces
 }
 
-/// Returns `text` without quoted code, and without the names in braces of a message.
+/// Returns `text` without quoted code. If it is a message, the names in braces are removed, too.
 fn without_code(text: &str, kind: Kind) -> String {
     let text: Vec<&str> = text.split('`').step_by(2).collect();
     let text = text.join(" x ");
@@ -440,7 +442,7 @@ fn string(text: &str, before: Option<char>, language: Language) -> Option<(&str,
     let is_name = before.is_some_and(|c| c.is_alphanumeric() || c == '_');
     if language == Language::Rust {
         if let Some(rest) = text.strip_prefix('\'') {
-            // A character or a lifetime.
+            // The quote starts a character or a lifetime.
             let after = rest.chars().next()?;
             let close = match after {
                 '\\' => {
@@ -514,7 +516,7 @@ fn forbidden_words_are_not_used() {
     });
 }
 
-/// Lines of files of each kind with a mistake in a comment or a message.
+/// Files with a mistake in a comment or a message, for each kind of file. The rule must find each mistake.
 const PLANTED: [(&str, &str); 26] = [
     ("schema/src/planted.rs", "//! A file.\n// Begins anew.\n"),
     ("schema/src/planted.rs", "//! A file that refuses\n//! to know sockets.\n"),
