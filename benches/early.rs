@@ -1,8 +1,9 @@
-//! Gain and cost of early warnings from partial scans. Posts appear in the smaller zone, one after the other, at
-//! positions all over the scan. The gain is the time from the warning until the hub sends the zones of the same scan,
-//! for an LMS and for rotating scanners. On a line that loses bytes in bursts, the hub withdraws some warnings, and the
-//! bench counts them. The cost is the CPU time of the hub with a subscriber to `early`, compared with a subscriber to
-//! `zones` alone. The bench does not measure how much earlier a robot stops, because its brakes are slower.
+//! Gain and cost of early warnings from partial scans, for an LMS and for rotating scanners. Posts appear in the
+//! smaller zone, one after the other, at positions all over the scan. The gain is the time from the warning until the
+//! hub sends the zones of the same scan. On a line that loses bytes in bursts, the hub withdraws some warnings, and the
+//! bench counts the withdrawn warnings. The cost is the additional CPU time of the hub if `early` has a subscriber, and
+//! not only `zones`. The bench does not measure how much earlier a robot stops, because a robot's brakes are slower
+//! than a scan.
 
 mod support;
 
@@ -27,15 +28,15 @@ fn main() -> ExitCode {
     support::main(measure)
 }
 
-/// A scanner with the names of its figures.
+/// A scanner, with the names of its figures.
 struct Scanner {
     name: &'static str,
     flags: &'static [&'static str],
     keys: &'static [&'static str],
-    /// Directions of the scanner's posts: the first direction, and the angle that all posts cover. In radians,
-    /// counterclockwise from the right.
+    /// Directions of the posts around this scanner: the direction of the first post, and the angle that all posts
+    /// together cover. Both are in radians, and directions are counterclockwise from the right.
     view: (f64, f64),
-    /// Time for which each post exists; and time from the start of one post to the start of the next. In seconds.
+    /// Time for which each post exists, and time from the appearance of one post to that of the next, both in seconds.
     post_duration_s: f64,
     post_interval_s: f64,
     warning_figures: [&'static str; 4],
@@ -130,10 +131,10 @@ fn measure(options: &Options) -> Outcome<()> {
 /// Results of a scanner, one value per pair of runs.
 #[derive(Default)]
 struct WarningFigures {
-    /// Medians of the gain in ms, by part of the scan.
+    /// Medians of the gain in milliseconds, by the part of the scan in which the post is.
     gains: BTreeMap<usize, Vec<f64>>,
-    /// Number of warnings and number of withdrawn warnings on a clean line; then both numbers on a line that loses
-    /// bytes.
+    /// Number of warnings and number of withdrawn warnings on a clean line, followed by the same two numbers on a line
+    /// that loses bytes.
     counts: [Vec<f64>; 4],
     /// CPU time of the hub in percent, with a subscriber to `early` and without one.
     cpu_percents: [Vec<f64>; 2],
@@ -246,7 +247,8 @@ impl Scanner {
 struct WarningRun {
     warnings: usize,
     withdrawn: usize,
-    /// Times in ms from the first warning of a scan to the zones of this scan, by sixth of the scan.
+    /// Times in milliseconds from the first warning of a scan to the zones of the same scan, by the sixth of the scan
+    /// in which the warning was sent.
     gains_ms: BTreeMap<usize, Vec<f64>>,
 }
 
@@ -262,7 +264,7 @@ impl WarningRun {
                 continue;
             }
             run.warnings += 1;
-            // During a revolution, a warning has the `seq` of a packet, so the next zones belong to it.
+            // A warning during a revolution has the `seq` of a packet, so the next zones are those of the same scan.
             if let Some((_, zones_ns)) = sent.range(header.seq..).next() {
                 let gain_ms = (*zones_ns as f64 - sent_ns(header) as f64) / 1e6;
                 let place = usize::from(early.beam) * SCAN_PARTS / beams;
@@ -281,7 +283,8 @@ impl WarningRun {
     }
 }
 
-/// Receives a topic for `span` from its first sample on. Returns each header together with the result of `take`.
+/// Receives a topic for `span` from its first sample on. Returns the header of each sample together with the result of
+/// `take` for the sample.
 fn receive<P: Payload, T>(
     environment: &BenchEnvironment,
     span: Duration,
@@ -300,7 +303,7 @@ fn receive<P: Payload, T>(
     Ok(received)
 }
 
-/// Returns the time at which the hub sent a sample, on the clock of stamps.
+/// Returns the time at which the hub sent a sample, in nanoseconds of the clock of stamps.
 fn sent_ns(header: &Header) -> u64 {
     header.stamp_last_ns + header.hub_time_ns().unwrap_or(0)
 }
@@ -308,5 +311,5 @@ fn sent_ns(header: &Header) -> u64 {
 const POST_COUNT: usize = 200;
 /// Number of parts into which a scan is divided.
 const SCAN_PARTS: usize = 6;
-/// Time after which the sensor streams and the hub has estimated its timing.
+/// Time after which the sensor streams and the hub has estimated the timing of the line.
 const SETTLE_TIME: Duration = Duration::from_secs(4);

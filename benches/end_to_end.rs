@@ -1,7 +1,8 @@
-//! Transport and start. For the transport, 2 x 1500 telegrams pass from ptys at 500 kBd through the running hub to a
-//! process per sensor. The bench compares them with the log of the simulator: everything must arrive in order, bit for
-//! bit and in time. The start is measured with an idle sensor at each of the four rates. The baseline is a minimal host
-//! that has the rate from the beginning. The tests of the framer cover damaged bytes.
+//! Transport of telegrams through the hub, and start of the hub. For the transport, 1500 telegrams of each of two
+//! sensors pass from ptys at 500 kBd through the hub to one process per sensor. The bench compares the received
+//! telegrams with the log of the simulator: all of them must arrive in order, bit for bit and in time. The start is
+//! measured with an idle sensor at each of the four rates. The baseline of the start is a minimal host that has the
+//! right rate from the beginning. This bench sends no damaged bytes. The tests of the framer cover them.
 //!
 //! At 9,600 baud, the baseline requests the status, which takes 0.17 s at this rate. The hub first waits for a running
 //! stream, and then tries one rate after the other, 19,200 baud last.
@@ -37,7 +38,7 @@ fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
         subscriber.wait_for_line("attaching", STEP_TIMEOUT)?;
         Ok(subscriber)
     };
-    // The sensors start last, because a subscriber can detect every loss only if it attaches before they start.
+    // Start the sensors last. A subscriber can detect every loss only if it attaches before the sensors start.
     let subscribers: Vec<Child> = SENSORS.iter().map(start).collect::<Outcome<_>>()?;
     let hub = environment.start_hub(&SENSORS)?;
     hub.wait_for_line("ready", STEP_TIMEOUT)?;
@@ -61,7 +62,8 @@ fn measure_transport(count: usize) -> Outcome<Vec<Figure>> {
         let sent = known.iter().max().map_or(0, |last| last + 1);
         let values = [
             hashes.len() as f64,
-            // Telegrams that were sent before the last received telegram and did not arrive.
+            // Number of telegrams that did not arrive, although the sensor sent them before the last telegram that was
+            // received.
             (sent - known.len()) as f64,
             places.iter().filter(|place| place.is_none()).count() as f64,
             known.windows(2).filter(|pair| pair[0] >= pair[1]).count() as f64,
@@ -100,7 +102,8 @@ fn measure_starts(
     Ok(figures)
 }
 
-/// Returns the times from exec of the hub to the state `streaming` and to the first scan at a subscriber, in ms.
+/// Starts a hub. Returns two times in milliseconds: from exec of the hub to the state `streaming`, and from exec to the
+/// first scan at a subscriber.
 fn start_hub(rate: u32) -> Outcome<[f64; 2]> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate(&ONE_SENSOR, rate)?;
@@ -115,7 +118,7 @@ fn start_hub(rate: u32) -> Outcome<[f64; 2]> {
     Ok([streaming, first])
 }
 
-/// Returns the same times for a host that has the rate from the beginning.
+/// Returns the same two times for a host that has the right rate from the beginning.
 fn start_baseline(rate: u32) -> Outcome<[f64; 2]> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate(&ONE_SENSOR, rate)?;
@@ -125,7 +128,7 @@ fn start_baseline(rate: u32) -> Outcome<[f64; 2]> {
     Ok([streaming, since(host.wait_for_line("scan", STEP_TIMEOUT)?.number(1)?)])
 }
 
-/// Rate at power-on, and the names of its figures.
+/// Rates at power-on, each with the names of its figures.
 const START_CASES: [(u32, &str, &str); 4] = [
     (500_000, "500000 Bd to streaming", "500000 Bd to first scan"),
     (38_400, "38400 Bd to streaming", "38400 Bd to first scan"),

@@ -1,6 +1,6 @@
 //! The four pictures of Fig. 8 of the paper, from the simulated room with the same name. `cargo bench --bench fig8 --
-//! --draw DIR` writes the pictures as SVG. `-- --method paper` uses the paper's method, and `-- --seed 3` draws other
-//! random numbers. Without `--draw`, the bench only prints what the pictures would show.
+//! --draw DIR` writes the pictures as SVG. `-- --method paper` uses the method of the paper, and `-- --seed 3` changes
+//! the random numbers of the simulation. Without `--draw`, the bench only prints what the pictures would show.
 
 #[path = "../tests/testkit/decoded_scan.rs"]
 mod decoded_scan;
@@ -16,15 +16,15 @@ use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Background, Foreground, Nanos, Pose, Scan};
 use scanhub_sim::room::Room;
 
-/// Number of scans, as in the paper's figure.
+/// Number of scans, as in the figure of the paper.
 const SCAN_COUNT: u64 = 2_000;
 /// Time between two scans.
 const SCAN_PERIOD_NS: Nanos = 2 * MIRROR_PERIOD;
-/// Time until which nothing changes. Box 1 is put down at 15 s.
+/// Time until which nothing in the room changes. Box 1 is put down at 15 s.
 const UNCHANGED_UNTIL_NS: Nanos = 14_900_000_000;
-/// Time of the snapshot: the person is in the room, and box 1 is still foreground.
+/// Time of the snapshot. At this time, the person is in the room, and box 1 is still foreground.
 const SNAPSHOT_NS: Nanos = 19_000_000_000;
-/// Minimum difference of two backgrounds that is drawn, in mm. It is the threshold of the methods.
+/// Minimum difference between two backgrounds that is drawn, in millimeters. It equals the threshold of the methods.
 const MIN_DIFFERENCE_MM: u16 = 30;
 
 struct Options {
@@ -61,14 +61,14 @@ impl Options {
 /// Results of the run.
 #[derive(Default)]
 struct RoomRun {
-    /// Every position that was background at any time.
+    /// Positions that were background at any time.
     models: Vec<Position>,
-    /// Every position that was foreground at any time.
+    /// Positions that were foreground at any time.
     foreground: Vec<Position>,
     before: Vec<u16>,
     after: Vec<u16>,
     snapshot: Option<(Vec<u16>, Box<Foreground>)>,
-    /// The last scan. All scans have the same beams.
+    /// The last scan. All scans have beams at the same angles.
     scan: Box<Scan>,
 }
 
@@ -104,7 +104,7 @@ impl RoomRun {
         run
     }
 
-    /// Returns the positions of `other` that differ from `model`.
+    /// Returns the positions in `other` whose range differs from that in `model`.
     fn differences(&self, model: &[u16], other: &[u16]) -> Vec<Position> {
         let differs = |i: &usize| is_known(other[*i]) && model[*i].abs_diff(other[*i]) > MIN_DIFFERENCE_MM;
         (0..model.len()).filter(differs).map(|i| Position::of(&self.scan, i, other[i])).collect()
@@ -150,7 +150,7 @@ fn scan(room: &Room, end_ns: Nanos) -> Box<Scan> {
     decoded_scan::scan(&room.scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, end_ns), Unit::Mm)
 }
 
-/// Returns whether the background of a beam is a range.
+/// Returns whether the background of a beam is a range, and not unknown or far.
 fn is_known(range: u16) -> bool {
     range != Background::UNKNOWN && range != Background::FAR
 }
@@ -212,23 +212,23 @@ struct Position {
 }
 
 impl Position {
-    /// Returns the end of beam `i` of `scan` at this `range`, in units of the scan.
+    /// Returns the position at which beam `i` of `scan` ends if its range is `range`, which is in the unit of the scan.
     fn of(scan: &Scan, i: usize, range: u16) -> Position {
         let mm = f64::from(range) * f64::from(scan.unit_um) / 1000.0;
         let (left, ahead) = scan.angle(i).sin_cos();
         Position { right_mm: (-mm * left).round() as i32, ahead_mm: (mm * ahead).round() as i32 }
     }
 
-    /// Returns the position on the page, in pixels. A pixel is one centimeter.
+    /// Returns the position on the picture, in pixels. A pixel is one centimeter.
     fn pixel(self) -> (i32, i32) {
         let centimeters = |mm: i32| (f64::from(mm) / 10.0).round() as i32;
         (LEFT + centimeters(self.right_mm), BOTTOM - centimeters(self.ahead_mm))
     }
 }
 
-/// A floor plan as SVG, seen from above, with the sensor at the bottom. It has dots in classes, rings and a scale. The
-/// dots of one class are one path on a grid of one centimeter, so the file is small. The picture has no background and
-/// no extreme colors, so it is readable on light and on dark pages.
+/// A floor plan as SVG, seen from above, with the sensor at the bottom. It has dots of several classes, rings and a
+/// scale. The dots of one class are drawn as one path on a grid of one centimeter, so that the file is small. The
+/// picture has no background and no extreme colors, so it is readable on light and on dark pages.
 struct FloorPlan {
     body: String,
     legend: Vec<&'static str>,
@@ -241,7 +241,7 @@ impl FloorPlan {
         FloorPlan { body: String::new(), legend: Vec::new(), title }
     }
 
-    /// Draws a dot at each of `positions`, in the color of `class`, one of [`CLASSES`].
+    /// Draws a dot at each of `positions`, in the color of `class`, which is one of [`CLASSES`].
     fn dots(&mut self, class: &'static str, positions: &[Position]) {
         let pixels: BTreeSet<(i32, i32)> = positions.iter().map(|place| place.pixel()).collect();
         let _ = write!(self.body, "<path class=\"{class}\" d=\"");
@@ -257,7 +257,7 @@ impl FloorPlan {
         self.legend.push(class);
     }
 
-    /// Draws a ring around an object of `width_mm`.
+    /// Draws a ring around an object that is `width_mm` wide.
     fn ring(&mut self, center: Position, width_mm: u16) {
         let (x, y) = center.pixel();
         let radius = width_mm / 20 + 9;
@@ -301,8 +301,8 @@ impl FloorPlan {
 /// Classes of dots with their colors.
 const CLASSES: [(&str, &str); 4] =
     [("background", "#808080"), ("foreground", "#e67e22"), ("new", "#d9534f"), ("gone", "#3498db")];
-/// Size of the page, and position of the sensor on it, in pixels. The page shows the room of 6.3 by 5.5 m and the
-/// corridor behind its door.
+/// Size of the picture, and position of the sensor in it, in pixels. The picture shows the room of 6.3 by 5.5 m and the
+/// corridor behind the room's door.
 const WIDTH: i32 = 760;
 const HEIGHT: i32 = 730;
 const LEFT: i32 = 350;

@@ -1,7 +1,8 @@
-//! Cost of the hub per telegram. Measures the hub's CPU time and its sleeps while 1, 2 or 4 sensors stream, with one
-//! sleeping subscriber per sensor. The baseline is a minimal reader of ptys that makes only the necessary system calls
-//! and wakes a process per telegram. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the
-//! same time (`support/simultaneous.rs`). The bench does not measure the cost of subscribers or of a real adapter.
+//! Cost of the hub per telegram. The bench measures the CPU time and the number of sleeps of the hub while 1, 2 or 4
+//! sensors stream, with one sleeping subscriber per sensor. The baseline is a minimal reader of ptys that makes only
+//! the necessary system calls, and wakes a process for each telegram. The hub and the baselines run at the same time
+//! (`support/simultaneous.rs`). With `--beside PROGRAM`, the hub of another build also runs at the same time. The bench
+//! does not measure the cost of subscribers or of a real adapter.
 
 mod support;
 
@@ -31,7 +32,8 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
         rounds.push(load_of_round(&comparison, round, seconds)?);
     }
     let figure = |name, unit, of: fn(&Load) -> Option<f64>, target| {
-        // Other programs on the machine make some seconds far more expensive than most, so the median counts.
+        // Take the median of the seconds of a round. Because of other programs on the machine, the hub needs far more
+        // CPU time in some seconds than in most.
         let in_round = |loads: &Vec<Load>| {
             let mut seconds: Vec<f64> = loads.iter().filter_map(of).collect();
             seconds.sort_by(f64::total_cmp);
@@ -79,7 +81,7 @@ impl Load {
     }
 }
 
-/// Runs all programs, and returns their resource usage in every second.
+/// Runs all programs of a round. Returns the resources that each program used, in each second.
 fn load_of_round(comparison: &Comparison, round: usize, seconds: u64) -> Outcome<Vec<Vec<Load>>> {
     let sensors = comparison.sensors;
     let mut running = Vec::new();
@@ -146,7 +148,7 @@ struct Sample {
 
 impl Sample {
     /// Reads the counters of `pid`. The reading threads of a hub have the names of its sensors. In the baseline, all
-    /// threads except the first are readers. The first one only waits for the others.
+    /// threads except the first one read. The first thread only waits for the others.
     fn take(pid: u32, sensors: Option<&[&str]>) -> Outcome<Sample> {
         let now = clock::now();
         let process = ThreadUsage::of(pid, |_| true)?;
@@ -158,8 +160,8 @@ impl Sample {
     }
 }
 
-/// Returns the hub's own counts of wake-ups and telegrams, for all links. Called outside of the measured time, because
-/// the call adds a subscriber.
+/// Returns the numbers of wake-ups and telegrams that the hub itself counts, as sums over all links. The bench must not
+/// call this during the measured time, because the call adds a subscriber.
 fn counters(environment: &BenchEnvironment, sensors: &[&str]) -> Outcome<(f64, f64)> {
     let mut sum = (0, 0);
     for sensor in sensors {

@@ -1,9 +1,10 @@
-//! Latency of subscribers in other languages than Rust. It is the time from the last byte that the hub read until one
-//! process has the scan. This process is the only subscriber. The runs of the languages alternate. Rust sleeps on the
-//! doorbell, its default, and is the baseline. The bench does not measure what a program does with the scan.
+//! Latency of subscribers in other languages than Rust. Latency is the time from the last byte of a scan that the hub
+//! read until a process has the scan. This process is the only subscriber. The runs of the languages alternate. The
+//! baseline is a subscriber in Rust that sleeps on the doorbell, which is the default. The bench does not measure the
+//! time in which a program processes the scan.
 //!
-//! Also measures the time in which Python reads ten minutes of two sensors from a recording into numpy arrays. The
-//! baseline is the same loop in Rust. Neither time includes the start of the process.
+//! The bench also measures the time in which Python reads ten minutes of two sensors from a recording into numpy
+//! arrays. The baseline is a loop in Rust that reads the same scans. Neither time includes the start of the process.
 
 mod support;
 
@@ -27,7 +28,7 @@ use support::{Options, Outcome};
 /// A language that is compared with Rust.
 struct Language {
     figures: [&'static str; 3],
-    /// Maximum ratio of the language's p50 to Rust's p50.
+    /// Maximum ratio of the language's median latency to that of Rust.
     max_ratio: f64,
     /// Returns the program and the first arguments of the language's subscriber. If this machine cannot run it, prints
     /// the reason and returns `None`. Domain, sensor and number of scans follow as arguments. The subscriber prints
@@ -98,7 +99,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns the ages of `count` scans in us, sorted. The first scans do not count.
+/// Returns the ages of `count` scans in microseconds, sorted. Leaves out the first scans.
 fn ages(subscriber: &Child, count: usize) -> Outcome<Vec<f64>> {
     let lines = subscriber.lines_until("end", STEP_TIMEOUT + Duration::from_millis(50) * count as u32)?;
     let aged = lines.iter().filter(|line| line.text.starts_with("aged")).skip(SKIPPED_SCANS);
@@ -131,7 +132,7 @@ fn measure_reading(environment: &BenchEnvironment, options: &Options) -> Outcome
     Ok(Some(Figure { name, unit: "ms", hub: pythons, baseline: rusts, target: Target::Ratio(1.3) }))
 }
 
-/// Writes a recording of two sensors. The same scans repeat after a while.
+/// Writes a recording of two sensors. After a while, the scans in it repeat.
 fn record(file: &Path, seconds: u64) -> Outcome<()> {
     let room = Room::new(&"room".parse()?, 1);
     let period_ns = Variant::HALF.revolutions() * MIRROR_PERIOD;

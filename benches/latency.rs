@@ -1,13 +1,14 @@
-//! Age of a telegram when a subscriber receives it, at 37.5 Hz from each of two sensors. The age starts when the last
-//! byte is written into the pty, by the simulator's own stamp. It ends when another process, which sleeps in the client
-//! library, has the sample. The baseline is a minimal chain that also reads late: pty, process, eventfd, process. Sent
-//! and received telegrams are matched by hash. Hub, baselines and, with `--beside PROGRAM`, the hub of another build
-//! run at the same time (`support/simultaneous.rs`). The bench does not cover the time from the measurement of a beam
-//! to the line, or the delay of an adapter.
+//! Age of a telegram when a subscriber receives it, at 37.5 Hz from each of two sensors. The age starts when the
+//! simulator has written the last byte into the pty, by the simulator's own stamp. It ends when a process that sleeps
+//! in the client library has the sample. The baseline is a minimal chain of pty, process, eventfd and process, which
+//! reads as late as the hub does. The bench matches sent and received telegrams by their hashes. The hub and the
+//! baselines run at the same time (`support/simultaneous.rs`). With `--beside PROGRAM`, the hub of another build also
+//! runs at the same time. The ages do not include the time from the measurement of a beam to the line, or the delay of
+//! an adapter.
 //!
-//! The path up to the last byte is the same for the baseline, so the difference arises between the read and the
-//! subscriber. The 99th percentile and the maximum depend on the machine as much as on the hub, because the simulator
-//! runs on the same cores.
+//! The path up to the last byte is the same for the hub and the baseline, so their difference arises between the read
+//! and the subscriber. The 99th percentile and the maximum depend on the machine as much as on the hub, because the
+//! simulator runs on the same cores.
 
 mod support;
 
@@ -77,15 +78,15 @@ struct ReceivedTelegrams(Vec<ReceivedTelegram>);
 struct ReceivedTelegram {
     sensor: usize,
     hash: String,
-    /// Time at which the reader of the pty had the telegram's last byte.
+    /// Time at which the reader of the pty had the last byte of the telegram.
     read_ns: u64,
     /// Time at which the subscriber received the telegram.
     at_ns: u64,
 }
 
 impl ReceivedTelegrams {
-    /// Returns the start and the end of the time that counts. It starts when the last sensor has started to stream, and
-    /// ends when the first sensor ends.
+    /// Returns the start and the end of the time whose telegrams count. This time starts when all sensors stream, and
+    /// ends when the first sensor stops.
     fn span(&self) -> (u64, u64) {
         let mut ends = HashMap::<usize, (u64, u64)>::new();
         for arrived in &self.0 {
@@ -97,8 +98,8 @@ impl ReceivedTelegrams {
     }
 
     /// Returns two series of times for the telegrams received in `span`, in us: from sent to received, and from sent to
-    /// read. A hub verifies checksums, so the sensors have sent all its telegrams. A baseline without checksums may
-    /// receive parts of two telegrams.
+    /// read. A hub checks checksums, so the sensors must have sent all telegrams that it received. A baseline does not
+    /// check them, so it may take parts of two telegrams for one telegram.
     fn latencies(&self, sent: &SentTimes, span: (u64, u64), is_hub: bool) -> Outcome<Latencies> {
         let mut latencies = Latencies::default();
         for arrived in self.0.iter().filter(|arrived| (span.0..=span.1).contains(&arrived.at_ns)) {
@@ -117,21 +118,21 @@ impl ReceivedTelegrams {
     }
 }
 
-/// Returns the time span that counts in all runs of a round.
+/// Returns the time whose telegrams count in all runs of a round.
 fn shared_span(runs: &[ReceivedTelegrams]) -> (u64, u64) {
     let spans = runs.iter().map(ReceivedTelegrams::span);
     spans.fold((0, u64::MAX), |all, span| (all.0.max(span.0), all.1.min(span.1)))
 }
 
-/// Latencies of a run, each series sorted.
+/// Latencies of a run. Each series is sorted.
 #[derive(Default)]
 struct Latencies {
     whole: Vec<f64>,
     read: Vec<f64>,
 }
 
-/// Runs all programs until each one has received `count` telegrams of each sensor after the start. Returns these
-/// telegrams.
+/// Runs all programs until each one has received `count` telegrams of each sensor after the settling time. Returns the
+/// received telegrams of each program.
 fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome<Vec<ReceivedTelegrams>> {
     let count = count + (SETTLE_TIME.as_millis() as u64 * SCAN_RATE_MHZ / 1_000_000) as usize;
     let start = |(number, candidate): (usize, &MeasuredProgram)| -> Outcome<_> {
@@ -184,7 +185,7 @@ fn through_baseline(baseline: &Child, sensors: usize, count: usize) -> Outcome<R
     };
     let mut run = ReceivedTelegrams(Vec::new());
     for sensor in 0..sensors {
-        // The wake-up carries no bytes: the nth one belongs to the nth telegram.
+        // A wake-up has no content, but the nth wake-up belongs to the nth telegram.
         for (read, woken) in of("read", sensor).into_iter().zip(of("woken", sensor)) {
             let (hash, at_ns, read_ns) = (read.words()[2].to_owned(), woken.number(2)?, read.number(3)?);
             run.0.push(ReceivedTelegram { sensor, hash, read_ns, at_ns });

@@ -1,11 +1,11 @@
-//! Losses on a line that loses bytes, as in the paper's Fig. 6. The line carries five minutes of telegrams and loses
+//! Losses on a line that loses bytes, as in the paper's Fig. 6. Telegrams of five minutes pass the line, which loses
 //! 0.135 % of their bytes in bursts. Three parsers read the remaining bytes. No parser can restore a telegram that the
-//! line damaged. If any other telegram is missing, the parser has discarded it. `--count N` sets the number of
-//! telegrams, and `--pairs N` sets the number of lines. `hub/drivers/tests/lms/framing.rs` checks the same with
-//! different content on the line.
+//! line has damaged. If a telegram is missing that the line has not damaged, the parser has discarded it. `--count N`
+//! sets the number of telegrams, and `--pairs N` sets the number of lines. The test `hub/drivers/tests/lms/framing.rs`
+//! compares the parsers with other content on the line.
 //!
-//! A damaged telegram lost at least one byte. A collateral telegram arrived with every byte, but the parser discarded
-//! it. In the paper, 0.135 % of the bytes and 40.8 % of the telegrams were lost.
+//! A telegram counts as *damaged* if it lost at least one byte. A telegram counts as *collateral* if all of its bytes
+//! arrived but the parser discarded it. In the paper, 0.135 % of the bytes and 40.8 % of the telegrams were lost.
 
 #[path = "../hub/drivers/tests/lms/line.rs"]
 #[allow(dead_code)] // The test uses the other content of the line.
@@ -64,12 +64,12 @@ impl LineRun {
     }
 }
 
-/// Returns a number of telegrams as a percentage of `of`.
+/// Returns `of` telegrams as a percentage of all telegrams.
 fn percent(stats: &TelegramCounts, of: u64) -> f64 {
     of as f64 * 100.0 / stats.telegrams as f64
 }
 
-/// Returns the figures of the line and then of the hub's parser, as in the paper's columns.
+/// Returns the figures of the line, and then those of the hub's parser. They are the columns of the table in the paper.
 fn figures(runs: &[LineRun]) -> Vec<Figure> {
     let figure = |name, unit, hub: Vec<f64>, target| Figure { name, unit, hub, baseline: Vec::new(), target };
     let ours =
@@ -84,7 +84,7 @@ fn figures(runs: &[LineRun]) -> Vec<Figure> {
     ]
 }
 
-/// Returns a row for each parser.
+/// Returns the cells of a table with one row for each parser.
 fn cells(runs: &[LineRun]) -> Vec<Cell> {
     type Column = (&'static str, &'static str, fn(&TelegramCounts) -> f64);
     const COLUMNS: [Column; 7] = [

@@ -1,6 +1,6 @@
 //! CPU time of the hub's processors for one scan of 361 beams, while a person walks through the room of the paper's
-//! Fig. 8. Targets for zones, marks and background together: 1 us with the method `paper`, 3 us with `multi`, and 5 us
-//! with segments.
+//! Fig. 8. The targets for zones, marks and background together are 1 us with the background method `paper`, 3 us with
+//! `multi`, and 5 us with segments in addition.
 
 #![allow(missing_docs)] // The macros of criterion create public functions.
 
@@ -18,11 +18,12 @@ use scanhub_schema::{Foreground, Marks, Pose, Scan, Zones};
 use scanhub_sim::room::Room;
 
 const SENSOR_POSE: Pose = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, upside_down: 0, reserved: [0; 7] };
-/// Beams of each scan.
+/// Number of beams of each scan.
 const BEAM_COUNT: usize = 361;
-/// First scan that is measured. By then, a person walks through the room, and the background is learned.
+/// Index of the first scan that is measured. At this time, a person walks through the room, and the background is
+/// learned.
 const FIRST_SCAN: u64 = 800;
-/// Number of different scans, which the bench measures one after the other and then again.
+/// Number of scans that the bench uses. The bench processes these scans one after the other, again and again.
 const SCAN_COUNT: u64 = 64;
 
 /// Returns the first `count` scans of a world.
@@ -44,7 +45,7 @@ fn model(method: Method, scans: &[Box<Scan>]) -> (BackgroundModel, &[Box<Scan>])
     (model, present)
 }
 
-/// Measures the time of `update` for one scan after the other, over and over.
+/// Measures the time of `update` for one scan. Passes the scans one after the other, again and again.
 fn time_scans(c: &mut Criterion, name: &str, scans: &[Box<Scan>], mut update: impl FnMut(&Scan)) {
     let mut next = scans.iter().cycle();
     c.bench_function(name, |b| b.iter(|| update(black_box(next.next().expect("an endless sequence")))));
@@ -83,7 +84,7 @@ fn bench_background(c: &mut Criterion) {
     }
     let (mut model, scans) = model(Method::Multi, &scans);
     let mut cutter = Segmenter::new(SENSOR_POSE, BEAM_COUNT);
-    // Compute the foreground once, and divide it into segments repeatedly.
+    // Compute the foreground only once, and measure how long it takes to divide it into segments.
     let mut foreground = Foreground::of(BEAM_COUNT);
     model.update(&scans[0], &mut foreground);
     time_scans(c, "segments", &scans[..1], |scan| cutter.update(scan, black_box(&mut foreground)));

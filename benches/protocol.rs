@@ -1,5 +1,5 @@
-//! CPU time for a telegram of 361 beams between the port and shared memory: framing, checksum, and decoding. Targets: 2
-//! us for framing and checksum together, 0.3 us for decoding.
+//! CPU time for a telegram of 361 beams between the port and shared memory: framing, checksum, and decoding. The
+//! targets are 2 us for framing and checksum together, and 0.3 us for decoding.
 
 #![allow(missing_docs)] // The macros of criterion create public functions.
 
@@ -13,7 +13,7 @@ use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_schema::{ArrayFlags, Scan};
 use std::hint::black_box;
 
-/// Lengths of the reads for one telegram, with the hub's late reads.
+/// Lengths of the reads for one telegram in the hub, which reads most of a telegram late.
 const READ_LENS: [usize; 3] = [16, 560, 156];
 /// Lengths of the reads for one telegram from a UART, which delivers 16 bytes at a time.
 const UART_READ_LENS: [usize; 46] = {
@@ -23,7 +23,7 @@ const UART_READ_LENS: [usize; 46] = {
 };
 
 /// Returns telegrams of a room with noise, which are all different. No telegram ends with a start byte, because the
-/// framer would hold it.
+/// framer would hold such a telegram.
 fn telegrams() -> Vec<Vec<u8>> {
     let mut rng = Rng::with_seed(1);
     let mut scan = || {

@@ -1,7 +1,7 @@
-//! CPU time that the hub's thread needs from loan to wake-up for a scan. There are 0 to 200 subscribers that are awake,
-//! asleep on the doorbell, or asleep on the event. Publishing is measured as CPU time of the publishing thread, which
-//! includes about 0.3 us for reading the clock. It excludes the CPU time of subscribers. The bench also measures
-//! datagrams: packing and sealing, reading and checking.
+//! CPU time that the hub's thread needs to publish a scan, from the loan to the wake-up of the subscribers. There are 0
+//! to 200 subscribers that are awake, asleep on the doorbell, or asleep on the event. Publishing is measured as CPU
+//! time of the publishing thread, which includes about 0.3 us for reading the clock. It excludes the CPU time of
+//! subscribers. The bench also measures two costs of datagrams: packing and sealing, and reading and checking.
 //!
 //! Subscribers that are awake keep the memory in the cache. The other subscribers sleep for a millisecond between two
 //! scans.
@@ -74,8 +74,8 @@ fn publish(c: &mut Criterion) {
                             }
                             if rest != WaitMethod::Awake {
                                 wait_until(|| crowd.received.load(Ordering::Acquire) >= sent * count);
-                                // Scans do not follow each other without a pause, so wait until the last subscriber
-                                // sleeps again.
+                                // Real scans follow each other with a pause, so wait until the last subscriber sleeps
+                                // again.
                                 thread::sleep(SCAN_INTERVAL);
                             }
                         }
@@ -88,7 +88,7 @@ fn publish(c: &mut Criterion) {
     group.finish();
 }
 
-/// State of the threads of subscribers.
+/// State that the bench and the threads of the subscribers share.
 #[derive(Default)]
 struct SubscriberThreads {
     ready: AtomicU64,
@@ -96,7 +96,8 @@ struct SubscriberThreads {
     should_end: AtomicBool,
 }
 
-/// Ends the subscribers however the bench ends. They check the flag at least every [`END_POLL_INTERVAL`].
+/// Ends the subscribers when it is dropped, however the bench ends. The subscribers check its flag at least every
+/// [`END_POLL_INTERVAL`].
 struct EndOnDrop<'a>(&'a SubscriberThreads);
 
 impl Drop for EndOnDrop<'_> {
@@ -189,10 +190,10 @@ where
 }
 
 const SUBSCRIBER_COUNTS: [u64; 6] = [0, 1, 4, 16, 64, 200];
-/// Pause between two scans, in which all subscribers fall asleep. The time between two scans of a real sensor is 26
-/// times as long.
+/// Pause between two scans, in which all subscribers go to sleep. The time between two scans of a real sensor is 26
+/// times as long as this pause.
 const SCAN_INTERVAL: Duration = Duration::from_millis(1);
-/// Interval in which subscribers check whether the bench has ended.
+/// Interval at which subscribers check whether the bench has ended.
 const END_POLL_INTERVAL: Duration = Duration::from_millis(500);
 
 criterion_group!(benches, publish, datagram);

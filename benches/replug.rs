@@ -1,10 +1,11 @@
-//! Time and CPU time that unplugging a sensor costs. A pty that simulates a streaming sensor is removed under a running
-//! hub, and returns under its name. Every other time, it returns with another number. This happens twenty times. The
-//! figures are the time until the hub reports the port as absent, the time until a subscriber has a telegram again, and
-//! the CPU time of the hub in between. The same is measured for rotating scanners, which also lose their power for a
-//! moment.
+//! Time without telegrams and CPU time that it costs to unplug a sensor. While a hub runs, the pty of a simulated
+//! sensor that streams is removed, and returns under the same name. This is repeated twenty times. In every second
+//! repetition, the pty returns with another number. The figures are the time until the hub reports the port as absent,
+//! the time until a subscriber has a telegram again, and the CPU time of the hub in between. The same figures are
+//! measured for rotating scanners. These scanners also lose their power for a short time.
 //!
-//! The bench does not measure how long the kernel takes to detect the loss of an adapter, or udev to name it.
+//! The bench does not measure how long the kernel takes to detect the loss of an adapter, or how long udev takes to
+//! create the name of its port.
 
 mod support;
 
@@ -51,7 +52,7 @@ fn measure(options: &Options) -> Outcome<()> {
     telegrams.wait_for_line("telegram", STEP_TIMEOUT)?;
     let (mut noticed, mut back, mut busy, mut torn) = (Vec::new(), Vec::new(), Vec::new(), 0.0);
     for round in 0..options.count(20) {
-        // A different phase of the stream in each round.
+        // Unplug the sensor at another phase of the stream in each round.
         clock::sleep_until(clock::now() + (300 + 11 * (round as u64 % 20)) * MILLIS);
         telegrams.lines_so_far();
         statuses.lines_so_far();
@@ -59,11 +60,11 @@ fn measure(options: &Options) -> Outcome<()> {
         let absent = statuses.wait_for_line("status front absent", STEP_TIMEOUT)?.number(3)?;
         noticed.push(absent.saturating_sub(pulled) as f64 / 1e6);
         let (before, started) = (ThreadUsage::of(hub.guard.pid(), |_| true)?, clock::now());
-        // A different phase of the hub's polls, too.
+        // Plug the sensor in at another phase of the hub's polls in each round.
         clock::sleep_until(started + (1_000 + 37 * (round as u64 % 20)) * MILLIS);
         let work = ThreadUsage::of(hub.guard.pid(), |_| true)?.since(before);
         busy.push(100.0 * work.busy_ns as f64 / (clock::now() - started) as f64);
-        // Drops the lines that arrived before the sensor was unplugged.
+        // Drop the lines that arrived before the sensor was unplugged.
         telegrams.lines_so_far();
         let other_number = (round % 2 == 1).then(make_pty).transpose()?;
         plug = PluggedSensor::plug_in(&name)?;
@@ -91,7 +92,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// A streaming sensor that is plugged in under a name.
+/// A simulated sensor that is plugged in under a name, and streams.
 struct PluggedSensor {
     is_unplugged: Arc<AtomicBool>,
     sensor: JoinHandle<OwnedFd>,
@@ -111,7 +112,7 @@ impl PluggedSensor {
         Ok(PluggedSensor { is_unplugged, sensor, plugged_ns: clock::now() })
     }
 
-    /// Unplugs the sensor, and returns the time.
+    /// Unplugs the sensor, and returns the time at which this was done.
     fn unplug(self, name: &str) -> Outcome<u64> {
         self.is_unplugged.store(true, Ordering::Relaxed);
         let line = self.sensor.join().map_err(|_| "the sensor panicked")?;
@@ -122,8 +123,8 @@ impl PluggedSensor {
     }
 }
 
-/// Sends scans like a sensor while a program has the line open. Scans are two revolutions of the mirror apart, and each
-/// scan is sent in two parts.
+/// Sends scans like a sensor while a program has the line open. The time between two scans is that of two revolutions
+/// of the mirror. Each scan is sent in two parts.
 fn stream(line: OwnedFd, is_unplugged: &AtomicBool) -> OwnedFd {
     let mut at = clock::now();
     let mut buffer = [0; 256];
@@ -155,14 +156,14 @@ fn is_open(line: &OwnedFd) -> bool {
     poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
 }
 
-/// Returns a raw pty and the name of its other end.
+/// Returns the sensor's end of a raw pty, and the name of the other end.
 fn make_pty() -> Outcome<(OwnedFd, Vec<u8>)> {
     let line = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
     grantpt(&line)?;
     unlockpt(&line)?;
     let name = ptsname(&line, Vec::new())?;
     fcntl_setfl(&line, OFlags::RDWR | OFlags::NONBLOCK)?;
-    // A pty reports that it is closed only after a program has opened it once.
+    // Open and close the other end once, because a pty reports that it is closed only after a program has opened it.
     let other = open(&*name, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
     let mut termios = tcgetattr(&other)?;
     termios.make_raw();
@@ -172,7 +173,7 @@ fn make_pty() -> Outcome<(OwnedFd, Vec<u8>)> {
 
 const MILLIS: u64 = 1_000_000;
 
-/// A rotating scanner with the names of its figures.
+/// A model of rotating scanner, with the names of its figures.
 struct RotatingScanner {
     family: &'static str,
     scanner: Scanner,
@@ -196,8 +197,8 @@ const SCANNERS: [RotatingScanner; 2] = [
 ];
 
 /// Measures all rotating scanners, at ptys of the simulator in this process. The adapter is unplugged for two seconds,
-/// or the power is off for a moment. The figures are the times until a subscriber again has a scan of a whole
-/// revolution.
+/// or the power is off for a short time. The figures are the times until a subscriber has a scan of a whole revolution
+/// again.
 fn rotating_scanners(options: &Options) -> Outcome<Vec<Figure>> {
     let mut figures = Vec::new();
     for scanner in &SCANNERS {
@@ -231,7 +232,7 @@ impl RotatingScanner {
             |event: Event| events.lock().map(|mut events| events.push_back(event)).map_err(|_| "poisoned");
         let (mut back, mut powered) = (Vec::new(), Vec::new());
         for round in 0..options.count(10) as u64 {
-            // A different phase of the revolution in each round.
+            // Unplug the adapter at another phase of the revolution in each round.
             clock::sleep_until(clock::now() + (1_000 + 37 * (round % 10)) * MILLIS);
             inject(Event::Unplug(UNPLUGGED_NS))?;
             while port.exists() {
@@ -243,8 +244,8 @@ impl RotatingScanner {
             back.push((scans.wait_for_line("scanned", STEP_TIMEOUT)?.number(2)? - since) as f64 / 1e6);
             clock::sleep_until(clock::now() + (1_000 + 41 * (round % 10)) * MILLIS);
             inject(Event::PowerCycle)?;
-            // By this time, all bytes in transit have arrived, and the scanner has sent nothing since it lost its
-            // power.
+            // Wait until all bytes in transit have arrived. The scanner sends nothing from the loss of its power until
+            // its boot message.
             clock::sleep_until(clock::now() + BOOT_TIME.as_nanos() as u64);
             let since = clock::now();
             scans.lines_so_far();
@@ -273,7 +274,7 @@ fn wait_for_name(port: &Path) {
     }
 }
 
-/// Time from power-on to the boot message.
+/// Time from power-on of a scanner to its boot message.
 const BOOT_TIME: Duration = Duration::from_millis(500);
-/// Time for which an adapter is unplugged, in ns.
+/// Time for which the adapter is unplugged, in nanoseconds.
 const UNPLUGGED_NS: u64 = 2_000 * MILLIS;

@@ -1,11 +1,12 @@
-//! Time and telegrams that a crash of the hub costs its subscribers. The hub is killed with SIGKILL and started again,
-//! twenty times. No service manager keeps its lines. A process per sensor receives the telegrams. The bench measures
-//! the time until the services exist and the time until each subscriber has a telegram. The baseline is a minimal
-//! reader that opens the same streaming ptys and wakes a process. The bench also counts damaged telegrams, telegrams
-//! missed within a run, and writes to the sensors' EEPROM.
+//! Time and telegrams that a crash of the hub costs its subscribers. Twenty times, the hub is killed with SIGKILL and
+//! started again. No service manager keeps the hub's lines open. One process per sensor receives the telegrams. The
+//! bench measures the time until the hub's topics exist, and the time until each subscriber has a telegram. The
+//! baseline is a minimal reader that opens the same streaming ptys and wakes a process. The bench also counts damaged
+//! telegrams, telegrams missed within a run, and writes to the sensors' EEPROM.
 //!
-//! The second part does the same under a service manager that keeps the line of one sensor open. It measures the
-//! silence and the losses. The bench does not measure how long a service manager takes to detect the exit of a service.
+//! The second part repeats this under a service manager that keeps the line of one sensor open. This part measures how
+//! long no telegram arrives, and which telegrams are lost. The bench does not measure how long a service manager takes
+//! to detect the exit of a service.
 
 #[path = "../tests/testkit/supervisor.rs"]
 mod supervisor;
@@ -44,7 +45,8 @@ fn measure(options: &Options) -> Outcome<()> {
     };
     runs.restart()?;
     let (mut hub, mut baseline) = (Vec::new(), Vec::new());
-    // A series of kills, and then the same number of starts of the baseline, on the same streams.
+    // Alternate a series of kills with a series of starts of the baseline on the same streams. Both series have the
+    // same length.
     let each = options.count(20).div_ceil(options.pairs());
     for _ in 0..options.pairs() {
         for _ in 0..each {
@@ -90,10 +92,10 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Times of a start, in ms from exec.
+/// Times of a start, in milliseconds from exec.
 struct StartTimes {
     up_ms: f64,
-    /// Times of the first telegram at the subscriber that was served first, and at the other subscriber.
+    /// Times of the first telegram at the two subscribers, the earlier time first.
     first_ms: [f64; 2],
 }
 
@@ -105,7 +107,7 @@ impl StartTimes {
     }
 }
 
-/// The runs of the hub, and the subscribers, which outlive them.
+/// The current run of the hub, and the subscribers, which stay attached over all runs.
 struct HubRuns<'a> {
     stage: &'a BenchEnvironment,
     subscribers: &'a [Child],
@@ -128,15 +130,15 @@ impl HubRuns<'_> {
         Ok(())
     }
 
-    /// Kills the hub, if one runs, and starts the next one. Returns the times at which each subscriber has a telegram
-    /// of the new hub.
+    /// Kills the hub, if one runs, and starts the next one. Returns the time at which the new hub is up and the times
+    /// at which the subscribers have a telegram of the new hub.
     fn restart(&mut self) -> Outcome<StartTimes> {
         self.kill()?;
         let hub = self.stage.start_hub(&SENSORS)?;
         let up_ns = hub.wait_for_line("ready", STEP_TIMEOUT)?.at_ns;
         let mut first_ns = [0; 2];
         for (first_ns, subscriber) in first_ns.iter_mut().zip(self.subscribers) {
-            // The last telegrams of the killed hub may still be in the pipe.
+            // Lines about the last telegrams of the killed hub may still be in the pipe.
             while *first_ns < hub.started_ns {
                 let line = subscriber.wait_for_line("telegram", STEP_TIMEOUT)?;
                 self.count(&line.words());
@@ -173,15 +175,16 @@ fn start_baseline(environment: &BenchEnvironment) -> Outcome<StartTimes> {
     Ok(start)
 }
 
-/// Returns the length of run number `n`. The lengths differ, so that each run ends at a different phase of the stream.
+/// Returns the duration of run number `n`. The durations differ, so that each run ends at a different phase of the
+/// stream.
 fn run_time(n: usize) -> Duration {
     Duration::from_millis(700 + 11 * (n as u64 % 20))
 }
 
 /// Measures a hub whose line a service manager keeps open, as with the unit in hub/dist. The hub is killed `kills`
-/// times, evenly distributed over a telegram. It is also killed half as many times in the 0.6 ms in which it reads a
-/// telegram. Only in this time has a telegram left the line without being published. The telegrams of a subscriber are
-/// compared with the telegrams that the simulated sensor sent.
+/// times, evenly distributed over a telegram. In a second series, with half as many kills, the hub is killed in the 0.6
+/// ms in which it reads a telegram. Only in this time, a telegram has left the line but is not published yet. The
+/// telegrams that a subscriber received are compared with those that the simulated sensor sent.
 fn measure_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
     let spread = kill_with_kept_line(kills, |n| SCAN_PERIOD_NS * (2 * n + 1) / (2 * kills as u64))?;
     let reading = kill_with_kept_line(kills.div_ceil(2), |_| SCAN_PERIOD_NS - READ_AHEAD_NS / 2)?;
@@ -217,26 +220,28 @@ fn measure_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
 /// Results of several kills.
 #[derive(Default)]
 struct KillResults {
-    /// Time from receiving the last telegram of a run until receiving the first telegram of the next run.
+    /// For each kill, the time from the last telegram of a run to the first telegram of the next run, at the
+    /// subscriber.
     telegrams_ms: Vec<f64>,
-    /// Time from receiving the last scan of a run until receiving the first scan of the next run.
+    /// For each kill, the time from the last scan of a run to the first scan of the next run, at the subscriber.
     scans_ms: Vec<f64>,
-    /// Number of complete telegrams of measured data that the sensor sent from the first received one to the last
-    /// received one.
+    /// Number of complete telegrams of measured data that the sensor sent between the first and the last telegram that
+    /// was received, including these two.
     sent: usize,
     lost: usize,
-    /// Number of lost telegrams that the hub should not have been reading when it was killed. A hub that wakes late
-    /// reads all bytes that have arrived.
+    /// Number of lost telegrams that no killed hub can have been reading. (A hub that wakes late reads a telegram later
+    /// than usual.)
     lost_while_idle: usize,
-    /// Number of telegrams that the sensor aborted in this time in order to reply to the next hub.
+    /// Number of telegrams that the sensor aborted between the first and the last received telegram, in order to reply
+    /// to the next hub.
     aborted: usize,
 }
 
-/// A subscriber, with the time of the last sample of each run.
+/// A subscriber, with the time of the last sample that it has received.
 struct Receiver {
     process: Child,
-    /// Positions of two words in a line: the time at which the sample was received, and the run that the sample belongs
-    /// to.
+    /// Indexes of two words in a line of the subscriber: the time at which a sample was received, and the run of the
+    /// hub that sent the sample.
     words: (usize, usize),
     boot: u64,
     last_ns: u64,
@@ -250,7 +255,7 @@ impl Receiver {
         Receiver { process, words, boot: 0, last_ns: 0, silences_ms: Vec::new(), lines: Vec::new() }
     }
 
-    /// Waits for the next sample.
+    /// Waits for the next sample. If it is from a new run, stores the silence before it.
     fn next(&mut self) -> Outcome<()> {
         let line = self.process.next_line(STEP_TIMEOUT)?;
         let words = line.words();
@@ -266,7 +271,8 @@ impl Receiver {
         Ok(())
     }
 
-    /// Receives until there is a sample at or after `until_ns`, and until the run has changed `run_changes` times.
+    /// Receives samples until one has arrived at `until_ns` or later, and until the run of the hub has changed
+    /// `run_changes` times in total.
     fn receive_until(&mut self, until_ns: u64, run_changes: usize) -> Outcome<()> {
         while self.last_ns < until_ns || self.silences_ms.len() < run_changes {
             self.next()?;
@@ -275,7 +281,7 @@ impl Receiver {
     }
 }
 
-/// Kills the hub `kills` times. Kill number n happens `moment(n)` after the last byte of a telegram.
+/// Kills the hub `kills` times. Kill number n happens `moment(n)` nanoseconds after the last byte of a telegram.
 fn kill_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<KillResults> {
     let environment = BenchEnvironment::new()?;
     let sensor = SENSORS[0];
@@ -334,15 +340,15 @@ fn kill_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<Kil
     })
 }
 
-/// Time from one telegram of 361 beams to the next, in ns: two revolutions of the mirror.
+/// Time from one telegram of 361 beams to the next, in nanoseconds. This is the time of two revolutions of the mirror.
 const SCAN_PERIOD_NS: u64 = 26_640_000;
-/// Time before the end of a telegram at which the hub starts to read, in ns.
+/// Time before the end of a telegram at which the hub starts to read the telegram, in nanoseconds.
 const READ_AHEAD_NS: u64 = 600_000;
-/// Maximum difference between the times that two processes report for the same event, in ns.
+/// Maximum difference between the times that two processes report for the same event, in nanoseconds.
 const CLOCK_NOISE_NS: u64 = 400_000;
-/// Maximum delay of a hub that shares its processors, in ns.
+/// Maximum delay of a hub that shares its processors with other programs, in nanoseconds.
 const MAX_DELAY_NS: u64 = 4_000_000;
-/// Time after which the hub has certainly estimated the sensor's timing.
+/// Time after which the hub has certainly estimated the timing of the sensor.
 const SETTLE_TIME: Duration = Duration::from_millis(700);
-/// Time until a service manager restarts the hub: RestartSec of the unit.
+/// Time that a service manager waits before it restarts the hub: `RestartSec` of the unit.
 const RESTART_PAUSE: Duration = Duration::from_millis(20);

@@ -1,7 +1,7 @@
-//! CPU time of the hub for rotating scanners. The baseline is a reader that coalesces the scanners' packets in the same
-//! way and does nothing else. The bench also measures the accuracy of the stamps of packets and scans after the hub was
-//! stopped for half a second. Simulated scanners are on ptys, and each has two subscribers, which are processes. The
-//! bench does not measure the cost of a real adapter, or of subscribers.
+//! CPU time of the hub for rotating scanners. The baseline is a reader that reads several packets at a time, as the hub
+//! does, and does nothing else. The bench also measures how accurate the stamps of packets and scans are after the hub
+//! was stopped for half a second. The simulated scanners are on ptys, and each of them has two subscribers, which are
+//! processes. The bench does not measure the cost of a real adapter, or of subscribers.
 
 mod support;
 
@@ -37,9 +37,9 @@ fn main() -> ExitCode {
 struct ScannerGroup {
     family: &'static str,
     model: &'static str,
-    /// Approximate number of bytes per revolution.
+    /// Approximate number of bytes that a scanner sends per revolution.
     revolution_len: usize,
-    /// Number of bytes in a packet, and time from one packet to the next in ns.
+    /// Number of bytes in a packet, and time from one packet to the next in nanoseconds.
     packet: (usize, u64),
     load_figure: &'static str,
     missed_figure: &'static str,
@@ -89,7 +89,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Measures the CPU time of the hub and of its baseline, alternating on the same lines.
+/// Measures the CPU time of the hub and of the baseline. They run alternately on the same lines.
 fn load(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 2]> {
     let environment = BenchEnvironment::new()?;
     let _simulator = group.simulate(&environment, &SENSORS)?;
@@ -124,7 +124,7 @@ fn load(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 2]> {
     ])
 }
 
-/// Stops the hub repeatedly for half a second, while two scanners continue to send.
+/// Stops the hub repeatedly for half a second, while two scanners continue to send. Measures the errors of stamps.
 fn stalls(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 5]> {
     let environment = BenchEnvironment::new()?;
     let sensors = &SENSORS[..2];
@@ -140,7 +140,7 @@ fn stalls(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 5]> {
     thread::sleep(SETTLE_TIME);
     subscribers.iter().chain(&stamps).for_each(|subscriber| drop(subscriber.lines_so_far()));
     for round in 0..options.count(20) as u64 {
-        // A different phase of the revolution in each round.
+        // Stop the hub at another phase of the revolution in each round.
         thread::sleep(Duration::from_millis(1500 + 17 * (round % 10)));
         kill_process(process, Signal::STOP)?;
         thread::sleep(STALL_TIME);
@@ -180,7 +180,8 @@ fn stalls(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 5]> {
             baseline: none(),
             target: Target::Max(0.0),
         },
-        // Time in which a real scanner would have sent. Stamps may have errors of up to this time, and may be uneven.
+        // Time for which the simulator did not send, although a real scanner would have. The errors of stamps and the
+        // unevenness may be as long as this time.
         Figure { name: group.stall_figure, unit: "ms", hub: stood, baseline: none(), target: Target::None },
         Figure {
             name: group.unevenness_figure,
@@ -200,7 +201,7 @@ fn stalls(group: &ScannerGroup, options: &Options) -> Outcome<[Figure; 5]> {
 }
 
 impl ScannerGroup {
-    /// Starts scanners of this model at ptys, in one simulator.
+    /// Starts one simulator with scanners of this model at ptys.
     fn simulate(&self, environment: &BenchEnvironment, sensors: &[&str]) -> Outcome<Child> {
         environment.simulate_as(sensors, &self.flags())
     }
@@ -209,7 +210,7 @@ impl ScannerGroup {
         ["--family", self.family, "--model", self.model, "--world", "room"]
     }
 
-    /// Starts the hub and `per_sensor` subscribers per sensor, and waits for scans.
+    /// Starts the hub and `per_sensor` subscribers per sensor, and waits until each subscriber has received scans.
     fn start_hub(
         &self,
         environment: &BenchEnvironment,
@@ -235,7 +236,7 @@ impl ScannerGroup {
         Ok((hub, subscribers))
     }
 
-    /// Returns the CPU time of the hub, and the number of scans and packets that subscribers missed.
+    /// Returns the CPU time of the hub, and the number of scans and packets that the subscribers missed.
     fn load_of_hub(&self, environment: &BenchEnvironment, span: Duration) -> Outcome<(f64, f64)> {
         let (hub, subscribers) = self.start_hub(environment, &SENSORS, 2)?;
         thread::sleep(SETTLE_TIME);
@@ -264,7 +265,7 @@ impl ScannerGroup {
     }
 }
 
-/// Returns the CPU time of process `pid` in `span`, in percent.
+/// Returns the CPU time that the process `pid` needs in `span`, in percent of one processor.
 fn cpu_percent(pid: u32, span: Duration) -> Outcome<f64> {
     let (before, started) = (ThreadUsage::of(pid, |_| true)?, clock::now());
     thread::sleep(span);
@@ -284,16 +285,16 @@ fn lost(environment: &BenchEnvironment) -> Outcome<u64> {
     Ok(sum)
 }
 
-/// Names of the scanners on a large vehicle.
+/// Names of eight scanners, as many as a large vehicle has.
 const SENSORS: [&str; 8] = ["a", "b", "c", "d", "e", "f", "g", "h"];
-/// Time after which the start is complete, and rates and clocks are estimated.
+/// Time after which the hub has started, and has estimated rates and clocks.
 const SETTLE_TIME: Duration = Duration::from_secs(3);
-/// Length of a stall, as on an overloaded machine.
+/// Time for which the hub is stopped, as it may happen on an overloaded machine.
 const STALL_TIME: Duration = Duration::from_millis(500);
-/// Minimum error of a wrong stamp, in ms.
+/// Minimum error of a stamp that counts as wrong, in milliseconds.
 const MAX_STAMP_ERROR_MS: f64 = 5.0;
 
-/// Baseline of a hub whose scanners send packets without pause. It sleeps until there are bytes, waits 5 ms like the
+/// Baseline for scanners that send packets without a pause. It sleeps until there are bytes, waits for 5 ms like the
 /// hub, reads all bytes, and wakes two sleeping processes once per revolution. It has no framing, no checksum and no
 /// shared memory.
 ///
@@ -312,7 +313,7 @@ fn coalesce(revolution_len: usize, ports: &[&str]) -> Outcome<()> {
         let line = PtyLine::open(Path::new(port), 115_200)?;
         readers.push(thread::spawn(move || {
             if let Err(error) = read_revolutions(&line, &ends, revolution_len) {
-                // The baseline would be too low if one of its readers had ended.
+                // Exit on an error, because the load of the baseline would be too low without one of its readers.
                 eprintln!("baseline: {error}");
                 std::process::exit(1)
             }
@@ -342,10 +343,10 @@ fn read_revolutions(line: &PtyLine, ends: &[OwnedFd], revolution_len: usize) -> 
 
 /// Number of subscribers to a scanner.
 const SUBSCRIBERS_PER_SENSOR: usize = 2;
-/// Time for which the hub leaves packets unread in the line, in ns.
+/// Time for which the hub leaves packets unread in the line, in nanoseconds.
 const READ_INTERVAL_NS: u64 = 5_000_000;
 
-/// Receives the scans of `sensor` forever, and prints each: `scan STAMP_NS MISSED INCOMPLETE`.
+/// Receives the scans of `sensor` forever, and prints a line `scan STAMP_NS MISSED INCOMPLETE` for each scan.
 fn print_scans(domain: &str, sensor: &str) -> Outcome<()> {
     let mut scans = subscriber::subscribe::<Scan>(domain, sensor)?;
     let mut out = std::io::stdout().lock();
@@ -356,22 +357,22 @@ fn print_scans(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Receives the packets of `sensor`, of `len` bytes each, forever. Prints for each sample the stamp and the hash of its
-/// last packet: `packets STAMP_NS HASH`.
+/// Receives the packets of `sensor` forever. Each packet has `len` bytes. Prints a line `packets STAMP_NS HASH` for
+/// each sample, with the stamp and the hash of the sample's last packet.
 fn print_packets(domain: &str, sensor: &str, len: usize) -> Outcome<()> {
     let mut samples = subscriber::subscribe::<[u8]>(domain, sensor)?;
     let mut out = std::io::stdout().lock();
     loop {
         let Some(sample) = samples.next()? else { continue };
-        // Replies have other lengths.
+        // Leave out replies, which have other lengths.
         if let Some(last) = sample.rchunks_exact(len).next().filter(|_| sample.len() % len == 0) {
             writeln!(out, "packets {} {}", sample.header().stamp_last_ns, truth::hash(last))?;
         }
     }
 }
 
-/// Returns the maximum error of the stamps in `lines`, in ms, and the number of stamps whose error is more than
-/// `limit_ms`. `due` contains the times at which each packet was due, by the packet's hash.
+/// Returns the maximum error of the stamps in `lines` in milliseconds, and the number of stamps whose error exceeds
+/// `limit_ms`. `due` has the times at which each packet was due, by the hash of the packet.
 fn stamp_error_ms(
     lines: &[OutputLine],
     due: &HashMap<&str, Vec<u64>>,
@@ -407,8 +408,8 @@ impl ReceivedScans {
         Ok(scans)
     }
 
-    /// Returns the maximum deviation of the time between two consecutive scans from a whole number of revolutions, in
-    /// ms.
+    /// Returns the unevenness of the scans in milliseconds. It is the maximum difference between the time from one scan
+    /// to the next and the time of a whole number of revolutions.
     fn unevenness_ms(&self) -> f64 {
         let mut spans: Vec<f64> =
             self.stamps_ns.windows(2).map(|pair| pair[1].abs_diff(pair[0]) as f64 / 1e6).collect();

@@ -1,16 +1,15 @@
-//! Time until a sensor streams. The sensor starts in one of these states:
+//! Time until a sensor streams. At the start of the hub, the sensor is in one of these states:
 //!
-//! - at each of the four rates, idle, streaming or left in installation mode
-//! - just powered on, with quick replies. The baseline is a host that has the sensor's rate and sends no request for
+//! - idle, streaming or left in installation mode, at each of the four rates
+//! - just powered on, with quick replies. The baseline is a host that has the sensor's rate and sends no requests for
 //!   information
 //! - power-cycled in the middle of a scan while another sensor streams
 //!
-//! The bench does not measure how long a real sensor boots before it sends its boot message. That takes up to a minute.
+//! The bench does not measure how long a real sensor needs from power-on to its boot message, which is up to a minute.
 //!
-//! The simulated sensor takes 55 to 145 ms to reply, like recorded real sensors. A stream that already runs delivers
-//! telegrams at once. Scans follow when the sensor has reported its identity and the encoding of its values. The
-//! baseline of a start after power-on has the sensor's rate and sends no request for information: it changes the rate
-//! and starts the stream.
+//! The simulated sensor takes 55 to 145 ms to reply, like recorded real sensors. If a stream already runs, the hub
+//! publishes telegrams at once. Scans follow when the sensor has reported its identity and the encoding of its values.
+//! The baseline for a sensor that was just powered on only changes the rate and starts the stream.
 
 mod support;
 
@@ -58,9 +57,9 @@ fn start(rate: &str, state: &str) -> Outcome<f64> {
     Ok((scans.wait_for_line("scan", STEP_TIMEOUT)?.number(2)? - hub.started_ns) as f64 / 1e6)
 }
 
-/// Measures starts with an idle sensor at 9600 baud that replies after 60 ms. Three kinds of starts alternate: the
-/// first start of the hub, the next start with the state that the first one saved, and the baseline with the shortest
-/// possible dialog.
+/// Measures starts with an idle sensor at 9600 baud that replies after 60 ms. Three kinds of starts alternate. They are
+/// the first start of the hub, the next start with the state that the first hub has saved, and the baseline with the
+/// shortest possible dialog.
 fn cold_starts(count: usize) -> Outcome<[Figure; 2]> {
     let (mut first, mut again, mut shortest) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..count {
@@ -88,8 +87,8 @@ fn cold_starts(count: usize) -> Outcome<[Figure; 2]> {
     Ok([figure("power on, quick answers", first, 700.0), figure("the same, the next start", again, 700.0)])
 }
 
-/// Measures the time from exec of the hub until it has adopted an abandoned stream at the target rate, as its status
-/// reports.
+/// Measures the time from exec of the hub until its status reports that it has adopted an abandoned stream at the
+/// target rate.
 fn measure_adoption(count: usize) -> Outcome<Figure> {
     let mut hub = Vec::new();
     for _ in 0..count {
@@ -128,7 +127,7 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
         }
         let first = received[received.len() - 1].number(2)?;
         back.push((first - banner) as f64 / 1e6);
-        // Wait for the last telegrams of the other sensor.
+        // Wait until the last telegrams of the other sensor have been received.
         drop(healthy);
         let truth = SensorTruth::read(&environment.own_truth("rear"), "rear")?;
         let last = truth.sent.last().map(|sent| sent.hash.clone()).unwrap_or_default();
@@ -183,7 +182,7 @@ fn wait_for_boot_message(environment: &BenchEnvironment) -> Outcome<u64> {
 /// Flags of a sensor that is idle at 9600 baud and replies 60 ms after its ACK.
 const QUICK_FLAGS: [&str; 4] = ["--baud", "9600", "--fault", "answer=0.06"];
 
-/// Rate of the line, state of the sensor, and name of the figure.
+/// Rate of the line, state of the sensor, and name of the figure, for each case.
 const START_CASES: [(&str, &str, &str); 12] = [
     ("500000", "idle", "500000 Bd, idle"),
     ("500000", "streaming", "500000 Bd, streaming"),

@@ -1,7 +1,7 @@
-//! CPU time of the picture in a browser, delay until the picture shows a scan, and number of bytes that are sent. The
-//! bench uses `scanhub web` and a headless Chromium, and also viewers that draw nothing. The baseline is a page that
-//! draws the same number of points from memory as soon as the browser permits. The bench does not measure the delay of
-//! a screen and a graphics card.
+//! CPU time of the live picture in a browser, delay until the picture shows a scan, and number of bytes that the server
+//! sends. The bench uses `scanhub web` and a headless Chromium, and also viewers that draw nothing. The baseline is a
+//! page that draws the same number of points from memory as soon as the browser permits. The bench does not measure the
+//! additional delay of a screen and a graphics card.
 
 #[path = "../tests/it/browser.rs"]
 #[allow(dead_code, reason = "the tests press keys and make pictures, too")]
@@ -10,7 +10,7 @@ mod support;
 #[path = "../tests/testkit/child.rs"]
 mod test_child;
 
-/// The part of the testkit that the browser's driver needs.
+/// The part of the testkit that the driver of the browser needs.
 mod testkit {
     pub(crate) use crate::support::environment::STEP_TIMEOUT as WAIT_TIMEOUT;
     pub(crate) use crate::test_child::{Child, spawn};
@@ -69,7 +69,7 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Measures two sensors of 361 beams at 37.5 Hz.
+/// Measures the picture of two sensors with 361 beams at 37.5 Hz.
 fn measure_lms(series: &mut FigureList, span: Duration) -> Outcome<()> {
     let environment = BenchEnvironment::new()?;
     let _simulator = environment.simulate_as(&SENSORS, &["--baud", "500000", "--world", "demo"])?;
@@ -100,7 +100,8 @@ fn measure_lms(series: &mut FigureList, span: Duration) -> Outcome<()> {
     }
     drop(page);
 
-    // CPU time of server and hub, and ages of scans, with zero, one and sixteen viewers.
+    // Names of the figures with zero, one and sixteen viewers: CPU time of the server and of the hub, and ages of
+    // scans.
     let names = [
         [
             ("no viewer: server", Target::None),
@@ -144,8 +145,8 @@ fn measure_lms(series: &mut FigureList, span: Duration) -> Outcome<()> {
     Ok(())
 }
 
-/// Measures two sensors of 3240 beams at 10 Hz. The picture rotates, so that the page draws all of it as often as
-/// possible.
+/// Measures the picture of two sensors with 3240 beams at 10 Hz. The picture rotates, so that the page has to draw all
+/// of it in each frame.
 fn measure_rotating(series: &mut FigureList, span: Duration) -> Outcome<()> {
     let environment = BenchEnvironment::new()?;
     let world = environment.file("world").display().to_string();
@@ -186,7 +187,7 @@ fn measure_rotating(series: &mut FigureList, span: Duration) -> Outcome<()> {
     Ok(())
 }
 
-/// Starts the server, and returns its address.
+/// Starts the server, and returns the server and the address of its page.
 fn serve(environment: &BenchEnvironment) -> Outcome<(Child, String)> {
     let words = ["web", "--listen", "127.0.0.1:0", "--domain", environment.domain.name()];
     let web = Child::start(PROGRAM, &words.map(str::to_owned))?;
@@ -195,8 +196,8 @@ fn serve(environment: &BenchEnvironment) -> Outcome<(Child, String)> {
     Ok((web, url))
 }
 
-/// Returns the times from the receipt of a scan by a subscriber until the end of the frame that draws the scan, in ms,
-/// sorted.
+/// Returns the times from the receipt of a scan by a subscriber until the end of the frame that draws the scan, in
+/// milliseconds, sorted.
 fn delays(environment: &BenchEnvironment, page: &mut Browser, span: Duration) -> Outcome<Vec<f64>> {
     let over = AtomicBool::new(false);
     let (received, shown) = thread::scope(|scope| {
@@ -226,7 +227,7 @@ fn delays(environment: &BenchEnvironment, page: &mut Browser, span: Duration) ->
 
 type ReceivedStamps = HashMap<i64, f64>;
 
-/// Returns the times at which scans of `sensor` arrived, in ms since 1970. The keys are the stamps of the scans.
+/// Returns the times at which scans of `sensor` arrived, in milliseconds since 1970, by the stamp of the scan.
 fn receive(
     environment: &BenchEnvironment,
     sensor: &str,
@@ -246,12 +247,12 @@ fn receive(
     follow().map_err(|error| error.to_string())
 }
 
-/// Returns the stamp `stamp_ms`, which the page has in ms, in units of 5 us.
+/// Converts a stamp in milliseconds, as the page has it, to a number of 5 us. Such a number can be compared exactly.
 fn key(stamp_ms: f64) -> i64 {
     (stamp_ms * 200.0).round() as i64
 }
 
-/// Returns the ages of scans at a subscriber, in us, sorted.
+/// Returns the ages of scans at a subscriber in microseconds, sorted.
 fn ages(environment: &BenchEnvironment, span: Duration) -> Outcome<Vec<f64>> {
     let mut scans =
         subscriber::builder::<Scan>(environment.domain.name(), SENSORS[0]).timeout(STEP_TIMEOUT).open()?;
@@ -264,7 +265,7 @@ fn ages(environment: &BenchEnvironment, span: Duration) -> Outcome<Vec<f64>> {
     Ok(ages)
 }
 
-/// Returns the number of bytes per second of the topics in the default view, as lines of `echo --json`.
+/// Returns the number of bytes per second that `echo --json` prints for the topics in the default view of the page.
 fn echoed(environment: &BenchEnvironment, span: Duration) -> Outcome<f64> {
     let topics = ["*/scan", "*/foreground", "*/background", "*/marks", "*/zones", "*/status"];
     let run_for = format!("--for={}s", span.as_secs().max(1));
@@ -290,7 +291,8 @@ fn numbers(value: &Value) -> Vec<f64> {
     numbers
 }
 
-/// A page that needs no data. It draws 722 points as soon as the browser permits, 37.5 times per second.
+/// Script of the baseline page, which needs no data. It draws 722 points 37.5 times per second, each time as soon as
+/// the browser permits.
 const BLANK_SCRIPT: &str = "(() => {
     const canvas = document.createElement('canvas');
     [canvas.width, canvas.height] = [1280, 800];
@@ -312,7 +314,7 @@ const BLANK_SCRIPT: &str = "(() => {
         });
     }, 26.7);
 })()";
-/// Rotates the picture with each frame.
+/// Script that rotates the picture with each frame.
 const TURN_SCRIPT: &str = "(() => {
     const turn = () => {
         dispatchEvent(new KeyboardEvent('keydown', { key: '[' }));
@@ -320,7 +322,7 @@ const TURN_SCRIPT: &str = "(() => {
     };
     turn();
 })()";
-/// A world with walls on all sides, so that every beam has a range.
+/// World with walls on all sides, so that every beam has a range.
 const HALL_WORLD: &str =
     "[[thing]]\nline = [[6000, -6000], [6000, 6000], [-6000, 6000], [-6000, -6000], [6000, -6000]]\n";
 const NO_BROWSER: &str = "there is no browser (Debian: apt-get install chromium)";
@@ -328,7 +330,7 @@ const NO_BROWSER: &str = "there is no browser (Debian: apt-get install chromium)
 const SETTLE_TIME: Duration = Duration::from_secs(2);
 
 /// Runs a viewer without a picture. It subscribes to the same channels as the page, and reads as fast as possible for
-/// `span`. Returns the number of bytes per second in messages after the first second.
+/// `span`. Returns the number of bytes per second in the messages that arrive after the first second.
 fn run_viewer(url: &str, span: Duration) -> Outcome<f64> {
     let mut socket = connect(url)?;
     let (started, mut bytes, mut since) = (Instant::now(), 0, None);
@@ -359,7 +361,7 @@ fn run_viewer(url: &str, span: Duration) -> Outcome<f64> {
     Ok(bytes as f64 / since.ok_or("no message arrived")?.elapsed().as_secs_f64())
 }
 
-/// Starts `count` viewers, each in its own thread, until `span` has elapsed.
+/// Starts `count` viewers, each in its own thread, which run until `span` has elapsed.
 fn start_viewers(url: &str, count: usize, span: Duration) -> Vec<thread::JoinHandle<()>> {
     let one = |_| {
         let url = url.to_owned();
@@ -380,5 +382,5 @@ fn connect(url: &str) -> Outcome<WebSocket<TcpStream>> {
     Ok(socket)
 }
 
-/// Time at the start of a viewer's run that does not count.
+/// Time at the start of a viewer's run whose messages do not count.
 const WARM_UP_TIME: Duration = Duration::from_secs(1);

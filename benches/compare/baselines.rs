@@ -1,6 +1,7 @@
-//! Baselines in which a process wakes another one and does nothing else. One kind uses a word in shared memory on which
-//! the other process sleeps or spins; it costs one addition and one system call. The other kind uses an eventfd. Every
-//! mechanism contains one of these wake-ups. The rest of a mechanism's time is its own cost.
+//! Baselines in which a process wakes another process and does nothing else. One kind uses a word in shared memory on
+//! which the other process sleeps or spins. It costs one addition and one system call. The other kind uses an eventfd.
+//! Every compared mechanism contains one of these wake-ups. The rest of the mechanism's time is the cost of the
+//! mechanism itself.
 
 use std::io::{IoSlice, IoSliceMut};
 use std::mem::MaybeUninit;
@@ -178,7 +179,7 @@ fn received_descriptor(stream: &UnixStream) -> Outcome<OwnedFd> {
     Ok(received_descriptor.ok_or("no eventfd arrived")?)
 }
 
-/// Determines the message to which each wake-up belongs. A wake-up itself carries only a count.
+/// Determines the message to which each wake-up belongs. The wake-up itself has only a count.
 struct WakeupMatcher {
     mechanism: Mechanism,
     wakeup_count: u64,
@@ -216,5 +217,5 @@ impl WakeupMatcher {
     }
 }
 
-/// Timeout of a wait, in ns. It is longer than any step takes.
+/// Timeout of a wait, in nanoseconds. It is longer than any step of the bench takes.
 const STEP_TIMEOUT_NS: u64 = 10_000_000_000;

@@ -1,32 +1,33 @@
-//! Cost of a message from one process to N others. Topics of the hub, with each way to wait, are compared with the
-//! alternatives UDP multicast, Unix sockets, TCP and pipes. Bare wake-ups are the baselines. The runs alternate, so
-//! that other load on the machine affects all of them. The bench does not measure what a network or another machine
-//! adds.
+//! Cost of a message from one process to N other processes. The bench compares topics of the hub, with each way to
+//! wait, with UDP multicast, Unix sockets, TCP and pipes. The baselines are wake-ups without a message. The runs of the
+//! mechanisms alternate, so that other load on the machine affects all of them. The bench does not measure the
+//! additional cost of a network or of another machine.
 //!
 //! How to read the figures:
 //!
 //! - Latency is from just before the send until a process has the message and has read a byte of each cache line. The
 //!   latency of the last receiver covers only messages that all receivers got.
-//! - Every sender writes its whole message again: a topic's into the loan, the others' into their own memory. The
-//!   sender's CPU time therefore includes the writing and the sleep until the next message. "Sending alone" includes
-//!   neither.
+//! - Every sender writes the whole message again before each send. The sender of a topic writes it into the loan, and
+//!   the other senders write it into their own memory. The sender's CPU time therefore includes the writing, and the
+//!   sleep until the next message. "Sending alone" includes neither.
 //! - In the targets, the column "baseline" is the baseline or the socket with which topics are compared.
-//! - With more receivers than processors, the last receiver waits until the others have used the processors. This is
-//!   true for every mechanism.
-//! - UDP datagrams hold 65,507 bytes, and Unix datagram sockets 65,536. Longer messages are sent in parts, and one
-//!   lost part loses the message.
-//! - At full speed, streams, pipes and Unix datagrams wait for their receivers; multicast and topics lose messages.
-//! - The baselines `futex` and `cache line` use the hub's own doorbell: one addition and one system call. The baseline
-//!   `eventfd` uses no code of the hub.
-//! - Topics are a service with the hub's settings for messages of any length. For the scan there is also
-//!   `Subscriber::next`.
+//! - If there are more receivers than processors, the last receiver waits until the other receivers have used the
+//!   processors. This is true for every mechanism.
+//! - UDP datagrams hold 65,507 bytes, and Unix datagram sockets 65,536. Longer messages are sent in parts, and if one
+//!   part is lost, the message is lost.
+//! - Without a pause between messages, streams, pipes and Unix datagrams wait for their receivers. Multicast and topics
+//!   lose messages instead.
+//! - The baselines `futex` and `cache line` use the hub's own doorbell, which costs one addition and one system call.
+//!   The baseline `eventfd` uses no code of the hub.
+//! - In this bench, topics are a service with the hub's settings and with messages of any length. For messages as long
+//!   as a scan, `Subscriber::next` of the client library is also measured.
 //! - For each sample, the shared-memory library checks all possible subscriber slots three times. For one small message
 //!   to one receiver, a pipe or a Unix socket needs less memory than the slots. At 37.5 Hz, the slots have left the
-//!   caches before each message. For the same reason, spinning does not reach the microsecond that it reaches when
-//! - For the event, the library sends one datagram to each listener, and the listener needs one more system call for
-//!   it. The event takes about twice as long as a futex. The doorbell wakes all sleeping subscribers at once, so they
-//!   compete for two cores.
-//!   they compete for two cores.
+//!   caches before each message. For the same reason, spinning does not reach the latency of a microsecond that it
+//!   reaches when messages arrive without a pause.
+//! - To signal the event, the library sends one datagram to each listener, and the listener needs one more system call
+//!   to receive it. The event takes about twice as long as a futex.
+//! - The doorbell wakes all sleeping subscribers at once, so they compete for two cores.
 
 mod baselines;
 mod message;
@@ -49,7 +50,7 @@ use run::{Case, PhaseFigures};
 use support::environment::BenchEnvironment;
 use support::{Options, Outcome};
 
-/// Results of a mechanism in one phase, one per run.
+/// Results of a mechanism in one phase, with one result per run.
 pub(crate) struct Cell {
     pub(crate) case: Case,
     /// Index of the phase in the schedule.
@@ -58,12 +59,12 @@ pub(crate) struct Cell {
 }
 
 impl Cell {
-    /// Returns whether messages are sent at a rate.
+    /// Returns whether messages are sent at a rate, and not without a pause.
     fn is_paced(&self) -> bool {
         PHASES[self.phase].period_ns > 0
     }
 
-    /// Returns whether the messages, receivers and rate are the same.
+    /// Returns whether `other` has messages of the same length, the same number of receivers and the same rate.
     fn has_same_load(&self, other: &Cell) -> bool {
         let place = |cell: &Cell| (cell.case.payload, cell.case.receivers, cell.phase);
         place(self) == place(other)
@@ -81,7 +82,7 @@ fn main() -> ExitCode {
     support::main_with(run_part, measure)
 }
 
-/// Runs a process of a run, which is selected by its command line.
+/// Runs one process of a run. The words of the command line select the process.
 fn run_part(words: &[&str]) -> Outcome<()> {
     let [part, way, payload, receivers, domain, place, ref rest @ ..] = *words else {
         return Err(format!("unknown part {words:?}").into());
@@ -124,8 +125,8 @@ fn measure(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Runs all mechanisms with the same messages and the same number of receivers, `pairs` times. Each time, another
-/// mechanism runs first.
+/// Runs all mechanisms with the same messages and the same number of receivers, `pairs` times. In each repetition,
+/// another mechanism runs first.
 fn compare(
     stage: &BenchEnvironment,
     payload: usize,

@@ -1,5 +1,5 @@
-//! The mechanisms that are compared, the messages that each of them carries, and the phases in which messages are sent.
-//! Sender and receivers both use these definitions.
+//! The mechanisms that the bench compares, the messages that each of them transfers, and the phases in which messages
+//! are sent. Sender and receivers both use these definitions.
 
 use std::hint::black_box;
 
@@ -7,14 +7,14 @@ use scanhub_schema::{ArrayFlags, Scan};
 
 use crate::support::Outcome;
 
-/// A mechanism that carries messages from one process to others, and what the receivers wait for.
+/// A mechanism that transfers messages from one process to others, and the way in which the receivers wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Mechanism {
-    /// A topic of the hub; receivers sleep on its doorbell.
+    /// A topic of the hub. Receivers sleep on its doorbell.
     Doorbell,
-    /// A topic; receivers sleep on its event.
+    /// A topic of the hub. Receivers sleep on its event.
     Event,
-    /// A topic; receivers poll its doorbell without pause.
+    /// A topic of the hub. Receivers poll its doorbell without a pause.
     Spin,
     /// The scan topic itself, received with the client library as programs do.
     Subscription,
@@ -28,11 +28,11 @@ pub(crate) enum Mechanism {
     Tcp,
     /// A pipe for each receiver.
     Pipe,
-    /// Only a wake-up by futex.
+    /// A wake-up by futex, without a message.
     FutexBaseline,
-    /// Only a wake-up by eventfd.
+    /// A wake-up by eventfd, without a message.
     EventfdBaseline,
-    /// Only a cache line that another processor changes.
+    /// A cache line that another processor changes, without a message.
     SpinBaseline,
 }
 
@@ -79,7 +79,7 @@ impl Mechanism {
             .ok_or_else(|| format!("unknown mechanism {name}"))?)
     }
 
-    /// Returns whether users would choose this mechanism instead of topics.
+    /// Returns whether this is a mechanism that users could choose instead of topics.
     pub(crate) fn is_alternative(self) -> bool {
         matches!(
             self,
@@ -91,7 +91,7 @@ impl Mechanism {
         )
     }
 
-    /// Returns whether this is a baseline, which wakes and carries no data.
+    /// Returns whether this is a baseline, which wakes the receiver but transfers no message.
     pub(crate) fn is_baseline(self) -> bool {
         matches!(self, Mechanism::FutexBaseline | Mechanism::EventfdBaseline | Mechanism::SpinBaseline)
     }
@@ -105,9 +105,9 @@ impl Mechanism {
             )
     }
 
-    /// Returns whether the mechanism is run with this number of receivers and messages of this size. A receiver that
-    /// spins needs its own processor, and so does the sender. A baseline has one receiver. The client library is
-    /// compared only for messages of the length of a scan.
+    /// Returns whether the bench runs the mechanism with this number of receivers and with messages of this length. A
+    /// receiver that spins needs its own processor, and so does the sender. A baseline has one receiver. The client
+    /// library is compared only for messages of the length of a scan.
     pub(crate) fn is_run_with(self, receivers: usize, payload: usize, processors: usize) -> bool {
         match self {
             Mechanism::Spin => receivers < processors,
@@ -119,19 +119,19 @@ impl Mechanism {
     }
 }
 
-/// Identification of a message. It is written to both ends of the message.
+/// Identification of a message. The sender writes it to the start and to the end of the message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Label {
-    /// Index of its phase in [`PHASES`].
+    /// Index in [`PHASES`] of the phase to which the message belongs.
     pub(crate) phase: usize,
-    /// Number of the message in its phase, from 0.
+    /// Number of the message within its phase, starting at 0.
     pub(crate) number: u64,
-    /// Whether it only reports the end of its phase.
+    /// Whether the message only reports the end of its phase.
     pub(crate) is_end: bool,
 }
 
 impl Label {
-    /// Writes the label to both ends of `bytes`.
+    /// Writes the label to the start and to the end of `bytes`.
     pub(crate) fn write(self, bytes: &mut [u8]) {
         let kind = self.phase as u64 * 2 + u64::from(self.is_end);
         let number = self.number.to_le_bytes();
@@ -141,8 +141,8 @@ impl Label {
         bytes[tail..].copy_from_slice(&number);
     }
 
-    /// Reads a byte of each cache line of a message, and returns its label. Fails if the two ends of `bytes` belong to
-    /// different messages.
+    /// Reads a byte of each cache line of a message, and returns its label. Fails if the labels at both ends of `bytes`
+    /// are different.
     pub(crate) fn read(bytes: &[u8]) -> Outcome<Label> {
         black_box(bytes.iter().step_by(CACHE_LINE_LEN).fold(0u64, |sum, byte| sum + u64::from(*byte)));
         let [number, kind] = [&bytes[..NUMBER_LEN], &bytes[NUMBER_LEN..LABEL_LEN]].map(word);
@@ -157,8 +157,8 @@ fn word(bytes: &[u8]) -> u64 {
     bytes.iter().rev().fold(0, |word, byte| word << 8 | u64::from(*byte))
 }
 
-/// A message in the sender's own memory. The sender writes it again for each send, because a real sender has just
-/// computed its data.
+/// A message in the sender's own memory. The sender writes the message again before each send, because a real sender
+/// would have just computed its data.
 pub(crate) struct MessageBuffer {
     contents: Vec<u8>,
     bytes: Vec<u8>,
@@ -189,12 +189,12 @@ impl MessageBuffer {
     }
 }
 
-/// Returns the content of a message of `len` bytes. The label then overwrites both ends.
+/// Returns the content of a message of `len` bytes. The label then overwrites the start and the end.
 pub(crate) fn contents(len: usize) -> Vec<u8> {
     (0..len).map(|i| i as u8).collect()
 }
 
-/// Beams of the hub's own messages: 180 degrees at 0.5 degrees.
+/// Number of beams in the hub's own messages: 180 degrees in steps of 0.5 degrees.
 pub(crate) const BEAM_COUNT: usize = 361;
 /// Length of a scan of [`BEAM_COUNT`] beams.
 pub(crate) const SCAN_LEN: usize = Scan::len(BEAM_COUNT, ArrayFlags::UPPER);
@@ -208,29 +208,29 @@ const CACHE_LINE_LEN: usize = 64;
 pub(crate) struct Phase {
     /// Name in tables.
     pub(crate) name: &'static str,
-    /// Time from one message to the next, in ns; 0 for no pause.
+    /// Time from one message to the next, in nanoseconds, or 0 for messages without a pause.
     pub(crate) period_ns: u64,
     /// Maximum number of messages.
     max_count: usize,
-    /// Time after which the phase ends in any case, in ns. Some mechanisms cannot keep the rate.
+    /// Maximum duration of the phase, in nanoseconds. The limit exists because some mechanisms cannot keep the rate.
     max_ns: u64,
 }
 
 impl Phase {
-    /// Returns the number of messages that `mechanism` sends. Baselines send only at a rate, because a wake-up counts
-    /// only while a receiver waits.
+    /// Returns the number of messages that `mechanism` sends. Baselines send only in phases with a rate, because a
+    /// wake-up can be counted only while the receiver waits.
     pub(crate) fn count(&self, mechanism: Mechanism) -> usize {
         if mechanism.is_baseline() && self.period_ns == 0 { 0 } else { self.max_count }
     }
 
-    /// Returns the time after which the phase ends in any case, in ns from its start. Receivers of a baseline detect
-    /// the end by the count alone.
+    /// Returns the maximum duration of the phase with `mechanism`, in nanoseconds. It is not limited for baselines,
+    /// whose receivers detect the end only by the number of wake-ups.
     pub(crate) fn max_ns(&self, mechanism: Mechanism) -> u64 {
         if mechanism.is_baseline() { u64::MAX } else { self.max_ns }
     }
 }
 
-/// The phases in their order. The first phase fills memory and caches, and does not count.
+/// The phases in their order. The first phase only fills memory and caches, so its results do not count.
 pub(crate) const PHASES: [Phase; 4] = [
     Phase { name: "warm-up", period_ns: 1_000_000, max_count: 20, max_ns: 40_000_000 },
     Phase { name: "37.5 Hz", period_ns: 26_666_667, max_count: 28, max_ns: 900_000_000 },

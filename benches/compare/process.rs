@@ -1,5 +1,5 @@
-//! The sending and the receiving process of a run. Both work with any mechanism. They print the time at which each
-//! message was sent or received, and the CPU time that this took.
+//! The sending and the receiving process of a run. Both of them work with any mechanism. They print the time at which
+//! each message was sent or received, and the CPU time for sending or receiving.
 
 use std::fmt::Write as _;
 use std::io::ErrorKind;
@@ -12,7 +12,7 @@ use super::message::{Label, Mechanism, PHASES, Phase};
 use super::{baselines, sockets, topic};
 use crate::support::{Outcome, clock};
 
-/// The run that sender and receivers belong to.
+/// Parameters of the run to which a sender or a receiver belongs.
 pub(crate) struct RunParameters<'a> {
     pub(crate) mechanism: Mechanism,
     /// Length of a message, in bytes.
@@ -26,15 +26,15 @@ pub(crate) struct RunParameters<'a> {
 
 /// Sending end of a mechanism.
 pub(crate) trait MessageSender {
-    /// Returns the address that receivers need in order to connect, or "-".
+    /// Returns the address that receivers need to connect, or "-" if they need none.
     fn address(&self) -> Outcome<String> {
         Ok("-".into())
     }
 
-    /// Connects to all receivers, which are ready by now.
+    /// Connects to all receivers. They are already waiting for the connection.
     fn open(&mut self) -> Outcome<()>;
 
-    /// Writes a message to the memory that it will be sent from. Mechanisms that carry no data write nothing.
+    /// Writes a message to the memory from which it will be sent. Baselines write nothing.
     fn write(&mut self, label: Label) -> Outcome<()>;
 
     /// Sends the written message to all receivers.
@@ -48,8 +48,8 @@ pub(crate) trait MessageSender {
 }
 
 /// Sends until the control socket reports the end. Prints `ready ADDRESS`, `open`, and for each phase `sent BUSY_NS
-/// SENDING_NS SENT_NS..`. SENDING_NS is the CPU time without the writing of messages and the waits. It is 0 if it was
-/// not measured.
+/// SENDING_NS SENT_NS..`. BUSY_NS is the whole CPU time. SENDING_NS is the CPU time without the writing of messages and
+/// without the waits, or 0 if it was not measured.
 pub(crate) fn send_all(task: &RunParameters) -> Outcome<()> {
     let control_socket = UnixDatagram::bind(control_path(task.path_prefix))?;
     let mut outlet = sender(task)?;
@@ -81,13 +81,13 @@ pub(crate) fn send_all(task: &RunParameters) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns the path of the socket on which the bench signals the sender to continue.
+/// Returns the path of the socket through which the bench makes the sender continue.
 pub(crate) fn control_path(path_prefix: &str) -> String {
     format!("{path_prefix}-control")
 }
 
-/// Returns the CPU time of this thread, in ns. Schedstat has the same value, but the kernel updates it only at the end
-/// of a tick or of a sleep.
+/// Returns the CPU time of this thread, in nanoseconds. The file schedstat has the same value, but the kernel updates
+/// the file only at the end of a tick or of a sleep.
 pub(crate) fn busy_ns() -> u64 {
     let busy = clock_gettime(ClockId::ThreadCPUTime);
     busy.tv_sec as u64 * 1_000_000_000 + busy.tv_nsec as u64
@@ -127,7 +127,8 @@ fn send(
             break;
         }
         sender.write(Label { phase: position, number, is_end: false })?;
-        // Reading the clock is a system call, which would slow down a sender that never pauses.
+        // Read the CPU time only in phases with a rate, because reading it is a system call that would slow down a
+        // sender without pauses.
         let before = (phase.period_ns > 0).then(busy_ns);
         sent.push(clock::now());
         sender.send()?;
@@ -158,7 +159,8 @@ fn is_signaled(socket: &UnixDatagram) -> Outcome<bool> {
     }
 }
 
-/// Interval at which the sender reports the end of a phase again if the report can be lost.
+/// Interval at which the sender reports the end of a phase again. The sender repeats the report only if the mechanism
+/// can lose messages.
 const END_REPEAT_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Receiving end of a mechanism.

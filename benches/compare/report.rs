@@ -1,5 +1,5 @@
-//! The tables and the targets. There is one table for each length of messages, number of receivers and rate. A target
-//! is the maximum cost of topics relative to the baselines or to the cheapest socket.
+//! The tables and the targets of the bench. There is one table for each combination of message length, number of
+//! receivers and rate. A target is the maximum cost of topics relative to the baselines or to the cheapest socket.
 
 use serde_json::{Value, json};
 
@@ -13,8 +13,8 @@ use crate::support::figures::{self, Spread, percentile};
 type FigureOf = fn(&PhaseFigures) -> Option<f64>;
 
 /// Prints the machine, and then all tables. With `--json`, prints a line `{class: "machine", bench, machine,
-/// processors, runs}` and the most important figures as cells. It then prints a line of class `compared` with all
-/// figures for each mechanism, length, number of receivers and rate.
+/// processors, runs}` and the most important figures as cells. Then prints a line of class `compared` with all figures
+/// for each combination of mechanism, message length, number of receivers and rate.
 pub(crate) fn print_tables(options: &Options, processors: usize, pairs: usize, cells: &[Cell]) {
     let digests = cells.iter().flat_map(digests).collect::<Vec<_>>();
     if options.json {
@@ -53,7 +53,7 @@ const COST_FIGURES: [(&str, &str, FigureOf); 6] = [
     ("sent, of the rate", "%", |run| run.kept_percent),
 ];
 
-/// Returns all figures, for people.
+/// Returns all figures of `cell`, for the tables.
 fn columns(cell: &Cell) -> Vec<figures::Cell> {
     let Case { mechanism, payload, receivers } = cell.case;
     let figure = |description: &str, (column, unit, of): (&str, &'static str, FigureOf)| figures::Cell {
@@ -67,7 +67,7 @@ fn columns(cell: &Cell) -> Vec<figures::Cell> {
     latency.chain(COST_FIGURES.into_iter().map(|column| figure("cost", column))).collect()
 }
 
-/// Returns the most important figures, with one column for each number of receivers.
+/// Returns the most important figures of `cell`. There is one column for each number of receivers.
 fn digests(cell: &Cell) -> Vec<figures::Cell> {
     const PACED_FIGURES: [(&str, &str, FigureOf); 2] = [
         ("latency of the last receiver, p50", "us", |run| run.last[0]),
@@ -105,7 +105,7 @@ fn comparison_line(cell: &Cell) -> Value {
     line
 }
 
-/// Returns the value of each run that has one.
+/// Returns the figure that `of` selects, for each run that has this figure.
 fn values(cell: &Cell, of: FigureOf) -> Vec<f64> {
     cell.runs.iter().filter_map(of).collect()
 }
@@ -119,8 +119,8 @@ fn machine() -> String {
 }
 
 /// Prints the targets of topics relative to the baselines and to the cheapest socket, and whether they are met. With
-/// `--json`, prints lines of class `measurement`, whose `baseline` is the mechanism that topics are compared with. It
-/// also prints a line of class `above` for each cell in which a socket is cheaper.
+/// `--json`, prints lines of class `measurement`, whose `baseline` is the mechanism with which topics are compared.
+/// Also prints a line of class `above` for each cell in which a socket is cheaper.
 pub(crate) fn print_targets(options: &Options, cells: &[Cell]) {
     let mut verdicts = Vec::new();
     for cell in cells.iter().filter(|cell| cell.is_paced()) {
@@ -140,14 +140,15 @@ struct TargetCheck {
     unit: &'static str,
     /// One value per run.
     topic_values: Vec<f64>,
-    /// Values of the mechanism that the topic is compared with, one per run. Empty if there is none.
+    /// Values of the mechanism with which the topic is compared, one per run. Empty if the target is an absolute value.
     compared_values: Vec<f64>,
     target: String,
     is_met: bool,
 }
 
 impl TargetCheck {
-    /// Compares `cell` with `other`. The target is that `cell` takes at most `max_ratio` times as much.
+    /// Compares a figure of `cell` with the same figure of `other`. The target is that the figure of `cell` is at most
+    /// `max_ratio` times as high.
     fn check_ratio(
         cell: &Cell,
         other: &Cell,
@@ -167,7 +168,8 @@ impl TargetCheck {
         Some(verdict)
     }
 
-    /// Returns the ratio for each run, because the two runs of a pair happen within the same minute.
+    /// Returns the ratio for each pair of runs. The two runs of a pair are compared, because they happen within the
+    /// same minute.
     fn ratios(&self) -> Vec<f64> {
         self.topic_values.iter().zip(&self.compared_values).map(|(ours, other)| ours / other).collect()
     }
@@ -209,7 +211,7 @@ fn check_waits(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     )
 }
 
-/// Checks spinning. The other processors must be idle for this.
+/// Checks the latency of subscribers that spin. The other processors must be idle for this.
 fn check_spinning(cell: &Cell, cells: &[Cell]) -> Option<TargetCheck> {
     const MAX_LATENCY_US: f64 = 1.0;
     if cell.case.mechanism != Mechanism::Spin || cell.case.payload > MAX_HUB_MESSAGE_LEN {
@@ -261,7 +263,7 @@ fn check_many_receivers(cell: &Cell, cells: &[Cell]) -> Vec<TargetCheck> {
 }
 
 /// Compares the sender and the last receiver with the cheapest socket. There is one target for all cells together, and
-/// one for each cell in which topics take more than the socket.
+/// another target for each cell in which topics take more time than the socket.
 fn check_sockets(cells: &[Cell]) -> Vec<TargetCheck> {
     const LAST_FIGURE: (&str, FigureOf) = ("last receiver's p50", |run| run.last[0]);
     let mut verdicts = Vec::new();
@@ -315,8 +317,8 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     percentile(&values, 0.5)
 }
 
-/// CPU time of the sender per message. The first figure includes writing the message and the wait until it is due. The
-/// second one excludes both.
+/// CPU time of the sender per message. The first figure includes writing the message and waiting until the message is
+/// due. The second figure excludes both.
 const SENDER_FIGURES: [(&str, FigureOf); 2] =
     [("sender's CPU time", |run| Some(run.sender_us)), ("sending alone", |run| run.sending_us)];
 /// Maximum length of the hub's own messages.

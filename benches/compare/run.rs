@@ -1,5 +1,5 @@
-//! A run of one mechanism with one number of receivers and one length of messages. It starts the processes, controls
-//! them through all phases, and computes figures from their output.
+//! A run of one mechanism with one number of receivers and one length of messages. This module starts the processes,
+//! controls them through all phases, and computes figures from their output.
 
 use std::os::unix::net::UnixDatagram;
 
@@ -21,9 +21,11 @@ pub(crate) struct Case {
 /// Figures of one phase.
 #[derive(Clone, Debug)]
 pub(crate) struct PhaseFigures {
-    /// Time from just before the send until a receiver has the message, over all receivers: p50, p99, p99.9, in us.
+    /// Time from just before the send until a receiver has the message, over all receivers: p50, p99 and p99.9, in
+    /// microseconds.
     pub(crate) latency: [Option<f64>; 3],
-    /// The same time for the last receiver of each message, if all receivers received the message.
+    /// Time like `latency`, but only for the last receiver of each message. Only messages that all receivers have
+    /// received count.
     pub(crate) last: [Option<f64>; 3],
     /// CPU time of the sender per message, in us. It includes writing the message and waiting until it is due.
     pub(crate) sender_us: f64,
@@ -35,7 +37,8 @@ pub(crate) struct PhaseFigures {
     pub(crate) rate_hz: f64,
     /// Messages that were not received, in %.
     pub(crate) missed_percent: f64,
-    /// Messages that were sent, in % of those that the rate requires; `None` without a rate.
+    /// Number of messages that were sent, in percent of the number that the rate requires. `None` if messages are not
+    /// sent at a rate.
     pub(crate) kept_percent: Option<f64>,
 }
 
@@ -85,11 +88,11 @@ impl Case {
     }
 }
 
-/// Output of a process about one phase.
+/// Output of a sending or receiving process about one phase.
 struct Report {
     busy_ns: u64,
-    /// For a sender: the CPU time of sending, and then the time of each message. For a receiver: the number and the
-    /// time of each message, alternating.
+    /// For a sender, the CPU time of sending, followed by the time at which each message was sent. For a receiver, the
+    /// number of each message and the time at which it was received, alternating.
     numbers: Vec<u64>,
 }
 

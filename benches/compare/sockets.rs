@@ -1,4 +1,4 @@
-//! The alternatives that users would choose instead of topics: UDP multicast, Unix sockets, TCP and pipes.
+//! The mechanisms that users could choose instead of topics: UDP multicast, Unix sockets, TCP and pipes.
 
 use std::fs::{File, OpenOptions};
 use std::io::{IoSlice, IoSliceMut, Read, Write};
@@ -21,15 +21,15 @@ use super::message::{Label, MIN_MESSAGE_LEN, Mechanism, MessageBuffer};
 use super::process::{MessageReceiver, MessageSender, RunParameters};
 use crate::support::Outcome;
 
-/// Sending sockets for datagrams. UDP multicast on the loopback has one socket for the group, and Unix datagrams have
-/// one socket per receiver. The sender splits a message that is longer than a datagram, and the receiver reassembles
-/// it, as a user's program would do. If one of the datagrams is lost, the message is lost.
+/// Sending sockets for datagrams. For UDP multicast on the loopback, one socket sends to the group. For Unix datagrams,
+/// each receiver has its own socket. The sender splits a message that is longer than a datagram, and the receiver
+/// reassembles it, as a user's program would do. If one of the datagrams is lost, the message is lost.
 pub(crate) struct DatagramSender {
     group: Option<Ipv4Addr>,
     paths: Vec<String>,
     sockets: Vec<OwnedFd>,
     buffer: MessageBuffer,
-    /// Number of bytes of a message in one datagram.
+    /// Number of bytes of a message that one datagram contains.
     part_len: usize,
 }
 
@@ -122,12 +122,13 @@ impl DatagramReceiver {
             _ => UnixDatagram::bind(socket_path(task.path_prefix, number))?.into(),
         };
         let (len, part_len) = (task.payload, max_part_len(task));
-        // A part of another message may arrive instead of the last part, and may be longer.
+        // Make room for a longer part after the message. The part of another message may arrive in place of the last
+        // part, and may be longer than the last part.
         Ok(DatagramReceiver { socket, message: vec![0; len + part_len], len, part_len, received_parts: 0 })
     }
 
-    /// Receives the next part, and writes it after the parts that have arrived. Returns the label of the message if the
-    /// part was its last one.
+    /// Receives the next part, and writes it after the parts that have arrived. If this part completes the message,
+    /// returns the label of the message.
     fn take_part(&mut self) -> Outcome<Option<Label>> {
         let place = self.received_parts * self.part_len;
         let (mut number, mut index) = ([0; NUMBER_LEN], [0; NUMBER_LEN]);
@@ -143,7 +144,7 @@ impl DatagramReceiver {
         if index == 0 {
             self.message.copy_within(place..place + self.part_len, 0);
         } else if index != self.received_parts || self.message[..NUMBER_LEN] != number {
-            // The message with the parts that have arrived will never be complete.
+            // A part is missing, so the message whose other parts have arrived will never be complete.
             self.received_parts = 0;
             return Ok(None);
         }
@@ -196,7 +197,8 @@ fn socket_path(path_prefix: &str, number: usize) -> String {
     format!("{path_prefix}-mailbox-{number}")
 }
 
-/// Length of each of the two numbers at the start of a part: the number of the message, and the index of the part.
+/// Length of each of the two numbers at the start of a part. These are the number of the message and the index of the
+/// part.
 const NUMBER_LEN: usize = size_of::<u64>();
 /// Maximum length of a UDP datagram.
 const MAX_UDP_LEN: usize = 65_507;
@@ -204,12 +206,12 @@ const MAX_UDP_LEN: usize = 65_507;
 const MAX_UNIX_LEN: usize = 65_536;
 /// Receive buffer of a member of the group, in bytes.
 const RECEIVE_BUFFER_LEN: usize = 4 << 20;
-/// Port of all groups; each run has its own group.
+/// UDP port of all groups. Each run has its own group.
 const GROUP_PORT: u16 = 29_183;
 
 /// The sending ends of Unix stream sockets, TCP or pipes. Each receiver has its own connection, and each message is one
-/// write per connection. All messages have the same length, so a receiver reads exactly one message, if possible with
-/// one read.
+/// write per connection. All messages have the same length, so a receiver reads exactly one message at a time, if
+/// possible with one call of `read`.
 pub(crate) struct StreamSender {
     listener: Listener,
     receivers: usize,
@@ -217,7 +219,7 @@ pub(crate) struct StreamSender {
     buffer: MessageBuffer,
 }
 
-/// The addresses on which receivers connect.
+/// A listening socket or a pipe's paths, through which receivers connect.
 enum Listener {
     Unix(UnixListener, String),
     Tcp(TcpListener),
@@ -269,8 +271,8 @@ impl MessageSender for StreamSender {
                 }
                 Listener::Pipes(paths) => {
                     let end = OpenOptions::new().write(true).open(&paths[number])?;
-                    // Make the pipe as large as a message. If the system does not permit that, the size does not
-                    // change.
+                    // Make the pipe as large as a message. If the system does not permit this size, the pipe keeps its
+                    // old size.
                     let _ = fcntl_setpipe_size(&end, self.buffer.bytes().len().max(PIPE_LEN));
                     end
                 }
@@ -316,7 +318,7 @@ impl StreamReceiver {
     pub(crate) fn new(task: &RunParameters, number: usize, address: &str) -> Outcome<StreamReceiver> {
         let end = match task.mechanism {
             Mechanism::Tcp => File::from(OwnedFd::from(TcpStream::connect(address)?)),
-            // Opened also for writing, because a pipe without a writer is at its end.
+            // Open the pipe for writing, too, because a pipe without a writer is at its end.
             Mechanism::Pipe => OpenOptions::new()
                 .read(true)
                 .write(true)
@@ -343,5 +345,5 @@ fn pipe_path(path_prefix: &str, number: usize) -> String {
     format!("{path_prefix}-pipe-{number}")
 }
 
-/// Default size of a pipe.
+/// Minimum size of a pipe, which is the default size of the system.
 const PIPE_LEN: usize = 1 << 16;

@@ -1,6 +1,6 @@
-//! Topics of two kinds: a service of bytes with the hub's settings for messages of any length, and for comparison the
-//! hub's topic `scan`. Both are published as in the hub. The publisher loans a sample, writes it in place, sends it,
-//! and then wakes all subscribers once.
+//! Topics of two kinds. The first kind is a service of bytes with the hub's settings, for messages of any length. For
+//! comparison, the second kind is the hub's topic `scan`. Both are published as in the hub. The publisher loans a
+//! sample, writes it in place, sends it, and then wakes all subscribers once.
 
 use iceoryx2::prelude::ServiceName;
 use scanhub_schema::limits::TopicLimits;
@@ -74,7 +74,7 @@ impl BytesSender {
         Ok(BytesSender { written: None, publisher, _service: service, contents: contents(task.payload), hub })
     }
 
-    /// Writes a message of this length into a loan.
+    /// Loans a sample of this length, and writes a message into it.
     fn loan(&mut self, label: Label, len: usize) -> Outcome<()> {
         let loan = self.publisher.loan_slice_uninit(len).map_err(|error| format!("no loan: {error:?}"))?;
         let sample = self.written.insert(loan.write_from_slice(&self.contents[..len]));
@@ -111,9 +111,10 @@ pub(crate) struct BytesReceiver {
 
 /// The way in which a subscriber waits, as in the client library.
 enum WaitMethod {
-    /// The doorbell, the doorbell's count when samples were last received, and whether the subscriber sleeps.
+    /// The doorbell, the count of the doorbell when samples were last received, and whether the subscriber sleeps (or
+    /// spins).
     Doorbell(Doorbell, u32, bool),
-    /// The event, and whether the subscriber has taken wake-ups since its last sleep.
+    /// The event, and whether the subscriber has taken the wake-ups of the event since its last sleep.
     Event(Box<Listener>, bool),
 }
 
@@ -149,8 +150,8 @@ impl MessageReceiver for BytesReceiver {
 }
 
 impl WaitMethod {
-    /// Sleeps or spins until a sample may have arrived. Returns at once if one may have arrived since samples were last
-    /// received.
+    /// Sleeps or spins until a sample may have arrived. Returns at once if a sample may have arrived since samples were
+    /// last received.
     fn wait(&mut self) -> Outcome<()> {
         match self {
             WaitMethod::Doorbell(doorbell, ring_count, sleeps) => {
@@ -223,7 +224,7 @@ pub(crate) struct ScanReceiver(scanhub_client::Subscriber<Scan>);
 impl ScanReceiver {
     pub(crate) fn new(task: &RunParameters) -> Outcome<ScanReceiver> {
         let mut scans = subscriber::subscribe::<Scan>(task.domain, SENSOR)?;
-        // This attaches to the domain. No message has been sent yet.
+        // The first call attaches the subscriber to the domain. No message has been sent yet.
         scans.try_next()?;
         Ok(ScanReceiver(scans))
     }

@@ -1,5 +1,5 @@
-//! CPU time of the machine and of its processes, as the kernel counts it in two ways. `/proc/stat` adds whole ticks to
-//! the thread that runs at the tick. The scheduler adds nanoseconds to each thread.
+//! CPU time of the machine and of its processes. The kernel counts it in two ways. For `/proc/stat`, it adds a whole
+//! tick to the thread that runs at the time of the tick. The scheduler counts the nanoseconds of each thread.
 
 use std::collections::BTreeMap;
 use std::fs::{read_dir, read_to_string};
@@ -14,7 +14,7 @@ pub(crate) struct Snapshot {
     processes: BTreeMap<u32, Usage>,
 }
 
-/// CPU time in percent of one processor, user and system separately.
+/// CPU time in percent of one processor, separately for user and system.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Share {
     pub(crate) user: f64,
@@ -52,7 +52,7 @@ impl Snapshot {
         for entry in read_dir("/proc")? {
             let entry = entry?;
             if let Ok(pid) = entry.file_name().to_string_lossy().parse() {
-                // A process that exits at this moment does not count.
+                // Leave out a process that exits at this moment.
                 processes.extend(Usage::of(&entry.path()).map(|usage| (pid, usage)));
             }
         }
@@ -96,14 +96,14 @@ impl<'a> Span<'a> {
         Ok(sum.share(self.percent(sum.busy_ns as f64)))
     }
 
-    /// Returns the CPU time of the kernel's threads as the scheduler counts it, in percent of one processor. Some of
-    /// these threads transfer the bytes of ttys.
+    /// Returns the CPU time of the kernel's threads as the scheduler counts it, in percent of one processor. Some
+    /// threads of the kernel transfer the bytes of ttys.
     pub(crate) fn kernel(&self) -> f64 {
         self.sum(|usage| usage.is_kernel)
     }
 
-    /// Returns the CPU time of all processes that existed at the end, as the scheduler counts it, in percent of one
-    /// processor.
+    /// Returns the CPU time of all processes that existed at the second snapshot, as the scheduler counts it, in
+    /// percent of one processor.
     pub(crate) fn all_processes(&self) -> f64 {
         self.sum(|_| true)
     }
@@ -150,19 +150,20 @@ impl Ticks {
 /// CPU time of a process since its start.
 #[derive(Clone, Copy, Debug, Default)]
 struct Usage {
-    /// Exact CPU time.
+    /// CPU time in nanoseconds, as the scheduler counts it.
     busy_ns: u64,
-    /// Ticks in user mode and in system mode. Their ratio divides `busy_ns`.
+    /// Ticks in user mode and in system mode. Their ratio determines the user part and the system part of `busy_ns`.
     user: u64,
     system: u64,
     is_kernel: bool,
 }
 
 impl Usage {
-    /// Returns the counters of the process with this directory, or `None` if it has exited.
+    /// Returns the counters of the process whose directory in `/proc` is `process`, or `None` if the process has
+    /// exited.
     fn of(process: &Path) -> Option<Usage> {
         let stat = read_to_string(process.join("stat")).ok()?;
-        // The name may contain spaces and brackets; the field after it is the third.
+        // The name may contain spaces and brackets. The first field after the name is field 3.
         let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
         let field = |number: usize| fields.get(number - 3)?.parse::<u64>().ok();
         let mut usage =
@@ -192,7 +193,7 @@ impl Usage {
 
     /// Returns `busy` divided into user and system time.
     fn share(&self, busy: f64) -> Share {
-        // Half a tick is added to both, so that the whole time is divided even if no tick was counted.
+        // Add half a tick to each of the two counts, so that the time can be divided even if no tick was counted.
         let system = busy * (self.system as f64 + 0.5) / ((self.user + self.system) as f64 + 1.0);
         Share { user: busy - system, system }
     }

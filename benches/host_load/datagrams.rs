@@ -1,5 +1,5 @@
-//! Simulation of the paper's unit between two sensors and a network. It sends only the datagrams of that unit: plain
-//! telegrams to a multicast group on the loopback, with one port per sensor, at the sensors' rate.
+//! Simulation of the paper's unit between two sensors and a network. The simulation sends only datagrams: plain
+//! telegrams to a multicast group on the loopback, with one port per sensor, at the rate of the sensors.
 
 use std::net::{Ipv4Addr, UdpSocket};
 
@@ -14,7 +14,8 @@ use scanhub_sim::room::Room;
 use crate::subscriber::MODE;
 use crate::support::{Outcome, clock};
 
-/// Prints `ready`, and then sends forever: to `port` for the first sensor, and to the next port for the second sensor.
+/// Prints `ready`, and then sends forever. The telegrams of the first sensor go to `port`, and those of the second
+/// sensor to the next port.
 pub(crate) fn send(port: u16) -> Outcome<()> {
     let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
     set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST)?;
@@ -25,7 +26,8 @@ pub(crate) fn send(port: u16) -> Outcome<()> {
     let begin = clock::now();
     for number in 0.. {
         for (sensor, telegrams) in rooms.iter().enumerate() {
-            // Sensors are not synchronized. In this simulation, their scans are half a period apart.
+            // Real sensors are not synchronized. In this simulation, the scans of the two sensors are half a period
+            // apart.
             clock::sleep_until(begin + number * SCAN_PERIOD_NS + sensor as u64 * SCAN_PERIOD_NS / 2);
             let telegram = &telegrams[number as usize % telegrams.len()];
             socket.send_to(telegram, (GROUP, port + sensor as u16))?;
@@ -34,8 +36,8 @@ pub(crate) fn send(port: u16) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns a socket that receives the datagrams of the group for `port`. Several sockets can receive them at the same
-/// time.
+/// Returns a socket that receives the datagrams of the group for `port`. Several sockets can receive the same
+/// datagrams.
 pub(crate) fn receiver(port: u16) -> Outcome<UdpSocket> {
     let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
     set_socket_reuseaddr(&socket, true)?;
@@ -49,7 +51,7 @@ pub(crate) fn port() -> u16 {
     20_000 + (std::process::id() % 5_000) as u16 * 2
 }
 
-/// Returns the telegrams of ten seconds.
+/// Returns the telegrams that a sensor sends in ten seconds.
 fn telegrams(sensor: u64) -> Vec<Vec<u8>> {
     let room = Room::of_port(&"room".parse().expect("a built-in world"), 1, sensor);
     let telegram = |number: u64| {

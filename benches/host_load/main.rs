@@ -1,30 +1,32 @@
-//! Load of a machine by programs that use two sensors (the paper's Fig. 7), in five setups.
+//! Load that programs which use two sensors cause on a machine (the paper's Fig. 7), in five setups.
 //!
-//! - a: Each program reads the raw bytes from its own two lines, one byte at a time, and does everything itself.
+//! - a: Each program reads the raw bytes from its own two lines, one byte at a time, and processes them itself.
 //! - b: Like a, but each program reads all bytes that have arrived.
 //! - c: Each program receives plain telegrams by multicast, as from the paper's unit, and does the rest itself.
 //! - d: Each program receives the scans of the hub.
 //! - e: Each program receives the zones and the foreground of the hub.
 //!
-//! Each program is a process, and must receive 37.5 scans per second of each sensor. A table shows whether it did.
-//! Processes that simulate hardware do not count: the simulators, and in c the unit. Their time is subtracted from the
-//! machine's time.
+//! Each program is a process, and must receive 37.5 scans per second of each sensor. A table shows the rate that each
+//! program reached. Processes that simulate hardware do not count: the simulators, and in setup c the paper's unit.
+//! Their CPU time is subtracted from that of the machine.
 //!
-//! Each run has two counts. `/proc/stat` is the paper's count. It covers the whole machine with all other programs that
-//! run, and counts interrupts as system time. A kernel that counts by ticks (CONFIG_TICK_CPU_ACCOUNTING) adds a tick of
-//! 1 to 10 ms to the thread that runs at the tick. Most threads here run for less than 0.1 ms at a time. The table
-//! "/proc/stat, as a share of the scheduler's count" shows the error: 100 % would be exact. The share is larger if
-//! other processes ended during the run, because the scheduler's count does not contain them.
+//! The CPU time of each run is counted in two ways. The first one is `/proc/stat`, which the paper used. It covers the
+//! whole machine with all other programs that run, and counts interrupts as system time. A kernel that counts by ticks
+//! (CONFIG_TICK_CPU_ACCOUNTING) adds a tick of 1 to 10 ms to the thread that runs at the tick. Most threads here run
+//! for less than 0.1 ms at a time. The table "/proc/stat, as a share of the scheduler's count" shows the error, and 100
+//! % would be exact. The share is larger if other processes ended during the run, because the scheduler's count does
+//! not contain these processes.
 //!
-//! The scheduler counts the CPU time of processes in nanoseconds (schedstat). Only the division into user and system
-//! time comes from ticks, over the whole run time of a process. The targets apply to this count. The count excludes the
-//! work of the kernel's threads for a pty, which increases with the number of ptys. Another table shows that work.
+//! The second way is the scheduler's count of the CPU time of each process, in nanoseconds (schedstat). Only the
+//! division into user and system time comes from ticks, over the whole run time of a process. The targets apply to the
+//! scheduler's count. It excludes the CPU time that threads of the kernel need for ptys, which increases with the
+//! number of ptys. Another table shows this CPU time.
 //!
-//! The bench does not measure the cost of a real UART, because a pty has no interrupts. It needs an otherwise idle
-//! machine.
+//! The bench does not measure the cost of a real UART, because a pty has no interrupts. No other programs should run on
+//! the machine.
 //!
-//! Figures are shares of one processor. A rate below 37.5 Hz means that the setup fell behind. Its load is then the
-//! load of an overloaded machine.
+//! Figures are shares of one processor. A rate below 37.5 Hz means that the programs of the setup could not keep up.
+//! The load is then that of an overloaded machine.
 
 mod cpu_time;
 mod datagrams;
@@ -70,7 +72,7 @@ fn measure(options: &Options) -> Outcome<()> {
     let span = Duration::from_secs(seconds);
     let mut runs = Vec::new();
     for pair in 0..pairs {
-        // CPU time of the sender when there are no receivers.
+        // CPU time of the sender of datagrams when there are no receivers.
         let deaf = Setup::Datagrams.start(0)?.measure(span)?.drivers;
         for (round, &count) in counts.iter().enumerate() {
             let mut setups = Setup::ALL;
@@ -160,8 +162,8 @@ impl<'a> Tables<'a> {
         }
     }
 
-    /// Returns the figures of the hub's results, compared with raw bytes. The targets come from the paper: a sixth of
-    /// the system time, and a third of the user time.
+    /// Returns the figures for programs that use the results of the hub, compared with programs that read raw bytes.
+    /// The targets come from the paper. They are a sixth of the system time and a third of the user time.
     fn figures(&self) -> Vec<Figure> {
         let of = |name, value: Value, target| {
             let [hub, baseline] =
@@ -194,11 +196,11 @@ const fn load(name: &'static str, rows: &'static [Setup], value_of: Value) -> Ta
 }
 
 const BENCH_NAME: &str = "host_load";
-/// Number of subscribers in the paper's setup. The paper's figures apply to this number.
+/// Number of subscribers in the paper's setup. The figures in the paper are for this number of subscribers.
 const MAX_SUBSCRIBERS: usize = 4;
 /// Setups with a hub.
 const WITH_HUB: [Setup; 2] = [Setup::Scans, Setup::Results];
-/// Tables of the bench. Load is in percent of one processor.
+/// Tables of the bench. All loads are in percent of one processor.
 const TABLES: [Table; 11] = [
     load("system, processes of the host", &Setup::ALL, |run| run.host.processes.system),
     load("user, processes of the host", &Setup::ALL, |run| run.host.processes.user),

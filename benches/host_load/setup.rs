@@ -1,5 +1,6 @@
 //! The ways in which programs receive the data of two sensors. Each setup is a set of processes. Some processes belong
-//! to the host. The others only simulate hardware outside of the host. This module also measures their CPU time.
+//! to the host, and the others only simulate hardware outside of the host. This module starts the processes and
+//! measures their CPU time.
 
 use std::thread;
 use std::time::Duration;
@@ -12,11 +13,11 @@ use crate::support::environment::{BenchEnvironment, Child, SENSORS, STEP_TIMEOUT
 /// The way in which data reaches the subscribers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Setup {
-    /// Each subscriber has its own two serial lines, reads them byte by byte and does everything itself.
+    /// Each subscriber has its own two serial lines, reads the lines byte by byte, and processes the bytes itself.
     Bytes,
     /// Like `Bytes`, but each subscriber reads all bytes that have arrived.
     Blocks,
-    /// Each subscriber receives plain telegrams by multicast and does the rest itself.
+    /// Each subscriber receives plain telegrams by multicast and processes the telegrams itself.
     Datagrams,
     /// Each subscriber receives the scans of the hub.
     Scans,
@@ -40,8 +41,8 @@ impl Setup {
         }
     }
 
-    /// Starts the processes for `count` subscribers. With 0, only the sender of datagrams or the simulators and the hub
-    /// run.
+    /// Starts the processes for `count` subscribers. If `count` is 0, only the other processes run: the sender of
+    /// datagrams, or the simulators and the hub.
     pub(crate) fn start(self, count: usize) -> Outcome<SetupProcesses> {
         let environment = BenchEnvironment::new()?;
         let part = |words: &[&str]| environment.start_part(&[&[PART_NAME], words].concat());
@@ -94,7 +95,7 @@ pub(crate) struct SetupProcesses {
 }
 
 impl SetupProcesses {
-    /// Measures for `span`.
+    /// Measures the CPU time of all processes during `span`.
     pub(crate) fn measure(&self, span: Duration) -> Outcome<Load> {
         thread::sleep(SETTLE_TIME);
         let before = Snapshot::take()?;
@@ -103,7 +104,8 @@ impl SetupProcesses {
         Load::of(&Span::new(&before, &after), self, self.hz(before.at_ns(), after.at_ns())?)
     }
 
-    /// Returns the scans per second of the slowest combination of subscriber and sensor, or 0 without subscribers.
+    /// Returns the number of scans per second that a subscriber received from a sensor. Returns the smallest number of
+    /// all subscribers and sensors, or 0 without subscribers.
     fn hz(&self, from_ns: u64, to_ns: u64) -> Outcome<f64> {
         let mut minimum: Option<f64> = None;
         for subscriber in &self.subscribers {
@@ -118,7 +120,7 @@ impl SetupProcesses {
                     [(first, from_ns), .., (last, to_ns)] => {
                         (last - first) as f64 * 1e9 / (to_ns - from_ns) as f64
                     }
-                    // The program is too slow, or the time is too short to calculate a rate.
+                    // The program is too slow, or the measured time is too short to calculate a rate.
                     _ => 0.0,
                 };
                 minimum = Some(minimum.map_or(hz, |minimum| minimum.min(hz)));
@@ -130,7 +132,7 @@ impl SetupProcesses {
 
 /// Second word of the command line of a part of this bench.
 pub(crate) const PART_NAME: &str = "host-load";
-/// Time after which buffers, caches and timing no longer change.
+/// Time after which buffers, caches and the timing of the hub no longer change.
 const SETTLE_TIME: Duration = Duration::from_secs(2);
 
 /// CPU time during a run, in percent of one processor.
@@ -152,14 +154,15 @@ pub(crate) struct Load {
     pub(crate) all_processes: f64,
     /// Time that the hypervisor used for other machines.
     pub(crate) stolen: f64,
-    /// Scans per second of the slowest combination of subscriber and sensor.
+    /// Number of scans per second that a subscriber received from a sensor: the smallest number of all subscribers and
+    /// sensors.
     pub(crate) hz: f64,
 }
 
-/// CPU time of the host by both counts, in percent of one processor.
+/// CPU time of the host, as both ways count it, in percent of one processor.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Host {
-    /// CPU time as `/proc/stat` counts it, without processes that are not part of the host.
+    /// CPU time as `/proc/stat` counts it, without that of processes that are not part of the host.
     pub(crate) machine: Share,
     /// CPU time of subscribers and hub as the scheduler counts it.
     pub(crate) processes: Share,
@@ -182,9 +185,10 @@ impl Load {
         })
     }
 
-    /// Returns the host's part. On a loopback, the sender's system call also delivers a datagram; on a network, the
-    /// receiver's interrupt does that. `idle` is the CPU time of a sender without receivers. The time that a sender
-    /// needs beyond `idle` therefore belongs to the host. Other setups pass `None`.
+    /// Returns the host's part of the CPU time. On a loopback, the system call of the sender also delivers the
+    /// datagram. On a network, the interrupt of the receiving host does this. The CPU time that the sender needs for
+    /// delivery therefore belongs to the host. It is the time beyond `idle`, which is the CPU time of a sender without
+    /// receivers. `idle` is `None` in the other setups.
     pub(crate) fn of_host(&self, idle: Option<Share>) -> Host {
         let delivery = idle.map_or(0.0, |deaf| (self.drivers.total() - deaf.total()).max(0.0));
         let delivery = Share { user: 0.0, system: delivery };

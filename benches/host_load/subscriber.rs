@@ -1,6 +1,6 @@
 //! Programs that use the data of both sensors. Each program is a process with a thread per sensor. A program uses raw
-//! bytes, datagrams, the hub's scans, or the hub's results. It regularly prints how many scans it has received, which
-//! shows whether it falls behind.
+//! bytes, datagrams, the hub's scans, or the hub's results. The program regularly prints how many scans it has
+//! received, which shows whether it can keep up with the sensors.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -24,8 +24,9 @@ use crate::support::subscriber::subscribe;
 use crate::support::{Outcome, clock};
 
 /// Reads two serial lines, at most `max_read` bytes at once, like a very simple program. A thread per line blocks in
-/// `read` and finds telegrams with a state machine of six states. It makes no other system call. A program that reads a
-/// UART with a buffer of 16 bytes reads one byte at a time; more than 16 bytes are never available there.
+/// `read` and finds telegrams with a state machine of six states. The thread makes no other system call. With
+/// `max_read` of 1, it acts like a program that reads single bytes. From a UART with a buffer of 16 bytes, more than 16
+/// bytes are never available.
 pub(crate) fn read_bytes(ports: [&str; 2], max_read: usize) -> Outcome<()> {
     run_for_both(|number, progress| {
         let line = SerialLine::open(Path::new(ports[number]), BAUD_RATE)?;
@@ -44,7 +45,8 @@ pub(crate) fn read_bytes(ports: [&str; 2], max_read: usize) -> Outcome<()> {
     })
 }
 
-/// Receives plain telegrams at `port` for the first sensor, and at the next port for the second sensor.
+/// Receives plain telegrams. Those of the first sensor arrive at `port`, and those of the second sensor at the next
+/// port.
 pub(crate) fn receive_datagrams(port: u16) -> Outcome<()> {
     run_for_both(|number, progress| {
         let (socket, mut processors) = (datagrams::receiver(port + number as u16)?, Processors::new());
@@ -78,7 +80,7 @@ pub(crate) fn receive_results(domain: &str) -> Outcome<()> {
         loop {
             let Some(foreground) = foreground.next()? else { continue };
             black_box((foreground.beams, foreground.segments().len()));
-            // Take the zones of the same scan. Also take earlier zones that reported a silence.
+            // Take all zones up to those of the same scan, because earlier ones may report a silence.
             while let Some(zones) = zones.try_next()? {
                 black_box((zones.verdict(), zones.nearest()));
                 if zones.header().seq >= foreground.header().seq {
@@ -90,7 +92,7 @@ pub(crate) fn receive_results(domain: &str) -> Outcome<()> {
     })
 }
 
-/// Runs `follow` for both sensors, each in its own thread. The process exits if one of them fails.
+/// Runs `follow` for both sensors, each in its own thread. The process exits if `follow` fails for one of the sensors.
 fn run_for_both(follow: impl Fn(usize, &mut Progress) -> Outcome<()> + Sync) -> Outcome<()> {
     let follow_or_end = |number: usize| {
         let mut progress = Progress { sensor: SENSORS[number], count: 0 };
@@ -126,7 +128,7 @@ impl Progress {
 const BEAM_COUNT: usize = 361;
 /// Baud rate of the simulated sensors.
 const BAUD_RATE: u32 = 500_000;
-/// Number of scans between two reports. It corresponds to a little less than a second.
+/// Number of scans between two reports. 32 scans take a little less than a second.
 const REPORT_INTERVAL: u64 = 32;
 
 /// All processors for the scans of one sensor, with the same code and settings as in the hub: decoding, zones, marks,
@@ -170,5 +172,5 @@ impl Processors {
     }
 }
 
-/// Measuring mode of the sensors in this bench, the factory setting.
+/// Measuring mode of the sensors in this bench, which is the factory setting.
 pub(crate) const MODE: Mode = Mode(1);

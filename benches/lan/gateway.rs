@@ -1,4 +1,4 @@
-//! Latency and CPU time that the gateway adds to a datagram, and the maximum number of datagrams that it can send per
+//! Latency and CPU time of the gateway per datagram, and the maximum number of datagrams that the gateway can send per
 //! second.
 
 use std::io::Read;
@@ -23,17 +23,19 @@ use crate::wire::{self, has_topic, number};
 
 /// Number of samples in a run.
 const SAMPLE_COUNT: usize = 800;
-/// Number of samples at the start of a run that do not count.
+/// Number of samples at the start of a run whose ages do not count.
 const SKIPPED_SAMPLES: usize = 80;
-/// Period of the samples, in ns. Two sensors at 37.5 Hz send every 13 ms; a shorter period keeps the runs short.
+/// Period of the samples, in nanoseconds. Two sensors at 37.5 Hz send a sample every 13 ms. The period is shorter here,
+/// so that the runs are short.
 const PERIOD_NS: u64 = 7_000_000;
 /// Position of the sequence number in the header of a datagram.
 const NUMBER_FIELD: std::ops::Range<usize> = 20..24;
 /// Arguments with which this program is the sender of a baseline run.
 pub(crate) const SENDER_PART: [&str; 2] = ["part", "sender"];
 
-/// Measures p50 and p99 of the time from shared memory to a receiving program on the loopback. The runs alternate with
-/// a baseline that sends a datagram of the same length when an eventfd is signaled.
+/// Measures p50 and p99 of the time from shared memory to a receiving program on the loopback. The runs of the gateway
+/// alternate with runs of a baseline. The baseline is a process that sends a datagram of the same length whenever an
+/// eventfd is signaled.
 pub(crate) fn latency(pairs: usize) -> Outcome<Vec<Figure>> {
     let (mut hub, mut baseline): (Vec<Run>, Vec<Run>) = Default::default();
     for pair in 0..pairs {
@@ -97,8 +99,8 @@ fn baseline_run() -> Outcome<Run> {
     application.end()
 }
 
-/// Runs the process that a baseline run wakes. Its stdin is an eventfd. Each time the eventfd is signaled, the process
-/// sends a datagram with the next number.
+/// Runs the process that sends the datagrams in a run of the baseline. Its stdin is an eventfd. Each time the eventfd
+/// is signaled, the process sends a datagram with the next number.
 pub(crate) fn run_sender() -> Outcome<()> {
     set_parent_process_death_signal(Some(Signal::TERM))?;
     let socket = wire::sender()?;
@@ -108,7 +110,7 @@ pub(crate) fn run_sender() -> Outcome<()> {
     while !numbers.is_empty() {
         let mut count = [0; 8];
         rustix::io::read(rustix::stdio::stdin(), &mut count)?;
-        // If the sender is late, it reads a count greater than one.
+        // If this process is late, the count is greater than one.
         for number in numbers.by_ref().take(u64::from_ne_bytes(count) as usize) {
             datagram[NUMBER_FIELD].copy_from_slice(&number.to_le_bytes());
             socket.send_to(&datagram, wire::address(Topic::Scan))?;
@@ -117,19 +119,19 @@ pub(crate) fn run_sender() -> Outcome<()> {
     Ok(())
 }
 
-/// Sorted ages in us, and number of datagrams that did not arrive.
+/// Ages of the received datagrams in microseconds, sorted, and the number of datagrams that did not arrive.
 type Run = (Vec<f64>, f64);
 
 /// A thread that collects the ages of datagrams.
 struct Application {
-    /// Whether no more datagrams will be sent.
+    /// Whether all datagrams have been sent.
     is_finished: Arc<AtomicBool>,
     thread: JoinHandle<Vec<u64>>,
 }
 
 impl Application {
-    /// Starts the thread. `stamp` returns the time at which a datagram was created, in ns, or `None` for other
-    /// datagrams.
+    /// Starts the thread. `stamp` returns the time at which a datagram was created, in nanoseconds, or `None` for
+    /// datagrams that do not count.
     fn start(stamp: impl Fn(&[u8]) -> Option<u64> + Send + 'static) -> Outcome<Application> {
         let (socket, is_finished) = (wire::receiver()?, Arc::new(AtomicBool::new(false)));
         let flag = is_finished.clone();
@@ -148,8 +150,8 @@ impl Application {
         Ok(Application { is_finished, thread })
     }
 
-    /// Ends the thread, and returns what arrived. Some datagrams may be missing, because a hub does not wait for a
-    /// process that is descheduled.
+    /// Ends the thread, and returns the results of the run. Datagrams may be missing, because a hub does not wait for a
+    /// gateway that is not scheduled.
     fn end(self) -> Outcome<Run> {
         self.is_finished.store(true, Ordering::Relaxed);
         let ages = self.thread.join().map_err(|_| "the application panicked")?;
@@ -173,23 +175,23 @@ fn wall_ns() -> u64 {
     now.unwrap_or(Duration::ZERO).as_nanos() as u64
 }
 
-/// Time after which the gateway has certainly found a new hub, in ns.
+/// Time after which the gateway has certainly found a hub that has just started, in nanoseconds.
 const ATTACH_TIMEOUT_NS: u64 = 6_000_000_000;
 
 const MEASURE_TIME: Duration = Duration::from_secs(8);
-/// Time after which the gateway has certainly found a new hub.
+/// Duration equal to [`ATTACH_TIMEOUT_NS`].
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(6);
 const UNPACED_TIME: Duration = Duration::from_secs(3);
-/// Name of the thread that runs the baseline.
+/// Name of the thread that runs the baseline of the CPU time.
 const BASELINE_THREAD: &str = "bare";
-/// Datagrams within this time are sent without a pause, in ns.
+/// Maximum time between two datagrams that the baseline sends without a pause, in nanoseconds.
 const BURST_NS: u64 = 1_000_000;
 
-/// Time of arrival, and a datagram.
+/// Time at which a datagram arrived, and the datagram.
 type ReceivedDatagram = (u64, Vec<u8>);
 
 /// Measures the gateway's CPU time per datagram for two sensors with all their topics. The baseline is a thread that
-/// sends the same datagrams at the same times. Also measures how many datagrams per second the gateway can send.
+/// sends the same datagrams at the same times. Also measures the maximum number of datagrams per second.
 pub(crate) fn cpu_time(pairs: usize) -> Outcome<Vec<Figure>> {
     let (mut hub, mut baseline, mut share, mut rate) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     {
@@ -219,7 +221,7 @@ pub(crate) fn cpu_time(pairs: usize) -> Outcome<Vec<Figure>> {
     ])
 }
 
-/// Returns the gateway's CPU time in ns, and the datagrams that the gateway sent.
+/// Returns the gateway's CPU time in nanoseconds, and the datagrams that the gateway sent in this time.
 fn gateway_cpu_time(environment: &BenchEnvironment) -> Outcome<(f64, Vec<ReceivedDatagram>)> {
     let gateway = wire::gateway(environment, "lo", &wire::all_topics())?;
     thread::sleep(ATTACH_TIMEOUT);
@@ -235,7 +237,7 @@ fn gateway_cpu_time(environment: &BenchEnvironment) -> Outcome<(f64, Vec<Receive
     Ok((busy_ns as f64, received))
 }
 
-/// Returns the CPU time of a thread that sends the same datagrams while a thread receives them.
+/// Returns the CPU time of a thread that sends the datagrams in `received` again, while another thread receives them.
 fn baseline_cpu_time(received: &[ReceivedDatagram]) -> Outcome<f64> {
     let (stop, socket, to_groups) = (Arc::new(AtomicBool::new(false)), wire::receiver()?, wire::sender()?);
     let flag = stop.clone();
@@ -283,7 +285,7 @@ fn receive(socket: &UdpSocket, stop: &AtomicBool) -> Vec<ReceivedDatagram> {
     received
 }
 
-/// Returns the number of scans per second that the gateway sends if more scans are always available.
+/// Returns the number of scans per second that the gateway sends if another scan is always available.
 fn max_rate_of_gateway() -> Outcome<f64> {
     let environment = BenchEnvironment::new()?;
     let mut source = ScanSource::open(&environment.domain)?;
@@ -294,7 +296,7 @@ fn max_rate_of_gateway() -> Outcome<f64> {
     }
     let lines = gateway.end()?;
     let scans: Vec<_> = lines.iter().filter(|(_, line)| has_topic(line, SENSOR, "scan")).collect();
-    // Compare two statistics of the gateway in the middle of the run.
+    // Take two lines of statistics from the middle of the run.
     let [.., (from_ns, first), (to_ns, last), _] = scans[..] else { return Err("too few statistics".into()) };
     if number(last, "missed") == number(first, "missed") {
         eprintln!("the gateway could have sent more");
@@ -302,7 +304,8 @@ fn max_rate_of_gateway() -> Outcome<f64> {
     Ok((number(last, "sent") - number(first, "sent")) as f64 / ((to_ns - from_ns) as f64 / 1e9))
 }
 
-/// Returns the number of datagrams of this length that a loop sends per second.
+/// Returns the number of datagrams per second that a simple loop sends. The datagrams are as long as those of the
+/// gateway.
 fn max_rate_of_baseline() -> Outcome<f64> {
     let to_groups = wire::sender()?;
     let datagram = vec![0; HEADER_LEN + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];

@@ -1,15 +1,18 @@
-//! Costs and losses of the network. Everything runs in separate network namespaces, with `unshare`, `nsenter` and `ip`.
-//! The parts are:
+//! Costs and losses of the network. All programs run in separate network namespaces, for which the bench uses
+//! `unshare`, `nsenter` and `ip`. The bench measures:
 //!
-//! - the age of a scan that a gateway sent, compared with a datagram that an eventfd triggers
-//! - the gateway's CPU time, compared with a thread that sends the same datagrams, and how many it can send
-//! - what arrives over a good cable, and over one that is unplugged for a while
-//! - how a listener handles a million damaged datagrams
-//! - how long the datagrams of scans are
+//! - the age of a scan that a gateway sent, compared with the age of a datagram that a process sends when an eventfd is
+//!   signaled
+//! - the gateway's CPU time, compared with that of a thread that sends the same datagrams, and the maximum rate of the
+//!   gateway
+//! - the datagrams that arrive over a good cable, and over a cable that is unplugged for a while
+//! - the behavior of a listener that receives a million damaged datagrams
+//! - the lengths of the datagrams of scans
 //!
-//! The bench does not measure what a real switch does.
+//! The bench does not measure the effects of a real switch.
 //!
-//! After a link was down, the kernel sends no datagram until its link watch has run. That takes up to a second.
+//! After a network link was down, the kernel sends no datagram until its link watch has run, which takes up to a
+//! second.
 
 #[path = "../../tests/testkit/child.rs"]
 mod child;
@@ -78,7 +81,8 @@ fn measure_healthy_link(seconds: u64) -> Outcome<Vec<Figure>> {
     let mut rates = Vec::new();
     for sensor in SENSORS {
         let lines: Vec<_> = sent.iter().filter(|(_, line)| has_topic(line, sensor, "scan")).collect();
-        // The first statistics were printed before the sensors stream. The last ones may cover a fraction of a second.
+        // The first statistics were printed before the sensors stream. The last statistics may cover only a fraction of
+        // a second.
         let [(from_ns, first), .., (to_ns, last), _] = lines[..] else { return Err("too short".into()) };
         let count = number(last, "sent") - number(first, "sent");
         rates.push(count as f64 / ((to_ns - from_ns) as f64 / 1e9));
@@ -97,8 +101,8 @@ fn measure_healthy_link(seconds: u64) -> Outcome<Vec<Figure>> {
     ])
 }
 
-/// Number of beams with two names: without and with intensities. The beams cover 100 degrees at 1, 0.5 and 0.25
-/// degrees, and 180 degrees at 1 and 0.5 degrees.
+/// Numbers of beams, each with two names of figures: without intensities and with them. The beams cover 100 degrees in
+/// steps of 1, 0.5 and 0.25 degrees, and 180 degrees in steps of 1 and 0.5 degrees.
 const VARIANTS: [(usize, &str, &str); 5] = [
     (101, "size: 100/1", "size: 100/1, intensities"),
     (201, "size: 100/0.5", "size: 100/0.5, intensities"),
@@ -120,7 +124,8 @@ fn size(name: &'static str, count: usize, contents: u8) -> Figure {
     Figure { name, unit: "B", hub, baseline: Vec::new(), target: Target::Max(MTU_SAFE as f64) }
 }
 
-/// Number of damaged datagrams between two intact ones. A listener's buffer certainly has room for them.
+/// Number of damaged datagrams between two intact ones. A listener's receive buffer certainly has room for so many
+/// datagrams.
 const DAMAGED_PER_INTACT: u64 = 50;
 
 /// Sends `count` damaged and random datagrams to a listener. Measures which datagrams the listener accepts and reports,
@@ -179,7 +184,8 @@ fn sealed_datagram(
     Ok(head.seal(buffer, len).ok_or("it does not fit")?.to_vec())
 }
 
-/// Returns one of `intact` with some bits flipped, with its end removed, extended or replaced, or returns random bytes.
+/// Returns random bytes, or a damaged copy of one of `intact`. Some bits of the copy are flipped, or its end is
+/// removed, extended or replaced.
 fn damaged_datagram(random: &mut fastrand::Rng, intact: &[Vec<u8>]) -> Vec<u8> {
     let mut bytes = intact[random.usize(..intact.len())].clone();
     match random.u8(..5) {
@@ -196,7 +202,7 @@ fn damaged_datagram(random: &mut fastrand::Rng, intact: &[Vec<u8>]) -> Vec<u8> {
         }
         _ => bytes = (0..random.usize(..MTU_ETHERNET)).map(|_| random.u8(..)).collect(),
     }
-    // Flips may have canceled each other.
+    // If the flipped bits have canceled each other, damage the datagram again.
     if intact.contains(&bytes) {
         bytes[0] ^= 0x80;
     }
@@ -209,11 +215,11 @@ fn resident_kb(program: &Program) -> Outcome<u64> {
     Ok(line.split_whitespace().nth(1).ok_or("no number")?.parse()?)
 }
 
-/// Time for which the gateway's link is down.
+/// Time for which the link of the gateway's machine is down.
 const DOWN_TIME: Duration = Duration::from_secs(10);
 
-/// Takes the gateway's link down. Measures the time until its datagrams arrive again, and whether another machine
-/// detects the silence.
+/// Takes the link of the gateway's machine down for a while. Measures the time until the datagrams of the gateway
+/// arrive again, and whether a listener on another machine detects the silence.
 fn measure_link_down() -> Outcome<Vec<Figure>> {
     let environment = BenchEnvironment::new()?;
     let (pulled, other) = (Machine::new(3), Machine::new(4));

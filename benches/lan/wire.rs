@@ -1,4 +1,5 @@
-//! The network namespace in which the bench runs, its sockets on the loopback, and programs that print JSON.
+//! The network namespace in which the bench runs, the bench's sockets on the loopback, and child processes that print
+//! JSON.
 
 use std::env;
 use std::net::{Ipv4Addr, UdpSocket};
@@ -38,7 +39,7 @@ pub(crate) fn rerun_in_namespace() -> Outcome<ExitCode> {
     Ok(if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Returns a socket that receives the groups on the loopback.
+/// Returns a socket that receives the datagrams of all groups on the loopback.
 pub(crate) fn receiver() -> Outcome<UdpSocket> {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, PORT))?;
     for last in 80..84 {
@@ -52,14 +53,14 @@ pub(crate) fn receiver() -> Outcome<UdpSocket> {
     Ok(socket)
 }
 
-/// Returns a socket that sends to the groups on the loopback.
+/// Returns a socket that can send to the groups on the loopback.
 pub(crate) fn sender() -> Outcome<UdpSocket> {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST)?;
     Ok(socket)
 }
 
-/// Returns the address of the datagrams of `topic`.
+/// Returns the address to which the datagrams of `topic` are sent.
 pub(crate) fn address(topic: Topic) -> (Ipv4Addr, u16) {
     (Ipv4Addr::new(GROUP_PREFIX[0], GROUP_PREFIX[1], GROUP_PREFIX[2], group(topic)), PORT)
 }
@@ -78,14 +79,14 @@ pub(crate) fn gateway(environment: &BenchEnvironment, interface: &str, flags: &[
     Program::start(command, "gateway")
 }
 
-/// A program that prints JSON.
+/// A child process that prints lines of JSON.
 pub(crate) struct Program {
     guard: GuardedProcess,
     lines: Receiver<(u64, Value)>,
 }
 
 impl Program {
-    /// Starts a program, and waits for its first line of this class.
+    /// Starts a program, and waits for the first line of class `class`.
     pub(crate) fn start(mut command: Command, class: &str) -> Outcome<Program> {
         command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error");
         let mut process = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn()?;
@@ -109,7 +110,7 @@ impl Program {
         self.guard.pid()
     }
 
-    /// Returns the next line of this class, and drops the lines before it.
+    /// Waits for the next line of class `class`, and returns this line. Drops the lines before it.
     pub(crate) fn wait_for_class(&self, class: &str) -> Outcome<Value> {
         loop {
             let (_, line) =
@@ -120,8 +121,8 @@ impl Program {
         }
     }
 
-    /// Waits for the first line of this class after `since_ns`, and returns the time at which it arrived. Drops the
-    /// lines before it.
+    /// Waits for the first line of class `class` that arrives after `since_ns`, and returns the time at which it
+    /// arrived. Drops the lines before it.
     pub(crate) fn wait_for_class_after(&self, since_ns: u64, class: &str) -> Outcome<u64> {
         loop {
             let (at_ns, line) =
@@ -156,7 +157,7 @@ pub(crate) fn sum(lines: &[(u64, Value)], key: &str) -> f64 {
     rows.map(|(_, line)| number(line, key)).sum::<u64>() as f64
 }
 
-/// Returns a number of a line; 0 if it does not have it.
+/// Returns the number that a line has under `key`, or 0 if the line has no such number.
 pub(crate) fn number(line: &Value, key: &str) -> u64 {
     line[key].as_u64().unwrap_or_default()
 }

@@ -1,29 +1,35 @@
 //! Number of instructions, code lines of 64 bytes, code pages of 4 KiB and system calls that the hub needs for one
-//! telegram. The bench counts them by single steps of a link's thread under ptrace, with one subscriber that waits for
-//! scans. Unlike the figures of `hub_load`, these figures hardly depend on the machine's load. The bench does not
-//! measure time.
+//! telegram. The bench single-steps the thread of a link under ptrace to count them. One subscriber waits for scans.
+//! Unlike the figures of `hub_load`, these figures hardly depend on the machine's load. The bench does not measure
+//! time.
 //!
-//! The sensor sends at 9,600 baud, because the steps are too slow for a higher rate. Two costs would therefore be too
-//! high and are excluded. The first is repeated waits ([`steps::TelegramCost`]). The second is work that the hub does
-//! at most ten times a second: it examines the session and searches for subscribers, and once a second it publishes the
-//! status. At 9,600 baud, it does this work with every telegram, but at 500,000 baud with one of four. The stage of the
-//! status is still shown. Without symbols, all figures contain this work. The steps delay the hub, so it sleeps and
-//! reads less often than usual. System calls are therefore also counted at 500,000 baud, without steps.
+//! The sensor sends at 9,600 baud, because the steps are too slow for a higher rate. Two costs would be too high at
+//! this rate, so the figures exclude them. The first cost is repeated waits ([`steps::TelegramCost`]). The second cost
+//! is work that the hub does at most ten times a second: it examines the session and searches for subscribers, and once
+//! a second it publishes the status. At 9,600 baud, the hub does this work with every telegram, but at 500,000 baud
+//! only with one of four. The tables still show it as the stage of the status. If the program has no symbols, all
+//! figures include this work.
 //!
-//! The figures are measured while the hub learns the background, and after it has learned the background. Another hub
-//! learns it at 500,000 baud, and the measured hub starts with the saved model.
+//! The steps delay the hub, so it sleeps and reads less often than usual. System calls are therefore also counted at
+//! 500,000 baud, without steps.
 //!
-//! Stages, crates and functions need the symbols of the program, which `cargo bench` strips:
+//! The figures are measured both while the hub learns the background, and with a learned background. For the second
+//! case, another hub learns the background at 500,000 baud, and the measured hub starts with the saved model.
+//!
+//! The tables of stages, crates and functions need the symbols of the program, which `cargo bench` strips. This command
+//! keeps them:
 //!
 //! ```text
 //! CARGO_PROFILE_BENCH_STRIP=none CARGO_PROFILE_RELEASE_STRIP=none cargo bench --bench path
 //! ```
 //!
-//! With `SCANHUB_WRITE=1`, the bench also writes the order of functions for the linker, `hub/path.lds`. The linker
-//! ignores entries for functions that no longer exist, so write the file again only if the path has changed much.
+//! With `SCANHUB_WRITE=1`, the bench also writes `hub/path.lds`, which has the order of functions for the linker. The
+//! linker ignores entries for functions that no longer exist. Write the file again only if the path of a telegram has
+//! changed much.
 //!
 //! A code line or page counts once per telegram. It also counts once in each stage, crate and function that uses it, so
-//! the parts sum to more than the total. Code without a known function belongs to the stage of its caller.
+//! the sum of the parts is greater than the total. Steps in a function that no stage contains belong to the stage of
+//! the caller.
 #![cfg_attr(not(target_arch = "x86_64"), allow(unused))]
 
 #[cfg(target_arch = "x86_64")]
@@ -110,7 +116,7 @@ mod on_x86_64 {
     }
 
     /// Returns a linker script that puts functions next to each other, in the order of `patterns`. Each pattern matches
-    /// a symbol.
+    /// the symbol of a function.
     fn link_order(patterns: &[String]) -> String {
         let mut known = HashSet::new();
         let patterns = patterns.iter().filter(|pattern| known.insert(*pattern));
@@ -120,8 +126,8 @@ mod on_x86_64 {
         )
     }
 
-    /// Starts a hub at 500,000 baud that learns the background and saves it. Afterward, counts the hub's system calls
-    /// for `count` telegrams.
+    /// Starts a hub at 500,000 baud that learns the background and saves it. Then counts the hub's system calls for
+    /// `count` telegrams.
     fn measure_learning(environment: &BenchEnvironment, count: u64, cells: &mut Vec<Cell>) -> Outcome<()> {
         let hub = environment.start_hub(&[SENSOR])?;
         hub.wait_for_line("ready", STEP_TIMEOUT)?;
@@ -134,7 +140,7 @@ mod on_x86_64 {
             }
             thread::sleep(Duration::from_millis(100));
         }
-        // `measure` reports why it cannot attach.
+        // Return without a message if attaching fails, because `measure` reports the reason.
         let Ok(mut stepper) = Stepper::attach(link_thread(hub.guard.pid(), SENSOR)?) else { return Ok(()) };
         stepper.run_telegram()?;
         let (mut calls, mut telegrams) = (BTreeMap::<u64, u64>::new(), 0);
@@ -154,15 +160,15 @@ mod on_x86_64 {
         Ok(())
     }
 
-    /// Returns the path of the background that a hub has saved below `directory`.
+    /// Returns the path of the file in which a hub has saved the background, below `directory`.
     fn saved_background(directory: &Path) -> Option<PathBuf> {
         let domains = fs::read_dir(directory).ok()?.flatten();
         let files = domains.map(|domain| domain.path().join(format!("{SENSOR}.background.json")));
         files.into_iter().find(|file| file.exists())
     }
 
-    /// Steps through `count` telegrams, or fewer if `end` comes first. Returns the profile of the steps, and the system
-    /// calls of each telegram.
+    /// Steps through `count` telegrams, or through fewer if the time `end` is reached before. Returns the profile of
+    /// the steps, and the system calls of each telegram.
     fn step<'a>(
         stepper: &mut Stepper,
         code: &'a Code,
@@ -187,13 +193,14 @@ mod on_x86_64 {
                 index += 1;
                 !cost.repeats.iter().any(|steps| steps.contains(&(index - 1)))
             });
-            // On a busy machine, the next telegram may be complete before this one is read.
+            // On a busy machine, the next telegram may be complete before the hub has read this one. The cost then
+            // covers both, so leave it out.
             if cost.telegrams == 1 {
                 profile.add(steps.into_iter());
                 calls.push(cost.system_calls);
             }
-            // In other cases, the hub still reads the first bytes of the next telegram before most of that telegram has
-            // arrived.
+            // If the hub is less late than this, it still reads the first bytes of the next telegram before most of
+            // that telegram has arrived.
             if cost.lag > TELEGRAM_INTERVAL * 2 / 3 {
                 stepper.run_past_telegram(TELEGRAM_INTERVAL)?;
             }
@@ -204,7 +211,7 @@ mod on_x86_64 {
         Ok((profile, calls))
     }
 
-    /// Adds the tables for one state of the background.
+    /// Adds the tables for the background state `background`: learned or not learned.
     fn add_tables(
         background: &str,
         profile: &Profile<'_>,
@@ -289,13 +296,13 @@ mod on_x86_64 {
     }
 
     const SENSOR: &str = "front";
-    /// Path of the linker script that `hub/build.rs` passes to the linker, and first lines of the script.
+    /// Path of the linker script that `hub/build.rs` passes to the linker, and the first lines of this script.
     const LINK_ORDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/hub/path.lds");
     const LINK_ORDER_HEADER: &str = "/* The functions that run for each telegram, in the order in which they run, and then those of the\n   \
         status. Written by the bench `path`. */\n";
     /// Time between two telegrams at 9,600 baud.
     const TELEGRAM_INTERVAL: Duration = Duration::from_millis(773);
-    /// Maximum time for the steps with one state of the background, in seconds. An idle machine needs less for 100
+    /// Maximum time for the steps with one state of the background, in seconds. An idle machine needs less time for 100
     /// telegrams.
     const MAX_SECONDS: u64 = 110;
     /// Maximum number of functions in a table.

@@ -1,19 +1,19 @@
-//! Profile of the steps of one thread. It shows the functions, crates and stages that the thread's instructions, code
-//! lines and code pages belong to.
+//! Profile of the steps of one thread. It shows to which functions, crates and stages the instructions, code lines and
+//! code pages of the thread belong.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs;
 use std::process::Command;
 
-/// The code of a process, with names.
+/// The code of a process, with the names of files and functions.
 pub(crate) struct Code {
-    /// Path of the program, and address of its first page in memory.
+    /// Path of the program, and address of the program's first page in memory.
     program: String,
     base: u64,
-    /// Mapped files, by address: start, end and name.
+    /// Mapped files, sorted by address. Each entry has the start, the end and the name.
     files: Vec<(u64, u64, String)>,
-    /// Address in memory and name of each function of the program, sorted by address. Empty if the program has no
-    /// symbols.
+    /// Functions of the program, sorted by address. Each entry has the address in memory and the name. Empty if the
+    /// program has no symbols.
     functions: Vec<(u64, String)>,
 }
 
@@ -40,7 +40,7 @@ impl Code {
         Ok(Code { program, base, files, functions })
     }
 
-    /// Returns whether functions have names.
+    /// Returns whether the names of the program's functions are known.
     pub(crate) fn has_names(&self) -> bool {
         !self.functions.is_empty()
     }
@@ -54,21 +54,22 @@ impl Code {
         Some((index, &self.functions[index].1))
     }
 
-    /// Returns the name of the mapped file at `address`, which is empty for the program.
+    /// Returns the name of the mapped file at `address`. The name of the program itself is empty.
     pub(crate) fn file(&self, address: u64) -> Option<&str> {
         let file = self.files.iter().find(|(start, end, _)| (*start..*end).contains(&address));
         file.map(|(_, _, name)| name.as_str())
     }
 
-    /// Returns the name of the function at `address`, or of the file if the address is not in the program.
+    /// Returns the name of the function at `address`, or the name of the mapped file if the address is not in the
+    /// program.
     pub(crate) fn name(&self, address: u64) -> &str {
         let name = self.function(address).map(|(_, name)| name);
         name.or_else(|| self.file(address).filter(|name| !name.is_empty())).unwrap_or("?")
     }
 }
 
-/// Returns address and name of each function of `program`, read by `nm` with `flags`. The first page of `program` is at
-/// `base`.
+/// Runs `nm` with `flags` on `program`, and returns the address and the name of each function. `base` is the address of
+/// the first page of `program` in memory.
 fn functions(program: &str, base: u64, flags: &[&str]) -> Vec<(u64, String)> {
     let Ok(output) = Command::new("nm").args(flags).args(["--defined-only", program]).output() else {
         return Vec::new();
@@ -86,7 +87,7 @@ fn functions(program: &str, base: u64, flags: &[&str]) -> Vec<(u64, String)> {
     functions
 }
 
-/// Returns the pattern for the linker that matches `symbol` without its hash.
+/// Returns the linker pattern that matches `symbol` with any hash at its end.
 fn pattern(symbol: &str) -> String {
     let symbol = symbol.rsplit_once("17h").map_or(symbol.to_owned(), |(path, _)| format!("{path}17h*"));
     symbol.replace('$', "?")
@@ -110,13 +111,15 @@ pub(crate) enum PathStage {
     Publish,
     Processors,
     Bookkeeping,
-    /// The status, which the hub publishes once a second, and the checks that the hub makes up to ten times a second.
+    /// Publishing the status, which the hub does once a second, and the checks that the hub makes up to ten times a
+    /// second.
     Status,
     Other,
 }
 
-/// Stages with parts of function names. The innermost function with a stage counts, so steps in the shared-memory
-/// library, `memcpy` and the standard library belong to their callers. The first entry that matches a name counts.
+/// Parts of function names, each with its stage. A function belongs to the stage of the first entry that its name
+/// contains. An instruction belongs to the innermost calling function that has a stage. Steps in the shared-memory
+/// library, `memcpy` and the standard library therefore belong to the callers of these functions.
 const STAGES: [(&str, PathStage); 34] = [
     ("preprocess::zones::", PathStage::Zones),
     ("Pipeline::check_zones", PathStage::Zones),
@@ -154,8 +157,8 @@ const STAGES: [(&str, PathStage); 34] = [
     ("rustix::", PathStage::Sleeping),
 ];
 
-/// Ends of the names of functions whose steps all belong to the status. When the hub publishes the status, it also
-/// saves the scanner's identity.
+/// Ends of function names. All steps in these functions, and in the functions that they call, belong to the status.
+/// When the hub publishes the status, it also saves the scanner's identity.
 const STATUS_SUFFIXES: [&str; 6] = [
     "SessionDriver<S>::report",
     "LinkState<S>::publish_status",
@@ -181,7 +184,7 @@ impl PathStage {
         }
     }
 
-    /// Returns the stage of a function with the name `name`, if it has one.
+    /// Returns the stage of the function with the name `name`, or `None` if it has none.
     fn of_function(name: &str) -> Option<PathStage> {
         if STATUS_SUFFIXES.iter().any(|end| name.ends_with(end)) {
             return Some(PathStage::Status);
@@ -190,7 +193,7 @@ impl PathStage {
     }
 }
 
-/// Sums over the telegrams of a profile, for a stage, a crate or a function.
+/// Sums over all telegrams of a profile, for one stage, one crate or one function.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Totals {
     pub(crate) instructions: u64,
@@ -198,7 +201,7 @@ pub(crate) struct Totals {
     pub(crate) pages: u64,
 }
 
-/// Steps of one telegram that have the same stage, crate or function.
+/// Steps of one telegram that belong to the same stage, crate or function.
 #[derive(Default)]
 struct Steps {
     instructions: u64,
@@ -217,7 +220,7 @@ impl Steps {
 /// Profile of several telegrams.
 pub(crate) struct Profile<'a> {
     code: &'a Code,
-    /// Stage of each function that was executed, by its address.
+    /// Stage of each function that was executed, by the address of the function.
     stages: HashMap<u64, Option<PathStage>>,
     pub(crate) telegrams: u64,
     pub(crate) by_stage: BTreeMap<PathStage, Totals>,
@@ -225,8 +228,8 @@ pub(crate) struct Profile<'a> {
     pub(crate) by_function: HashMap<&'a str, Totals>,
     /// Sums of each telegram, without the status.
     pub(crate) per_telegram: Vec<Totals>,
-    /// Addresses of functions in the order of their first steps. The first list is for the path, and the second one is
-    /// for the status.
+    /// Addresses of functions in the order of their first steps. The first list has the functions of a telegram's path,
+    /// and the second list has those of the status.
     first_steps: [Vec<u64>; 2],
 }
 
@@ -244,9 +247,9 @@ impl<'a> Profile<'a> {
         }
     }
 
-    /// Returns patterns for the symbols of the executed functions, in the order of their first steps. If `of_status`,
-    /// they are the functions of the status; otherwise, those of the path. A pattern omits the hash at the end of a
-    /// symbol, and so also the types of a generic function.
+    /// Returns patterns for the symbols of the executed functions, in the order of their first steps. If `of_status` is
+    /// true, these are the functions of the status, and otherwise those of a telegram's path. A pattern omits the hash
+    /// at the end of a symbol, so it matches a generic function with any types.
     pub(crate) fn patterns(&self, of_status: bool) -> Vec<String> {
         let symbols = functions(&self.code.program, self.code.base, &[]);
         let of_address = |address| {
@@ -257,7 +260,8 @@ impl<'a> Profile<'a> {
         order.iter().flat_map(|address| of_address(*address)).map(|(_, symbol)| pattern(symbol)).collect()
     }
 
-    /// Returns the stage of an instruction at `address`. `calls` has the functions that called it, outermost first.
+    /// Returns the stage of an instruction at `address`. `calls` has the addresses of the functions in which the
+    /// instruction runs, outermost first.
     pub(crate) fn stage(&mut self, address: u64, calls: impl DoubleEndedIterator<Item = u64>) -> PathStage {
         let mut found = self.stage_of(address);
         for function in calls.rev() {

@@ -1,18 +1,20 @@
 //! Separation of people from the background. Two methods of the hub and two simple methods are compared, in scenes of
-//! the simulated world in which the truth of each beam is known.
+//! the simulated world in which the correct answer for each beam is known.
 //!
-//! A beam counts as foreground if its whole spot meets a person. A reported beam is wrong in three cases. It meets
-//! something that has always been in the scene. It meets what was behind an object that was taken away. Or it meets an
-//! object that was put down or moved more than 20 s ago. Some beams do not count: beams that graze a person or a moved
-//! object, beams without a reading, and beams that meet an object that was put down or moved in the last 20 s.
+//! A beam counts as foreground if its whole spot meets a person. A beam that is reported as foreground is wrong in
+//! three cases. First, it meets an object that has always been in the scene. Second, it meets the surface behind an
+//! object that was taken away. Third, it meets an object that was put down or moved more than 20 s ago. Some beams do
+//! not count: beams that graze a person or a moved object, beams without a reading, and beams that meet an object that
+//! was put down or moved in the last 20 s.
 //!
 //! Recall is the share of the foreground beams that are found. Precision is the share of the reported beams that are
-//! right. The number of wrong beams is per scan, over all 2000 scans including the first ones.
+//! right. The number of wrong beams is an average per scan, over all 2000 scans including the first ones.
 //!
 //! If a person stands in the room at the start, all methods learn this person as background, and find the person only
-//! after they move. The crowd is also present from the start. A person behind a door that has just opened is farther
-//! away than the door was, so no method finds this person either. Bytes are payloads on a network; an empty foreground
-//! has 58 bytes. In the room of Fig. 8, a person is present for 40 % of the time.
+//! after they move. The people of the scene with a crowd are also present from the start. A person behind a door that
+//! has just opened is farther away than the door was, so no method finds this person either. Bytes are those of
+//! payloads on a network, where an empty foreground has 58 bytes. In the room of Fig. 8, a person is present for 40 %
+//! of the time.
 
 use std::ops::Range;
 
@@ -38,7 +40,7 @@ const SCENES: [Scene; 11] = [
     Scene { name: "a crowd", world: "crowd", unit: Unit::Mm, mixed: true },
 ];
 
-/// Targets of `multi`: name of the figure, row, table, target.
+/// Targets of the method `multi`. Each entry has the name of the figure, the row, the table and the target.
 const TARGETS: [(&str, &str, &str, Target); 11] = [
     ("recall in Fig. 8", "Fig. 8", RECALL_TABLE, Target::Min(0.99)),
     ("precision in Fig. 8", "Fig. 8", PRECISION_TABLE, Target::Min(0.95)),
@@ -110,7 +112,7 @@ pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
         }
         cells.extend(METHODS.iter().zip(&scores).flat_map(|(name, score)| scored(scene, name, score)));
     }
-    // There is one table for each of these quantities, although they are computed scene by scene.
+    // Sort the cells by table. There is one table for each quantity, but the cells were computed scene by scene.
     cells.sort_by_key(|cell| {
         [RECALL_TABLE, PRECISION_TABLE, WRONG_TABLE].iter().position(|table| cell.table == *table)
     });
@@ -147,23 +149,23 @@ fn scored(scene: &Scene, method: &str, score: &Score) -> [Cell; 3] {
 }
 
 fn cell(table: &str, row: &str, method: &str, unit: &'static str, value: f64) -> Cell {
-    // Without a person or without a reported beam, the share is not a number.
+    // If a scene has no person or no reported beam, the share is not a number.
     let values = if value.is_finite() { vec![value] } else { Vec::new() };
     Cell { table: table.into(), row: row.into(), column: method.into(), unit, values }
 }
 
-/// Payload bytes of several runs, without headers.
+/// Bytes of the payloads of several runs, without headers.
 #[derive(Clone, Copy, Debug, Default)]
 struct PayloadBytes {
     scans: u64,
     scan: u64,
     foreground: u64,
-    /// Number of scans without foreground, and payload bytes of these scans.
+    /// Number of scans whose foreground is empty, and bytes of the foreground payloads of these scans.
     empty: (u64, u64),
 }
 
 impl PayloadBytes {
-    /// Adds a `run` with the method of `settings`.
+    /// Adds a run of a scene, processed by the method in `settings`.
     fn add(&mut self, settings: Settings, run: &[LabeledScan]) {
         let beams = Variant::HALF.beams();
         let mut model = BackgroundModel::new(settings, beams);
@@ -183,7 +185,8 @@ impl PayloadBytes {
         }
     }
 
-    /// Returns bytes per second at 37.5 Hz for scans, for the foreground, and for an empty foreground.
+    /// Returns three rates in bytes per second at 37.5 scans per second: for scans, for the foreground, and for an
+    /// empty foreground.
     fn per_second(&self) -> [f64; 3] {
         let per_second = |bytes: u64, scans: u64| bytes as f64 / scans as f64 * 1e3 / 26.64;
         [
@@ -195,16 +198,16 @@ impl PayloadBytes {
 }
 
 /// A method that learns only at the start. The background of a beam is the median of its readings in the first
-/// [`LEARNING_SCANS`] scans. A reading that is nearer than the background by more than 30 mm (60 in cm mode) is
-/// foreground.
+/// [`LEARNING_SCANS`] scans. A reading is foreground if it is nearer than the background by more than 30 mm (60 mm for
+/// a scanner that measures in centimeters).
 struct TeachIn {
     scans: usize,
     readings_mm: Vec<Vec<u32>>,
     background_mm: Vec<Option<u32>>,
 }
 
-/// Number of scans from which the background is learned. It corresponds to 5 s. The room of Fig. 8 is empty for the
-/// first 8 s.
+/// Number of scans from which the background is learned. 187 scans take 5 s. The room of Fig. 8 is empty for the first
+/// 8 s.
 const LEARNING_SCANS: usize = 187;
 
 impl TeachIn {
@@ -235,10 +238,10 @@ impl Detector for TeachIn {
 
 /// The adaptive Gaussian mixture of Zivkovic (ICPR 2004), which computer vision uses for the background of images, with
 /// one mixture for each beam. There are at most five Gaussians, and the learning rate is 1/375 (1/n at first). The
-/// heaviest Gaussians that together weigh .9 are background. A reading within four standard deviations of them is
-/// background. A reading within three standard deviations adapts the Gaussian. Weights decay by a prior of .05. The
-/// standard deviation starts at 15 mm and stays between 5 and 40 mm, twice as much in cm mode. Only readings that are
-/// nearer than the heaviest Gaussian count as foreground.
+/// heaviest Gaussians whose weights sum to .9 are background. A reading within four standard deviations of such a
+/// Gaussian is background. A reading within three standard deviations of a Gaussian adapts this Gaussian. Weights decay
+/// by a prior of .05. The standard deviation starts at 15 mm and stays between 5 and 40 mm, or twice as much for a
+/// scanner that measures in centimeters. Only readings that are nearer than the heaviest Gaussian count as foreground.
 struct Mixtures {
     scans: f64,
     beams: Vec<Vec<Gaussian>>,

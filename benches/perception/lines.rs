@@ -1,13 +1,15 @@
-//! Accuracy of the lines in a scan relative to its beams, and CPU time to find them. Both forms of the hub's method are
-//! compared with simple methods that use the same number of vertices. The rooms are drawn at random as in the
-//! experiment of PLE (Schaefer, Buescher, Luft, Burgard, IROS 2018). The logs come from real sensors.
+//! Accuracy of the lines that methods find in a scan, relative to the beams of the scan, and CPU time of these methods.
+//! The bench compares both forms of the hub's method with simple methods that use the same number of vertices. The
+//! rooms are drawn at random as in the experiment of PLE (Schaefer, Buescher, Luft, Burgard, IROS 2018). The logs come
+//! from real sensors.
 //!
-//! J vertices make J - 1 lines. The ratio is relative to iterative end-point fit on the same scans, as in PLE's
-//! publication. The target is PLE's own ratio. The lines have to cover .97 of the beams of a room.
+//! J vertices make J - 1 lines. The figure of a method is the ratio of its error to that of iterative end-point fit on
+//! the same scans, as in the publication of PLE. The target is the ratio that PLE reaches there. The lines have to
+//! cover .97 of the beams of a room.
 //!
-//! The RMSE covers only the beams that meet a line, so read it together with the share of these beams. The hub's lines
-//! need not be connected. On logs, points more than 1 m apart are not connected. If there are too many lines, the worst
-//! ones are dropped.
+//! The RMSE covers only the beams that meet a line, so compare it together with the share of these beams. The hub's
+//! lines need not be connected. On logs, points that are more than 1 m apart are not connected by a line. If the hub
+//! finds too many lines, the worst lines are dropped.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::Range;
@@ -21,9 +23,9 @@ use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings::{self, normal, scan};
 
 const VERTEX_COUNTS: [usize; 5] = [10, 20, 30, 40, 50];
-/// Ratios that PLE's publication gives, and ratios of PLE's optimized form.
+/// Ratios in the publication of PLE: those of PLE, and those of its optimized form.
 const PLE_RATIOS: [[f64; 5]; 2] = [[0.68, 0.86, 0.85, 0.87, 0.85], [0.44, 0.65, 0.67, 0.71, 0.71]];
-/// Maximum time for a scan of 360 beams, in us.
+/// Maximum time in microseconds for a scan of 360 beams, for each form of the hub's method.
 const MAX_TIME_US: [f64; 2] = [100.0, 1000.0];
 const NAMES: [[&str; 5]; 2] = [
     ["10 vertices: RMSE", "20 vertices: RMSE", "30 vertices: RMSE", "40 vertices: RMSE", "50 vertices: RMSE"],
@@ -36,7 +38,8 @@ const NAMES: [[&str; 5]; 2] = [
     ],
 ];
 
-/// Measures on drawn rooms and on logs. With `is_quick`, uses one set of rooms and few scans of each log.
+/// Measures the methods in rooms that are drawn at random, and on logs. If `is_quick` is true, uses only one set of
+/// rooms and few scans of each log.
 pub(crate) fn measure(is_quick: bool, is_json: bool) {
     let mut figures = Vec::new();
     let mut cells = Vec::new();
@@ -48,16 +51,16 @@ pub(crate) fn measure(is_quick: bool, is_json: bool) {
     figures::print_cells("perception, lines", is_json, &cells);
 }
 
-/// Returns the hub's line finder, limited only by the number of vertices. Points that are more than `gap_m` apart are
-/// not connected.
+/// Returns the hub's line finder, whose lines are limited only by the number of vertices `count`. Points that are more
+/// than `gap_m` apart are not connected.
 fn hub_line_finder(count: usize, refine: bool, gap_m: f64) -> LineFinder {
-    // At least two beams per line, as for the other methods, because all beams of a room count.
+    // Allow lines of two beams, as the other methods do, because all beams of a room count.
     let settings =
         Settings { max: count as u8 - 1, min_points: 2, refine, stop: StopCriterion::Number(gap_m) };
     LineFinder::new(Pose::default(), settings, 1081)
 }
 
-/// Returns the mean score and the time per scan in us.
+/// Returns the mean score of the lines that `finder` finds, and the time per scan in microseconds.
 fn run(finder: &mut LineFinder, scans: &[Box<Scan>]) -> (Score, f64) {
     let mut lines = Lines::default();
     let mut scores = Vec::new();
@@ -118,8 +121,8 @@ fn measure_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<C
     }
 }
 
-/// Compares lines with the true walls. The methods are the hub's method with settings that a user can configure, and
-/// end-point fit with the true number of vertices.
+/// Compares the lines of two methods with the true walls. One is the hub's method with settings that a user can
+/// configure. The other is end-point fit with the true number of vertices.
 fn compare_with_walls(seeds: Range<u64>, cells: &mut Vec<Cell>) {
     let draws: Vec<Vec<Room>> = seeds.map(|seed| draw_rooms(seed, RAY_COUNT)).collect();
     let mut lines = Lines::default();
@@ -158,7 +161,7 @@ fn compare_with_walls(seeds: Range<u64>, cells: &mut Vec<Cell>) {
         });
     }
     put("end-point fit", &mut |room| end_points(&room.scan, room.corners + 1));
-    // One line for each beam.
+    // The true walls are given as one line for each beam.
     put("true walls", &mut |room| {
         let line = |(beam, range): (usize, &f64)| (beam, beam, *range, room.scan.angle(beam));
         FoundLines { lines: room.walls_m.iter().enumerate().map(line).collect() }
@@ -200,8 +203,8 @@ fn measure_logs(max_scans: usize, cells: &mut Vec<Cell>) {
 
 /// Lines that a method found in a scan, in the order of their beams.
 struct FoundLines {
-    /// First beam and last beam of each line, and the line itself: distance of its nearest point from the sensor, and
-    /// direction of this point.
+    /// Lines. Each entry has the first beam, the last beam, the distance from the sensor to the nearest point of the
+    /// line, and the direction of this point.
     lines: Vec<(usize, usize, f64, f64)>,
 }
 
@@ -210,7 +213,7 @@ struct FoundLines {
 struct Score {
     /// Root mean square of the distances along the beams that meet a line, in meters.
     rmse: f64,
-    /// Share of the beams with a range that meet a line.
+    /// Share of the beams that meet a line, of all beams with a range.
     share: f64,
 }
 
@@ -223,12 +226,12 @@ impl FoundLines {
         FoundLines { lines: lines.lines().iter().map(line).collect() }
     }
 
-    /// Compares the lines with the beams of `scan`.
+    /// Compares the lines with the ranges of `scan`.
     fn score(&self, scan: &Scan) -> Score {
         self.compare(|beam| scan.distance_m(beam), scan)
     }
 
-    /// Compares the lines with the ranges that `range` returns for the beams of `scan`, in meters.
+    /// Compares the lines with the ranges in meters that `range` returns for the beams of `scan`.
     fn compare(&self, range: impl Fn(usize) -> Option<f64>, scan: &Scan) -> Score {
         let (mut square, mut count) = (0.0, 0);
         let mut is_met = vec![false; scan.beams()];
@@ -255,7 +258,7 @@ fn mean(scores: &[Score]) -> Score {
     Score { rmse: mean(|score| score.rmse), share: mean(|score| score.share) }
 }
 
-/// A beam with a range, and the position of its end.
+/// A beam with a range, and the position at which the beam ends.
 #[derive(Clone, Copy)]
 struct Point {
     beam: usize,
@@ -271,8 +274,8 @@ fn points(scan: &Scan) -> Vec<Point> {
     (0..scan.beams()).filter_map(point).collect()
 }
 
-/// Returns the nearest point of a line, as its distance from the sensor and its direction. The line has this normal and
-/// goes through (x, y).
+/// Returns the distance and the direction of the point of a line that is nearest to the sensor. The line has the normal
+/// `normal` and goes through (x, y).
 fn normal_form(normal: (f64, f64), x: f64, y: f64) -> (f64, f64) {
     let r = normal.0 * x + normal.1 * y;
     let turned = if r < 0.0 { -1.0 } else { 1.0 };
@@ -284,7 +287,7 @@ fn line_through(a: Point, b: Point) -> (f64, f64) {
     normal_form(((b.y - a.y) / length, (a.x - b.x) / length), a.x, a.y)
 }
 
-/// Returns the point that is farthest from the straight line between two points.
+/// Returns the distance and the index of the point that is farthest from the straight line through two points.
 fn farthest(points: &[Point], first: usize, last: usize) -> (f64, usize) {
     let (a, b) = (points[first], points[last]);
     let length = (b.x - a.x).hypot(b.y - a.y);
@@ -299,8 +302,8 @@ fn farthest(points: &[Point], first: usize, last: usize) -> (f64, usize) {
         .fold((0.0, first), |best, one| if one.0 > best.0 { one } else { best })
 }
 
-/// Returns the indices of the vertices of the polyline. The first vertices are both ends. Each further vertex is the
-/// point that is farthest from the polyline so far.
+/// Returns the indices of the vertices of the polyline. The first two vertices are the ends of the points. Each further
+/// vertex is the point that is farthest from the polyline so far.
 fn vertices(points: &[Point], count: usize) -> Vec<usize> {
     let mut vertices = vec![0, points.len() - 1];
     let mut splits = vec![farthest(points, 0, points.len() - 1)];
@@ -317,11 +320,12 @@ fn vertices(points: &[Point], count: usize) -> Vec<usize> {
     vertices
 }
 
-/// Returns the line with the first and last beam that meet it between the projections of the outermost points.
+/// Returns the line, with the first beam and the last beam that meet it between the projections of its outermost
+/// points.
 fn beams_on_line(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usize, f64, f64)> {
     let (first, last) = (points.first()?, points.last()?);
     let (sin, cos) = alpha.sin_cos();
-    // Returns the angle by which a point appears to the left of an end's projection on the line, in radians.
+    // Returns the angle in radians by which point `p` appears to the left of the projection of point `end` on the line.
     let left_of = |p: &Point, end: &Point| {
         let off = end.x * cos + end.y * sin - r;
         let (x, y) = (end.x - off * cos, end.y - off * sin);
@@ -333,7 +337,7 @@ fn beams_on_line(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usi
     Some((begin.beam, end.beam, r, alpha))
 }
 
-/// Iterative end-point fit. The lines are the pieces of a polyline through some of the points.
+/// Iterative end-point fit. The lines are the pieces of a polyline whose vertices are some of the points.
 fn end_points(scan: &Scan, count: usize) -> FoundLines {
     let points = points(scan);
     let mut lines = Vec::new();
@@ -347,7 +351,7 @@ fn end_points(scan: &Scan, count: usize) -> FoundLines {
     FoundLines { lines }
 }
 
-/// Returns the line of orthogonal least squares, and the sum of the squares.
+/// Returns the line that has the smallest sum of squared orthogonal distances to the points, and this sum.
 fn regression(points: &[Point]) -> ((f64, f64), f64) {
     let n = points.len() as f64;
     let (x, y) = points.iter().fold((0.0, 0.0), |(x, y), p| (x + p.x / n, y + p.y / n));
@@ -363,8 +367,9 @@ fn regression(points: &[Point]) -> ((f64, f64), f64) {
     (normal_form(normal, x, y), error.max(0.0))
 }
 
-/// Split and merge. It cuts the points into twice as many pieces as end-point fit. Then it repeatedly merges the two
-/// neighbors whose common line is nearest to their points, until few enough pieces remain.
+/// Split and merge. This method cuts the points into twice as many pieces as end-point fit does. Then it repeatedly
+/// merges two neighboring pieces, until few enough pieces remain. It always chooses the pieces whose common line is
+/// nearest to their points.
 fn split_and_merge(scan: &Scan, count: usize) -> FoundLines {
     let points = points(scan);
     if points.len() < 2 {
@@ -388,20 +393,20 @@ fn split_and_merge(scan: &Scan, count: usize) -> FoundLines {
     }
     let line = |&(first, last): &(usize, usize)| {
         let (one, points) = (points[first], &points[first..=last]);
-        // A single point is a line across its beam.
+        // For a single point, use a line at right angles to the beam.
         let alone = (one.x.hypot(one.y), one.y.atan2(one.x));
         beams_on_line(points, if points.len() > 1 { regression(points).0 } else { alone })
     };
     FoundLines { lines: pieces.iter().filter_map(line).collect() }
 }
 
-/// Number of lines that RANSAC tries before it takes one of them.
+/// Number of lines that RANSAC tries before it takes the best of them.
 const RANSAC_TRIES: usize = 200;
 /// Maximum distance between a line of RANSAC and a point that belongs to it, in meters.
 const RANSAC_DISTANCE_M: f64 = 0.05;
 
-/// RANSAC. It draws random lines through two points, takes the line with the longest run of near points, removes these
-/// points, and repeats.
+/// RANSAC. This method draws random lines through two points, and takes the line with the longest run of near points.
+/// It removes these points, and repeats this for the other points.
 fn ransac(scan: &Scan, count: usize) -> FoundLines {
     let mut random = Rng::with_seed(1);
     let mut left = points(scan);
@@ -422,11 +427,12 @@ fn ransac(scan: &Scan, count: usize) -> FoundLines {
         lines.extend(beams_on_line(&left[best.clone()], regression(&left[best.clone()]).0));
         left.drain(best);
     }
-    // If two lines cover a beam, the first one counts, because it has more points.
+    // If two lines cover the same beam, the beam belongs to the first line, which has more points.
     FoundLines { lines }
 }
 
-/// Returns the points around the point `at` that are near the line, without a break in their beams.
+/// Returns the indexes of the points around the point `at` that are near the line. The beams of these points follow
+/// each other without a gap.
 fn near_run(points: &[Point], at: usize, (r, alpha): (f64, f64)) -> std::ops::Range<usize> {
     let near = |p: &Point| (p.x * alpha.cos() + p.y * alpha.sin() - r).abs() < RANSAC_DISTANCE_M;
     let (mut first, mut end) = (at, at + 1);
@@ -439,16 +445,16 @@ fn near_run(points: &[Point], at: usize, (r, alpha): (f64, f64)) -> std::ops::Ra
     first..end
 }
 
-/// Number of scans in a set.
+/// Number of scans in a set, each of another room.
 const SCANS_PER_SET: usize = 260;
-/// Number of rays of a scan in the experiment.
+/// Number of rays of a scan in PLE's experiment.
 const RAY_COUNT: usize = 360;
 const CORNER_COUNTS: [usize; 7] = [3, 4, 5, 6, 12, 36, 180];
 /// Standard deviations of a ray's noise: for the angle in degrees, and for the range in meters.
 const RAY_NOISE: (f64, f64) = (0.2, 0.03);
 
-/// Returns the rooms of `seed` with scans of `rays` rays over 360 degrees. The scans include both ends, so the first
-/// and the last ray have the same direction.
+/// Returns the rooms of `seed` with scans of `rays` rays over 360 degrees. The scans include both ends of the circle,
+/// so the first and the last ray have the same direction.
 fn draw_rooms(seed: u64, rays: usize) -> Vec<Room> {
     let mut random = Rng::with_seed(seed);
     (0..SCANS_PER_SET).map(|_| room(&mut random, rays)).collect()
@@ -458,10 +464,10 @@ fn scans(rooms: Vec<Room>) -> Vec<Box<Scan>> {
     rooms.into_iter().map(|room| room.scan).collect()
 }
 
-/// A scan of a room, and the truth.
+/// A scan of a room, and the true walls.
 struct Room {
     scan: Box<Scan>,
-    /// Distance of the wall in the direction of each beam, in meters.
+    /// Distance in meters from the sensor to the wall, in the direction of each beam.
     walls_m: Vec<f64>,
     /// Number of corners, which is also the number of walls.
     corners: usize,
@@ -479,7 +485,7 @@ fn room(random: &mut Rng, rays: usize) -> Room {
         let corner = ((from_first / each) as usize).min(corners - 1);
         let (one, two) = (distances[corner], distances[(corner + 1) % corners]);
         let inside = from_first - corner as f64 * each;
-        // Distance to the wall between two corners, by the law of sines.
+        // The distance to the wall between two corners follows from the law of sines.
         one * two * each.sin() / (one * inside.sin() + two * (each - inside).sin())
     };
     let angles = (0..rays).map(|ray| ray as f64 * step - PI);

@@ -1,9 +1,9 @@
 //! Quality of the results that the hub computes from scans: foreground, lines, motion, and foreground of a moving
-//! robot. Each is compared with simple methods, in simulated scenes with known truth and on recordings of real sensors
-//! if they exist: `cargo bench --bench perception [-- [foreground|lines|motion|moving ..] [--json] [--quick] [--seeds
-//! FROM..TO]]`.
+//! robot. Each result is compared with those of simple methods. The scenes are simulated, with known correct results.
+//! Recordings of real sensors are used, too, if they exist. The command line is `cargo bench --bench perception [--
+//! [foreground|lines|motion|moving ..] [--json] [--quick] [--seeds FROM..TO]]`.
 //!
-//! The bench `preprocess` measures what the results cost in the hub.
+//! The bench `preprocess` measures the CPU time that these results cost in the hub.
 
 mod foreground;
 mod lines;
@@ -56,7 +56,7 @@ struct Options {
     parts: Vec<Part>,
     is_json: bool,
     is_quick: bool,
-    /// Seeds of simulated scenes and drives. Seeds below 10 were used for tuning.
+    /// Seeds of simulated scenes and drives. Seeds below 10 were used to tune parameters.
     seeds: Range<u64>,
 }
 

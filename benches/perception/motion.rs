@@ -1,11 +1,13 @@
 //! Accuracy of a robot's motion that is estimated from its scans, and CPU time of the estimate. The hub's method is
 //! compared with simple point-to-point and point-to-line matching of two scans. The simple methods start at the pose of
-//! the first scan and drop the worst tenth of the pairs. The drives are recordings of real robots and simulations.
+//! the first scan, and ignore the worst tenth of the pairs of points. The drives are recordings of real robots and
+//! simulations.
 //!
-//! The positions of three logs come from a map that was built from the same logs, with errors of about 20 mm. The
-//! positions of the model cars have no meaning below 5 mm. Steps of three of the logs are a meter and more, so the
-//! limits of `[motion]` are wider there. A step is wrong if its error is 200 mm (100 mm for the cars) or 5 degrees.
-//! `people in half; hidden` compares with the same scans, but beams on people have no reading.
+//! The true positions of three logs come from a map that was built from the same logs, and have errors of about 20 mm.
+//! The true positions of the model cars have errors of about 5 mm. The steps of three logs are a meter or more, so the
+//! limits in the section `[motion]` are wider for these logs. A step is wrong if its error is 200 mm (100 mm for the
+//! cars) or 5 degrees. The row `people in half; hidden` is for comparison: the scans are the same, but beams on people
+//! have no reading.
 
 use std::f64::consts::{PI, TAU};
 use std::time::Instant;
@@ -19,7 +21,7 @@ use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings::{self, Drive, normal, scan};
 use crate::worlds;
 
-/// Measures on recorded and simulated drives. With `is_quick`, uses fewer steps and seeds.
+/// Measures the methods on recorded and simulated drives. If `is_quick` is true, uses fewer steps and seeds.
 pub(crate) fn measure(is_quick: bool, is_json: bool) {
     let (mut figures, mut cells) = (Vec::new(), Vec::new());
     let drives = recordings::drives();
@@ -34,7 +36,8 @@ pub(crate) fn measure(is_quick: bool, is_json: bool) {
     figures::print_cells("perception, motion", is_json, &cells);
 }
 
-/// Returns the hub's result for each scan, and the CPU times for lines and motion in us per scan.
+/// Returns the motion that the hub's method estimates for each scan, and the CPU times for lines and for motion, in
+/// microseconds per scan.
 fn run(scans: &[Box<Scan>], settings: Settings) -> (Vec<Motion>, [f64; 2]) {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
     let mut finder = LineFinder::new(Pose::default(), LineSettings::default(), beams);
@@ -55,7 +58,7 @@ fn run(scans: &[Box<Scan>], settings: Settings) -> (Vec<Motion>, [f64; 2]) {
     (motions, taken_us.map(|us| us / scans.len().max(1) as f64))
 }
 
-/// Returns the difference between `truth` and `found`, in mm and degrees.
+/// Returns the difference between `truth` and `found`: the distance in millimeters and the angle in degrees.
 fn pose_error(truth: &Pose2, found: &Pose2) -> (f64, f64) {
     let between = truth.inverse().then(found);
     (1000.0 * between.x.hypot(between.y), between.yaw.to_degrees().abs())
@@ -71,7 +74,7 @@ fn median(values: &mut [f64]) -> f64 {
     figures::percentile(values, 0.5).unwrap_or(f64::NAN)
 }
 
-/// Adds the scores of at most `max_steps` steps of `drive`, evenly distributed.
+/// Adds the scores of at most `max_steps` steps of `drive`, which are evenly distributed over the drive.
 fn measure_drive(drive: &Drive, max_steps: usize, cells: &mut Vec<Cell>) {
     let (motions, times_us) = run(&drive.scans, drive.settings);
     let steps: Vec<(usize, Pose2)> = drive.steps().collect();
@@ -122,7 +125,7 @@ fn measure_drive(drive: &Drive, max_steps: usize, cells: &mut Vec<Cell>) {
     }
 }
 
-/// Adds the figures of simulated drives, with `seeds` of each kind.
+/// Adds the figures of simulated drives. Each kind of drive is simulated with `seeds` seeds.
 fn measure_simulated(seeds: u64, figures: &mut Vec<Figure>) {
     let mut put =
         |name, unit, hub, baseline, target| figures.push(Figure { name, unit, hub, baseline, target });
@@ -205,7 +208,7 @@ type Point = (f64, f64);
 const MAX_ITERATIONS: usize = 40;
 /// Maximum distance between two points of a pair, in meters.
 const MAX_PAIR_DISTANCE_M: f64 = 1.0;
-/// Share of the pairs that are used.
+/// Share of the pairs that a simple method uses. The other pairs are the worst ones.
 const TRIM_SHARE: f64 = 0.9;
 
 fn points(scan: &Scan) -> Vec<Point> {
@@ -220,7 +223,8 @@ fn squared_distance((x, y): Point, (a, b): Point) -> f64 {
     (x - a) * (x - a) + (y - b) * (y - b)
 }
 
-/// Returns the nearest point of `fixed` for each point of `moved`: both indices and the square of the distance.
+/// Finds the nearest point of `fixed` for each point of `moved`. Returns the indexes of both points and the square of
+/// their distance.
 fn pairs(fixed: &[Point], moved: &[Point]) -> Vec<(usize, usize, f64)> {
     let nearest = |(i, &point): (usize, &Point)| {
         let by_distance = fixed.iter().enumerate().map(|(j, &other)| (j, squared_distance(point, other)));
@@ -275,7 +279,7 @@ fn point_to_line(before: &Scan, now: &Scan) -> Pose2 {
     let mut pose = Pose2::default();
     for _ in 0..MAX_ITERATIONS {
         let moved: Vec<Point> = own.iter().map(|&point| pose.point(point)).collect();
-        // The line goes through the nearest point and the nearer one of its neighbors.
+        // The line goes through the nearest point and through one of its two neighbors, the nearer one.
         let of_pair = |(i, j, _): (usize, usize, f64)| {
             let point = moved[i];
             let neighbors = [j.checked_sub(1), Some(j + 1)].into_iter().flatten();
@@ -309,7 +313,7 @@ fn point_to_line(before: &Scan, now: &Scan) -> Pose2 {
     pose
 }
 
-/// Returns the solution x of m x = v, by Cramer's rule; `None` if m is singular.
+/// Returns the solution x of m x = v, which it computes by Cramer's rule. Returns `None` if m is singular.
 fn solve(m: [[f64; 3]; 3], v: [f64; 3]) -> Option<[f64; 3]> {
     let of = |m: &[[f64; 3]; 3]| {
         m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
@@ -328,15 +332,15 @@ fn solve(m: [[f64; 3]; 3], v: [f64; 3]) -> Option<[f64; 3]> {
 /// Kind of a simulated drive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum DriveKind {
-    /// A room.
+    /// The robot drives in a room.
     Room,
-    /// People walk around the robot and hide about half of the view.
+    /// People walk around the robot in a room, and hide about half of the view.
     People,
-    /// Like `People`, but beams that meet people have no reading.
+    /// Like `People`, but beams that meet a person have no reading.
     Hidden,
-    /// Two walls and nothing else.
+    /// The robot drives between two walls, and nothing else is visible.
     Corridor,
-    /// Every fiftieth scan is from another position.
+    /// The robot drives in a room, but every fiftieth scan is from another position.
     Jump,
     /// The robot does not move.
     Standing,
@@ -347,7 +351,7 @@ const NOISE_M: f64 = 0.01;
 const PEOPLE_COUNT: usize = 9;
 const SCAN_PERIOD_S: f64 = 1.0 / 37.5;
 
-/// Returns the walls of a room: a rectangle with pillars and boxes in it.
+/// Returns the walls of a rectangular room with pillars and boxes in it.
 fn room(random: &mut Rng) -> Vec<(Point, Point)> {
     let mut walls = box_walls((0.0, 0.0), (12.0, 9.0), 0.0);
     for _ in 0..8 {
@@ -367,7 +371,7 @@ fn box_walls(center: Point, (long, wide): (f64, f64), yaw: f64) -> Vec<(Point, P
     (0..4).map(|i| (corners[i], corners[(i + 1) % 4])).collect()
 }
 
-/// Returns the distance to the wall from `from` along the unit vector `along`.
+/// Returns the distance from `from` to a wall, along the unit vector `along`.
 fn distance_to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Point)) -> Option<f64> {
     let (dx, dy) = (x2 - x1, y2 - y1);
     let cross = along.0 * dy - along.1 * dx;
@@ -376,7 +380,7 @@ fn distance_to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Po
     (range > 0.0 && (0.0..=1.0).contains(&share)).then_some(range)
 }
 
-/// Returns the distance to a disc of `radius`.
+/// Returns the distance from `from` to a disc with this center and `radius`, along the unit vector `along`.
 fn distance_to_disc(from: Point, along: Point, center: Point, radius: f64) -> Option<f64> {
     let (dx, dy) = (center.0 - from.0, center.1 - from.1);
     let ahead = dx * along.0 + dy * along.1;
@@ -384,13 +388,14 @@ fn distance_to_disc(from: Point, along: Point, center: Point, radius: f64) -> Op
     (inside > 0.0 && ahead > radius).then(|| ahead - inside.sqrt())
 }
 
-/// A walking person, in the frame of the room.
+/// A person who walks. Position and speed are in the frame of the room.
 struct Walker {
     at: Point,
     by_second: Point,
 }
 
-/// Moves the people. Replaces people who leave the view from `visible_from`, so that about half of the view is hidden.
+/// Moves the people by the time of one scan. Replaces people who have left the view of the robot at `visible_from`, so
+/// that people always hide about half of the view.
 fn move_people(people: &mut Vec<Walker>, visible_from: &Pose2, random: &mut Rng) {
     for Walker { at, by_second } in people.iter_mut() {
         *at = (at.0 + by_second.0 * SCAN_PERIOD_S, at.1 + by_second.1 * SCAN_PERIOD_S);
@@ -431,7 +436,7 @@ fn drive(kind: DriveKind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Sca
         if at > 0 {
             turn = (turn + 0.3 * (random.f64() - 0.5)).clamp(-0.8, 0.8);
             speed = (speed + 0.1 * (random.f64() - 0.5)).clamp(0.2, 1.2);
-            // A robot far from the center turns back.
+            // If the robot is far from the center, it turns back.
             let is_far = pose.x.hypot(pose.y) > 1.5;
             let home = (-pose.y).atan2(-pose.x) - pose.yaw;
             let turn = if is_far { 1.5 * home.sin() } else { turn };
@@ -474,7 +479,8 @@ fn drive(kind: DriveKind, beams: usize, count: usize, seed: u64) -> (Vec<Box<Sca
     (scans, poses)
 }
 
-/// Returns the square of `deviation` in standard deviations of `covariance`.
+/// Returns the square of the length of `deviation`, measured in standard deviations of `covariance` (the Mahalanobis
+/// distance).
 fn normalized(deviation: &[f64; 3], covariance: &[f32; 9]) -> Option<f64> {
     let matrix = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(covariance[3 * i + j])));
     let x = solve(matrix, *deviation)?;

@@ -1,12 +1,13 @@
-//! Separation of moving from static objects on a driving robot, with `background.method = "moving"`. Simulated drives
-//! have known truth. For a standing robot, the method is compared with `multi`. Recordings come from a model car, with
-//! another car whose position is known.
+//! Separation of moving from static objects on a driving robot, with `background.method = "moving"`. In simulated
+//! drives, the correct answers are known. For a standing robot, the method is compared with the method `multi`. The
+//! recordings come from a model car, and show another car whose position is known.
 //!
-//! A beam counts as foreground if its whole spot meets a person, in space that was seen free at least five times. Three
-//! things do not count: beams at a person's edge, people in space that was not seen before, and the first 12 s.
+//! A beam counts as foreground if its whole spot meets a person, in space that was empty in at least five earlier
+//! scans. Three things do not count: beams at the edge of a person, people in space that was not visible before, and
+//! the first 12 s.
 //!
-//! A point belongs to the other car if it is within 0.2 m of the car's pose while the car moves. A reported beam is
-//! false if it is more than 0.4 m from that pose.
+//! A point belongs to the other car if it is within 0.2 m of the car's pose while the car moves. A beam that is
+//! reported as foreground is wrong if its point is more than 0.4 m from this pose.
 
 use std::ops::Range;
 use std::time::Instant;
@@ -19,7 +20,7 @@ use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings;
 use crate::worlds::{self, Drive};
 
-/// Measures on simulated drives with these `seeds` and on recorded ones.
+/// Measures the method on simulated drives with these `seeds`, and on recorded drives.
 pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
     let (mut figures, mut cells) = (Vec::new(), Vec::new());
     measure_drives(seeds, &mut figures);
@@ -56,8 +57,8 @@ impl Processors {
     }
 }
 
-/// Returns recall and precision of `method` from the scan with index `from` on, and the CPU time in us per scan. A map
-/// built with the true poses determines which beams are foreground.
+/// Returns recall and precision of `method` from the scan with index `from` on, and the CPU time in microseconds per
+/// scan. A map that is built with the true poses determines which beams are foreground.
 fn run(drive: &Drive, method: Method, from: usize) -> (f64, f64, f64) {
     let beams = drive.scans[0].beams();
     let mut processors = Processors::new(method, beams);
@@ -116,8 +117,8 @@ fn measure_drives(seeds: Range<u64>, figures: &mut Vec<Figure>) {
     put("standing: precision below multi's", "1", less(1), Vec::new(), Target::Max(0.01));
 }
 
-/// Adds the scores for the other car. They are the share of the beams on the moving car that are reported, and the
-/// number of other reported beams per scan.
+/// Adds the scores for recordings with another car. One score is the share of the beams on the moving car that are
+/// reported as foreground. The other score is the number of wrong beams per scan.
 fn measure_recordings(cells: &mut Vec<Cell>) {
     let recordings = recordings::drives_with_other_car();
     if recordings.is_empty() {

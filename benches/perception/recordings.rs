@@ -1,6 +1,6 @@
-//! Recorded drives of real robots whose positions are known. The first kind is logs of the CARMEN toolkit, with
-//! positions corrected by a map. The second kind is model cars under motion capture. The recordings are not part of the
-//! project.
+//! Recorded drives of real robots whose positions are known. Some of them are logs of the CARMEN toolkit, with
+//! positions that were corrected by a map. The others are drives of model cars, whose positions were measured by motion
+//! capture. The recordings are not part of the project.
 
 use std::f64::consts::{PI, TAU};
 use std::fs::{self, File};
@@ -16,32 +16,32 @@ use serde_json::Value;
 /// Names of the drives of model cars.
 const CARS: [&str; 2] = ["overtakes", "intersection"];
 
-/// A scan with the robot's pose at the scan, if the pose is known.
+/// A scan, and the pose of the robot at the time of the scan, if the pose is known.
 type PosedScan = (Box<Scan>, Option<Pose2>);
 
 /// Consecutive scans of a robot.
 pub(crate) struct Drive {
     pub(crate) name: String,
     pub(crate) scans: Vec<Box<Scan>>,
-    /// Position of the robot at each scan, if it is known.
+    /// Pose of the robot at each scan, or `None` if it is unknown.
     pub(crate) positions: Vec<Option<Pose2>>,
     pub(crate) settings: Settings,
-    /// Minimum error of a wrong step, in mm.
+    /// Minimum position error in millimeters at which a step is wrong.
     pub(crate) min_wrong_mm: f64,
 }
 
 impl Drive {
-    /// Returns each scan whose step from the previous scan is known: the index of the scan, and the step.
+    /// Returns the index of each scan whose step from the previous scan is known, together with this step.
     pub(crate) fn steps(&self) -> impl Iterator<Item = (usize, Pose2)> + '_ {
         let step = |at: usize| Some((at, self.positions[at - 1]?.inverse().then(&self.positions[at]?)));
         (1..self.positions.len()).filter_map(step)
     }
 }
 
-/// Returns all drives. Without recordings, there are none.
+/// Returns all drives. Without recordings, the list is empty.
 pub(crate) fn drives() -> Vec<Drive> {
     let logs = logs().into_iter().map(|(name, scans)| {
-        // All but one log have one scan per meter or per half turn.
+        // All logs except one have one scan per meter or per half turn, so wider limits are needed.
         let settings = if name == "freiburg-079" {
             Settings::default()
         } else {
@@ -66,7 +66,7 @@ pub(crate) fn drives_with_other_car() -> Vec<(Drive, Vec<Option<Pose2>>)> {
     CARS.into_iter().filter_map(of).collect()
 }
 
-/// Returns the folder of recordings: SCANHUB_DATA, or `../shared/data`.
+/// Returns the folder with recordings: the value of the variable SCANHUB_DATA, or `../shared/data`.
 fn folder() -> PathBuf {
     let default_folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
     std::env::var_os("SCANHUB_DATA").map_or(default_folder, PathBuf::from)
@@ -85,8 +85,8 @@ fn lines(path: &Path) -> io::Result<impl Iterator<Item = String>> {
     Ok(BufReader::new(MultiGzDecoder::new(File::open(path)?)).lines().map_while(Result::ok))
 }
 
-/// Returns each scan of a CARMEN log with the robot's position: lines `FLASER COUNT RANGE .. X Y YAW ..`, ranges in
-/// meters, 180 degrees.
+/// Returns each scan of a CARMEN log with the robot's pose. The scans are lines `FLASER COUNT RANGE .. X Y YAW ..`,
+/// with ranges in meters over 180 degrees.
 fn carmen(path: &Path) -> Option<Vec<PosedScan>> {
     let read = |line: String| {
         let mut words = line.strip_prefix("FLASER ")?.split_ascii_whitespace();
@@ -94,9 +94,9 @@ fn carmen(path: &Path) -> Option<Vec<PosedScan>> {
         let numbers: Vec<f64> = words.take(count + 3).map_while(|word| word.parse().ok()).collect();
         let (ranges, position) = numbers.split_at_checked(count)?;
         let &[x, y, yaw] = position else { return None };
-        // An odd number includes both ends of the half circle.
+        // If the number of ranges is odd, the scan includes both ends of the half circle.
         let step = PI / (count - count % 2) as f64;
-        // Three of the logs have 81 m for no return.
+        // Three of the logs have the range 81 m for a beam without an echo.
         let ranges: Vec<f64> =
             ranges.iter().map(|&range| if range < 50.0 { range } else { f64::INFINITY }).collect();
         Some((scan(-PI / 2.0, step, &ranges), Some(Pose2::new(x, y, yaw))))
@@ -104,7 +104,7 @@ fn carmen(path: &Path) -> Option<Vec<PosedScan>> {
     Some(lines(path).ok()?.filter_map(read).collect())
 }
 
-/// Returns the scans of all CARMEN logs, each log with its name. Without recordings, there are none.
+/// Returns the scans of all CARMEN logs, each log with its name. Without recordings, the list is empty.
 pub(crate) fn logs() -> Vec<(String, Vec<PosedScan>)> {
     let entries = fs::read_dir(folder().join("carmen")).into_iter().flatten().flatten();
     let mut paths: Vec<PathBuf> = entries.map(|entry| entry.path()).collect();
@@ -134,8 +134,8 @@ fn model_car(name: &str) -> Option<Drive> {
     })
 }
 
-/// Returns a scan of `ranges`, which are in meters, in units of 1 mm. A range beyond the maximum of a scan becomes no
-/// return.
+/// Returns a scan with these ranges, which are in meters, in units of 1 mm. If a range is beyond the maximum of a scan,
+/// the beam gets the code `no return`.
 pub(crate) fn scan(first_angle: f64, step: f64, ranges: &[f64]) -> Box<Scan> {
     let head = ScanHead {
         first_angle,
@@ -153,7 +153,7 @@ pub(crate) fn scan(first_angle: f64, step: f64, ranges: &[f64]) -> Box<Scan> {
     Scan::of(head, &ranges.iter().map(in_units).collect::<Vec<_>>())
 }
 
-/// Returns a number of the standard normal distribution, by the Box-Muller method.
+/// Returns a random number of the standard normal distribution, which it computes by the Box-Muller method.
 pub(crate) fn normal(random: &mut Rng) -> f64 {
     (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
 }

@@ -1,24 +1,24 @@
-//! Tables of quantities for several numbers of subscribers, sensors or beams, with fits that show how the quantities
-//! grow.
+//! Tables of quantities that were measured for several numbers of subscribers, sensors or beams. Fits show how the
+//! quantities grow with these numbers.
 
 use crate::support::figures::{self, Cell, percentile};
 
-/// A quantity that is measured for several numbers of items.
+/// A quantity that is measured for several numbers of items, such as subscribers.
 pub(crate) struct Quantity {
     pub(crate) name: &'static str,
     pub(crate) unit: &'static str,
-    /// Exponent that the quantity has if the total grows linearly: 0 for a cost per item, 1 for the cost of all items.
-    /// `None` if the growth is not evaluated.
+    /// Exponent that the quantity has if the cost of all items grows linearly. It is 0 for a cost per item, and 1 for
+    /// the cost of all items. `None` if the growth is not evaluated.
     pub(crate) linear: Option<f64>,
 }
 
 /// Values of several quantities, measured for several numbers of items.
 pub(crate) struct ParameterRange {
     title: String,
-    /// Name of the counted items, such as `subscribers`.
+    /// Name of the items, such as `subscribers`.
     counted: &'static str,
     quantities: Vec<Quantity>,
-    /// The numbers of items in order. Each number has the values of all runs, by quantity.
+    /// Rows of the table, in order. Each row has the number of items, and for each quantity the values of all runs.
     rows: Vec<(usize, Vec<Vec<f64>>)>,
 }
 
@@ -28,7 +28,7 @@ struct Growth {
     /// Parameters of the fit `fixed + per_item * n`, which minimizes the squares of relative errors.
     fixed: f64,
     per_item: f64,
-    /// Slope of the logarithms for large numbers of items. It is 1 for a quantity that grows linearly.
+    /// Slope of the logarithms for large numbers of items. It is 1 if the quantity grows linearly.
     exponent: f64,
 }
 
@@ -38,8 +38,7 @@ impl ParameterRange {
         ParameterRange { title: title.to_owned(), counted, quantities, rows: Vec::new() }
     }
 
-    /// Adds the values of one run with `number` items. There is one value for each quantity, in the order of the
-    /// quantities.
+    /// Adds the values of one run with `number` items. `values` has one value for each quantity, in the same order.
     pub(crate) fn add(&mut self, number: usize, values: &[f64]) {
         if self.rows.last().is_none_or(|(last, _)| *last != number) {
             self.rows.push((number, vec![Vec::new(); self.quantities.len()]));
@@ -70,7 +69,7 @@ impl ParameterRange {
         self.rows.iter().flat_map(row).collect()
     }
 
-    /// Returns the fits, and prints which quantities grow faster than linearly.
+    /// Returns the fits as cells, and prints which quantities grow faster than linearly.
     fn growths(&self, json: bool) -> Vec<Cell> {
         let mut cells = Vec::new();
         for (at, quantity) in self.quantities.iter().enumerate() {
@@ -118,7 +117,7 @@ impl Growth {
         let (fixed, per_item) = line(points.iter().map(|&(n, value)| (n, value, 1.0 / (value * value))))?;
         let far = points.iter().filter(|(n, _)| n * LARGE_FACTOR >= greatest);
         let near = points.len().saturating_sub(3);
-        // Use at least three points; with two, the slope would only show the spread of two runs.
+        // Use at least three points. With two points, the slope would only show the spread of two runs.
         let far: Vec<_> =
             if far.clone().count() < 3 { points[near..].to_vec() } else { far.copied().collect() };
         let (_, exponent) = line(far.iter().map(|(n, value)| (n.ln(), value.ln(), 1.0)))?;
@@ -126,7 +125,8 @@ impl Growth {
     }
 }
 
-/// Returns a and b of the line `a + b x` with the smallest weighted sum of squares for points `(x, value, weight)`.
+/// Returns a and b of the line `a + b x` that fits `points` best, by the smallest weighted sum of squared errors. A
+/// point is `(x, value, weight)`.
 fn line(points: impl Iterator<Item = (f64, f64, f64)>) -> Option<(f64, f64)> {
     let [mut weights, mut x, mut y, mut xx, mut xy] = [0.0; 5];
     for (at, value, weight) in points {
@@ -141,7 +141,9 @@ fn line(points: impl Iterator<Item = (f64, f64, f64)>) -> Option<(f64, f64)> {
     (spread > 0.0).then(|| ((y - slope * x) / weights, slope))
 }
 
-/// Factor that defines large numbers: those that are at least the largest number divided by this factor.
+/// Factor that defines large numbers of items. A number is large if it is at least the largest number divided by this
+/// factor.
 const LARGE_FACTOR: f64 = 16.0;
-/// Maximum difference from the exponent of linear growth that the spread of a few runs can explain.
+/// Tolerance for the exponent. If it exceeds the exponent of linear growth by no more than this, the spread of a few
+/// runs can explain the difference.
 const EXPONENT_TOLERANCE: f64 = 0.25;

@@ -1,29 +1,29 @@
 //! Costs of many subscribers, effects of broken subscribers on the others, and growth of the hub's costs.
 //!
-//! A hundred subscribers receive one sensor at once. Then a process that holds samples is killed twenty times, a
-//! subscriber is stopped for two seconds, and all slots of a topic are taken. Another subscriber, the witness, loses
-//! nothing in all of this. Afterward, the hub is in the same state as before.
+//! At first, a hundred subscribers receive the scans of one sensor at the same time. Then a process that holds samples
+//! is killed twenty times, a subscriber is stopped for two seconds, and subscribers take all slots of a topic. Another
+//! subscriber, the witness, must not lose a sample. After that, the hub must be in the same state as before.
 //!
 //! CPU time and memory are then measured for several numbers of subscribers, of sensors on lines, of sensors in virtual
-//! time, and of beams. A fit shows how each of them grows. Subscribers are threads of four processes. Lines are ptys of
-//! this machine. If simulators and hub no longer keep the rate of the sensors, the table shows it. The bench does not
-//! measure real adapters.
+//! time, and of beams. A fit shows how each of these costs grows. Subscribers are threads of four processes. Lines are
+//! ptys of this machine. The table shows the rate of the sensors, which drops if simulators and hub cannot keep up. The
+//! bench does not measure real adapters.
 //!
 //! How to read the figures:
 //!
 //! - In virtual time, the whole hub runs without ports and without waiting (`tests/testkit/virtual_hub.rs`). Simulated
 //!   telegrams arrive in three reads and pass framer, session, decoding and all processors into all topics in shared
-//!   memory. One system call wakes the subscribers, and one subscriber to each topic takes everything. Reads, sleeps
+//!   memory. One system call wakes the subscribers, and one subscriber to each topic takes all samples. Reads, sleeps
 //!   and wake-ups of subscribers are not included; `sensors on ptys` and `subscribers of one sensor` include them.
-//! - If there are many sensors, they run in hubs of 125 sensors at the same time. The cost increases between about ten
-//!   and about a hundred sensors because of the second-level cache. For each sample, the library checks all possible
-//!   subscriber slots of the topic, which are 1168 bytes apart.
-//! - A table of growth has the line `fixed + for each * n`, which minimizes the squares of relative errors. It also has
-//!   the slope of the logarithms from a sixteenth of the largest number upward. If a slope exceeds the slope of linear
-//!   growth by 0.25, it is reported as worse than linear.
-//! - Latency is the latency of the last subscriber. Numbers above 125 are measured once.
+//! - If there are many sensors, they run in hubs of 125 sensors at the same time. From about ten to about a hundred
+//!   sensors, the cost per sensor increases because of the second-level cache. For each sample, the library checks all
+//!   possible subscriber slots of the topic, which are 1168 bytes apart.
+//! - A table of growth has the fit `fixed + for each * n`, which minimizes the squares of relative errors. It also has
+//!   the slope of the logarithms, for numbers from a sixteenth of the largest number upward. If this slope exceeds the
+//!   slope of linear growth by 0.25, the growth is reported as worse than linear.
+//! - Latency is that of the last subscriber that receives a scan. Numbers of sensors above 125 are measured only once.
 //! - `program and libraries` are pages of the executable, which the machine holds only once. Touched shared memory is
-//!   the part of the samples that is in use. It is small because the same few samples are used repeatedly.
+//!   the part of the memory for samples that is in use. It is small because the same few samples are used repeatedly.
 
 mod growth;
 mod many_subscribers;
@@ -78,7 +78,7 @@ fn faults(options: &Options) -> Outcome<()> {
     figures.extend(measure_kills(&environment, &hub)?);
     figures.extend(measure_stopped(&environment)?);
     figures.extend(fill_slots(&environment)?);
-    // A request for the status needs a slot. After this time, the slots of the many subscribers are free.
+    // Wait until the slots of the many subscribers are free, because the next call needs a slot of topic `status`.
     thread::sleep(CLEANUP_TIMEOUT);
     let failed = counter(&environment, Counter::LoanFailed)?;
     figures.push(figure("samples without memory", "1", failed, Target::Max(0.0)));
@@ -153,7 +153,7 @@ fn measure_kills(environment: &BenchEnvironment, hub: &Child) -> Outcome<Vec<Fig
 
 /// Stops a subscriber for two seconds.
 fn measure_stopped(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
-    // The witness attached first, and reports everything that was published.
+    // The witness attaches first, so it reports all samples that the stopped subscriber may miss.
     let (witness, stopped) = (start_subscriber(environment)?, start_subscriber(environment)?);
     let pid = Pid::from_raw(stopped.guard.pid() as i32).ok_or("no process")?;
     thread::sleep(Duration::from_secs(1));
@@ -182,7 +182,7 @@ fn measure_stopped(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
     ])
 }
 
-/// Takes all slots of a topic, and one more.
+/// Attaches one subscriber more than a topic has slots.
 fn fill_slots(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
     let child = environment.start_part(&["stay", environment.domain.name(), SENSOR, "210"])?;
     let refused = child.wait_for_line("refused", 6 * STEP_TIMEOUT)?;
@@ -190,7 +190,7 @@ fn fill_slots(environment: &BenchEnvironment) -> Outcome<Vec<Figure>> {
     Ok(vec![figure("subscribers before one was refused", "1", refused.number(1)? as f64, Target::None)])
 }
 
-/// Starts a subscriber to telegrams that prints each of them, and waits for the first.
+/// Starts a subscriber that prints each telegram, and waits for the first one.
 fn start_subscriber(environment: &BenchEnvironment) -> Outcome<Child> {
     let subscriber = environment.start_subscriber("telegram", SENSOR, &["0"])?;
     subscriber.wait_for_line("telegram", STEP_TIMEOUT)?;
@@ -227,5 +227,5 @@ fn figure(name: &'static str, unit: &'static str, value: f64, target: Target) ->
 const SENSOR: &str = "front";
 const PROCESS_COUNT: usize = 4;
 const KILL_COUNT: usize = 20;
-/// Time after which the hub has certainly cleaned up after dead processes. The hub does this every 5 s.
+/// Time after which the hub has certainly cleaned up after dead processes, which it does every 5 s.
 const CLEANUP_TIMEOUT: Duration = Duration::from_secs(12);

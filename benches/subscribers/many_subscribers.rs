@@ -1,6 +1,6 @@
-//! Cost of one sensor's subscribers for the hub, time until the last of them has a scan, and memory of a hub with 200
-//! subscribers. Subscribers sleep on the doorbell or on the event. The sensor is at the other end of a pty and keeps
-//! its rate.
+//! Costs of many subscribers to one sensor: CPU time of the hub, time until the last subscriber has a scan, and memory
+//! of a hub with 200 subscribers. Subscribers sleep on the doorbell or on the event. The simulated sensor is at the
+//! other end of a pty, and sends at its real rate.
 
 use std::collections::BTreeMap;
 use std::sync::Barrier;
@@ -39,14 +39,15 @@ pub(crate) fn measure_subscribers(options: &Options) -> Outcome<()> {
             quantities,
         );
         for _ in 0..options.pairs().min(3) {
-            // One hub serves all numbers of subscribers, because subscribers that leave return their memory.
+            // Use the same hub for all numbers of subscribers, because the memory of a subscriber is free after it has
+            // left.
             let hub = environment.hub_with_many_slots(&[SENSOR])?;
             hub.wait_for_line("ready", STEP_TIMEOUT)?;
             let mut runs = Vec::new();
             for count in SUBSCRIBER_COUNTS {
                 match run(&environment, &hub, count, options.seconds(8), wait) {
                     Ok(values) => runs.push((count, values)),
-                    // An overloaded machine wakes too few subscribers in time.
+                    // On an overloaded machine, too few subscribers wake in time.
                     Err(error) => eprintln!("{count} subscribers, waiting for the {wait}: {error}"),
                 }
             }
@@ -58,9 +59,9 @@ pub(crate) fn measure_subscribers(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Subscribes `count` times to the scans of `sensor`. Receives for `seconds` after each subscriber has a scan. For each
-/// scan, prints `last SEQ COUNT AGE_NS`: the number of subscribers that received the scan, and its age at the last of
-/// them. Finally prints `missed COUNT`.
+/// Attaches `count` subscribers to the scans of `sensor`. After each subscriber has received a scan, they receive for
+/// `seconds` seconds. Prints a line `last SEQ COUNT AGE_NS` for each scan. COUNT is the number of subscribers that
+/// received the scan, and AGE_NS is the age of the scan at the last of them. Finally prints `missed COUNT`.
 pub(crate) fn subscribe_many(
     domain: &str,
     sensor: &str,
@@ -75,7 +76,7 @@ pub(crate) fn subscribe_many(
         let attached = attached.map_err(Into::into).and_then(|mut scans| -> Outcome<_> {
             scans.next()?.map(drop).map_or(Err("no scan arrived".into()), |()| Ok(scans))
         });
-        // A subscriber that fails must not block the others.
+        // Wait even after an error, because a subscriber that fails must not block the others.
         all.wait();
         let mut scans = attached.map_err(|error| error.to_string())?;
         let words = |error: scanhub_client::Error| error.to_string();
@@ -111,7 +112,7 @@ pub(crate) fn subscribe_many(
     })
 }
 
-/// Starts `count` subscribers in a few processes, and waits until each has a scan.
+/// Starts `count` subscribers in a few processes, and waits until each subscriber has a scan.
 fn start(
     environment: &BenchEnvironment,
     sensor: &str,
@@ -136,7 +137,7 @@ fn start(
     Ok(children)
 }
 
-/// Returns the values of the sweep for `count` subscribers.
+/// Measures `count` subscribers. Returns one value for each quantity of the table.
 fn run(
     environment: &BenchEnvironment,
     hub: &Child,
@@ -145,7 +146,7 @@ fn run(
     wait: &str,
 ) -> Outcome<[f64; 7]> {
     let children = start(environment, SENSOR, count, seconds, wait)?;
-    // The measurement ends before the first subscriber leaves.
+    // The measurement takes 0.9 times as long as the subscribers run, so it ends before the first of them leaves.
     let look =
         || -> Outcome<(u64, ThreadUsage)> { Ok((clock::now(), ThreadUsage::of(hub.guard.pid(), |_| true)?)) };
     let before = look()?;
@@ -184,7 +185,7 @@ const SENSOR: &str = "front";
 const SUBSCRIBER_COUNTS: [usize; 5] = [1, 4, 16, 64, 200];
 const PROCESS_COUNT: usize = 4;
 
-/// Number of files and number of their bytes, by file name extension.
+/// Number of files and total number of bytes in these files, by the extension of the file name.
 type SegmentSizes = BTreeMap<String, (usize, f64)>;
 
 /// Measures the memory of a hub with two links and 100 subscribers to the scans of each.
@@ -194,7 +195,8 @@ pub(crate) fn measure_memory(options: &Options) -> Outcome<()> {
     let hub = environment.hub_with_many_slots(&SENSORS)?;
     hub.wait_for_line("ready", STEP_TIMEOUT)?;
     let alone = segments(&environment.domain)?;
-    // The subscribers run until they are ended, so that the first ones are still attached when the last ones attach.
+    // The subscribers run until the bench ends them, so that the first ones are still attached when the last ones
+    // attach.
     let (seconds, long) = (options.seconds(8), 3600);
     let children: Vec<_> = SENSORS
         .iter()

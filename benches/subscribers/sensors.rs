@@ -1,5 +1,5 @@
-//! Costs of sensors for the hub: on lines at the sensors' own rate, and in virtual time as fast as the hub can process
-//! them. Also measures the cost of beams.
+//! Costs of sensors for the hub. Sensors on lines send at their real rate. In virtual time, telegrams arrive as fast as
+//! the hub can process them. The cost of beams is measured, too.
 
 use std::path::Path;
 use std::thread;
@@ -22,13 +22,14 @@ use crate::support::usage::{ResidentMemory, ThreadUsage, segments};
 use crate::support::{Options, Outcome, clock};
 use crate::virtual_hub::{VirtualLink, virtual_hub};
 
-/// Numbers of sensors on lines to measure with.
+/// Numbers of sensors on lines for which the bench measures the cost.
 const LINE_SENSOR_COUNTS: [usize; 5] = [1, 2, 4, 8, 16];
-/// Number of scans of a sensor on a line that do not count.
+/// Number of scans at the start that do not count, for a sensor on a line.
 const SKIPPED_SCANS: usize = 80;
 
 /// Measures 1 to 16 sensors. Each sensor has its own simulator at the other end of a pty, and a subscriber to its
-/// scans. The rate shows whether simulators and hub keep up with the sensors on the same processors.
+/// scans. The rate shows whether the simulators and the hub, which share the processors, can keep the rate of the
+/// sensors.
 pub(crate) fn measure_lines(options: &Options) -> Outcome<()> {
     let quantity = |name, unit, linear| Quantity { name, unit, linear };
     let quantities = vec![
@@ -53,7 +54,7 @@ pub(crate) fn measure_lines(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Returns the values of the range for this number of `sensors`.
+/// Measures this number of sensors on lines. Returns one value for each quantity of the table.
 fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
     let environment = BenchEnvironment::new()?;
     let names: Vec<String> = (0..sensors).map(|number| format!("s{number}")).collect();
@@ -69,7 +70,7 @@ fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
         |name: &&str| environment.start_part(&["ages", environment.domain.name(), name, &count.to_string()]);
     let subscribers: Vec<Child> = names.iter().map(start).collect::<Outcome<_>>()?;
     let patience = STEP_TIMEOUT + Duration::from_secs(4 * seconds);
-    // Wait until all sensors stream and the timing of each line is known.
+    // Wait until all sensors stream, and until the hub has estimated the timing of each line.
     for subscriber in &subscribers {
         subscriber.wait_for_line("attaching", STEP_TIMEOUT)?;
     }
@@ -107,9 +108,9 @@ fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
     ])
 }
 
-/// Measures 1 to 1,000 sensors in virtual time, to find how many sensors one core could serve if receiving bytes cost
-/// nothing. Many sensors are distributed over several hubs, because a hub has at most 256 links, and a process does not
-/// have enough descriptors for more sensors.
+/// Measures 1 to 1,000 sensors in virtual time. The result shows how many sensors one core could serve if it cost
+/// nothing to receive bytes. Many sensors are distributed over several hubs, because a hub has at most 256 links, and a
+/// process does not have enough descriptors for more sensors.
 pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
     let quantity = |name, unit, linear| Quantity { name, unit, linear };
     let quantities = vec![
@@ -123,16 +124,17 @@ pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
     let mut sweep = ParameterRange::new("sensors in virtual time", "sensors", quantities);
     let mut of_most = Vec::new();
     let telegrams = options.count(20_000);
-    // Leave out numbers of sensors for which there are too few telegrams.
+    // Leave out numbers of sensors for which each sensor would have fewer than four telegrams.
     for sensors in VIRTUAL_SENSOR_COUNTS.into_iter().filter(|sensors| sensors * 4 <= telegrams) {
-        // Setting up many sensors takes longer than measuring them, and one run already has many values.
+        // Measure many sensors only once. It takes longer to set them up than to measure them, and one run already has
+        // many values.
         for _ in 0..if sensors > SENSORS_PER_HUB { 1 } else { runs(options) } {
             let both = run_in_virtual_time(sensors, Variant::HALF, telegrams, true).and_then(|followed| {
                 Ok((followed, run_in_virtual_time(sensors, Variant::HALF, telegrams, false)?))
             });
             let (followed, alone) = match both {
                 Ok(both) => both,
-                // This machine does not have enough memory for more sensors.
+                // This machine does not have enough memory for this number of sensors.
                 Err(error) => {
                     eprintln!("{sensors} sensors in virtual time: {error}");
                     continue;
@@ -155,7 +157,7 @@ pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
             unit: "us",
             hub: of_most,
             baseline: Vec::new(),
-            // Time per telegram at which one core serves this number of sensors at their full rate.
+            // Maximum CPU time per telegram with which one core can serve this number of sensors at their full rate.
             target: Target::Max((1e7 / (MAX_SENSORS as f64 * SCAN_RATE_HZ)).floor() / 10.0),
         };
         figures::print("subscribers", options.json, &[figure]);
@@ -163,7 +165,7 @@ pub(crate) fn measure_virtual_time(options: &Options) -> Outcome<()> {
     Ok(())
 }
 
-/// Measures all variants of the LMS, with 16 sensors.
+/// Measures all variants of the LMS (numbers of beams), with 16 sensors.
 pub(crate) fn measure_variants(options: &Options) -> Outcome<()> {
     let quantities = vec![Quantity { name: "CPU time per telegram", unit: "us", linear: Some(1.0) }];
     let mut sweep = ParameterRange::new("beams in virtual time, 16 sensors", "beams", quantities);
@@ -185,7 +187,7 @@ struct TelegramCost {
     descriptors: f64,
 }
 
-/// Runs `sensors` in several hubs. All hubs start to measure at the same time.
+/// Runs `sensors` sensors, distributed over several hubs. All hubs start to measure at the same time.
 fn run_in_virtual_time(
     sensors: usize,
     variant: Variant,
@@ -210,7 +212,7 @@ fn run_in_virtual_time(
             &has_subscribers.to_string(),
         ])?);
     }
-    // Learning takes far less than a millisecond per telegram.
+    // To learn the background, a hub needs far less than a millisecond per telegram.
     let patience = STEP_TIMEOUT + Duration::from_millis(sensors as u64 * 760);
     parts.iter().try_for_each(|part: &Child| part.wait_for_line("ready", patience).map(drop))?;
     std::fs::write(&begin, "")?;
@@ -232,17 +234,20 @@ fn runs(options: &Options) -> usize {
 
 const VIRTUAL_SENSOR_COUNTS: [usize; 6] = [1, 4, 16, 64, 250, MAX_SENSORS];
 const MAX_SENSORS: usize = 1000;
-/// Maximum number of sensors in one hub. One process has the descriptors of the hub and its subscribers.
+/// Maximum number of sensors in one hub. It is limited by the descriptors of a process, because the hub and its
+/// subscribers run in one process.
 const SENSORS_PER_HUB: usize = 125;
 /// Scans per second of a sensor with 361 beams.
 const SCAN_RATE_HZ: f64 = 37.5;
 
 /// Drives a hub in virtual time: telegrams of the simulated room of Fig. 8 pass framer, session, decoding and all
-/// processors into topics in shared memory. Nothing sleeps or waits, so only the CPU time per telegram remains. With
-/// `has_subscribers`, each topic has a subscriber that takes all samples; otherwise, it has none.
+/// processors into topics in shared memory. No thread sleeps or waits, so only the CPU time per telegram is measured.
+/// If `has_subscribers` is true, each topic has a subscriber that takes all samples. Otherwise, topics have no
+/// subscribers.
 ///
-/// Runs `sensors` with `beams` beams until all have learned their background, and prints `ready`. Once the file `begin`
-/// exists, runs at least `telegrams` more. Prints `cost NS PUBLISHED RECEIVED DESCRIPTORS`.
+/// Runs `sensors` sensors with `beams` beams until the background of each sensor is learned, and then prints `ready`.
+/// When the file `begin` exists, processes at least `telegrams` more telegrams. Prints `cost NS PUBLISHED RECEIVED
+/// DESCRIPTORS`.
 pub(crate) fn drive(
     begin: &Path,
     beams: usize,
@@ -291,7 +296,7 @@ pub(crate) fn drive(
     })?
 }
 
-/// Costs of a few telegrams of each sensor.
+/// Total cost of a few telegrams of each sensor.
 #[derive(Default)]
 struct TotalCost {
     cpu_time_ns: u64,
@@ -299,7 +304,8 @@ struct TotalCost {
     received: usize,
 }
 
-/// Telegrams of the sensors. All sensors see the same room, each at a different time.
+/// Telegrams of the sensors. All sensors are in the same simulated room, but each sensor is at a different time of the
+/// simulation.
 struct SensorStreams {
     telegrams: Vec<Vec<u8>>,
     period: Nanos,
@@ -315,7 +321,8 @@ impl SensorStreams {
             let words = room.scan(variant, Unit::Mm, MODE, number * period);
             measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
         };
-        // The framer would hold a telegram that ends with a start byte until the next one arrives.
+        // Leave out telegrams that end with a start byte, because the framer would hold each of them until the next
+        // telegram arrives.
         let telegrams =
             (1..=TELEGRAM_COUNT).map(telegram).filter(|bytes| bytes.last() != Some(&STX)).collect();
         SensorStreams { telegrams, period, now: clock::now(), number: 0 }
@@ -415,12 +422,12 @@ fn cpu_ns() -> u64 {
     used.tv_sec as u64 * 1_000_000_000 + used.tv_nsec as u64
 }
 
-/// Time until a background is known. It is ten seconds and a margin.
+/// Time until the background is learned, which is ten seconds, plus a margin.
 const LEARNING_TIME_NS: Nanos = 10_500_000_000;
-/// 13 bits of range, 3 of intensity.
+/// Measuring mode with 13 bits of range and 3 bits of intensity.
 const MODE: Mode = Mode(1);
-/// Number of different telegrams.
+/// Number of different telegrams that a sensor sends. They repeat after that.
 const TELEGRAM_COUNT: u64 = 512;
-/// Number of telegrams of each sensor until the subscribers take the samples. The shortest queue holds four samples,
-/// and the hub may publish a sample later than its telegram.
+/// Number of telegrams of each sensor after which the subscribers take the samples. It is below the length of the
+/// shortest queue, which holds four samples, because the hub may publish a sample later than its telegram.
 const TELEGRAMS_PER_TAKE: usize = 3;

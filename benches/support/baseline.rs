@@ -1,11 +1,13 @@
-//! Minimal programs that the hub is compared with.
+//! Minimal programs with which the hub is compared.
 //!
-//! [`run_baseline`] is a hub that only streams. It makes the system calls that a late reader of a pty cannot avoid, and
-//! wakes a sleeping process once per telegram. It has no framing, no CRC, no counters and no shared memory. A telegram
-//! is the next 732 bytes after a pause. This pause is longer than the pause within a telegram.
+//! [`run_baseline`] acts like a hub that only streams. It makes the system calls that are necessary to read a telegram
+//! late from a pty, and wakes a sleeping process once per telegram. It has no framing, no CRC, no counters and no
+//! shared memory. It takes the next 732 bytes after a pause for a telegram. This pause is longer than any pause within
+//! a telegram.
 //!
-//! [`start_scanner`] is a hub that only starts a scanner whose rate it has from the beginning. It sends the requests
-//! and waits for the first scan. It does not search, and repeats a request only if the request was lost.
+//! [`start_scanner`] acts like a hub that only starts a scanner and has the scanner's rate from the beginning. It sends
+//! the necessary requests and waits for the first scan. It does not search, and repeats a request only if no reply
+//! arrives.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::Path;
@@ -25,9 +27,9 @@ use super::environment::GuardedProcess;
 use super::{Outcome, PART_WORD, clock, truth};
 
 /// Reads `count` telegrams (0: forever) from each of `ports` in a separate thread, and wakes one process per port. Each
-/// thread wakes up `wake_ahead_ns` before the expected end of a telegram. With 0, it wakes up as long before the end as
-/// the hub does. Prints `ready` first. At the end, prints the hash of each telegram and the time at which the telegram
-/// was read.
+/// thread wakes up `wake_ahead_ns` nanoseconds before the expected end of a telegram. If `wake_ahead_ns` is 0, it wakes
+/// up as long before the end as the hub does. First prints `ready`. At the end, prints the hash of each telegram and
+/// the time at which the telegram was read.
 pub(crate) fn run_baseline(ports: &[&str], count: usize, wake_ahead_ns: u64) -> Outcome<()> {
     let mut sleepers = Vec::new();
     let mut ends = Vec::new();
@@ -53,7 +55,7 @@ pub(crate) fn run_baseline(ports: &[&str], count: usize, wake_ahead_ns: u64) -> 
 }
 
 /// Sleeps on the eventfd that is its stdin until `count` telegrams were reported (0: forever). Then prints the time of
-/// each wake-up. With 0, prints the time of the first wake-up at once.
+/// each wake-up. If `count` is 0, prints only the time of the first wake-up, at once.
 pub(crate) fn run_sleeper(number: &str, count: usize) -> Outcome<()> {
     let wake = rustix::stdio::stdin();
     let mut times = Vec::with_capacity(count);
@@ -80,8 +82,8 @@ pub(crate) fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outco
     Ok(GuardedProcess::new(process))
 }
 
-/// Reads a port. Ends the whole process on an error, because the load of the baseline would be too low without one of
-/// its readers.
+/// Reads the telegrams of one line. Ends the whole process on an error, because the load of the baseline would be too
+/// low without one of its readers.
 fn read_or_end(
     line: &SerialLine,
     wake: &OwnedFd,
@@ -94,8 +96,8 @@ fn read_or_end(
     })
 }
 
-/// Runs the read loop. Returns each telegram with the time at which it was complete. The loop stores a telegram after
-/// the wake-up, in the pause before the next one.
+/// Runs the read loop. Returns each telegram with the time at which it was complete. The loop stores a telegram only
+/// after it has woken the process, in the pause before the next telegram.
 fn read(
     line: &SerialLine,
     wake: impl AsFd,
@@ -124,7 +126,7 @@ fn read(
                     clock::sleep_until(
                         first + duration - if wake_ahead_ns > 0 { wake_ahead_ns } else { own_lead.nanos() },
                     );
-                    // The bytes have certainly arrived, so there is no need to poll. The hub does the same.
+                    // Read without a call of `poll`, because the bytes have certainly arrived. The hub does the same.
                     filled += line.read(&mut telegram[filled..]).map_err(words)?;
                     reads_near_end = 1;
                 }
@@ -132,7 +134,7 @@ fn read(
         }
         let last = clock::now();
         if telegram[0] != lms::telegram::STX {
-            // The pause was not between two telegrams: the sender was descheduled.
+            // The pause was within a telegram, because the sender was not scheduled. Wait for the next pause.
             line.wait_for_pause(TELEGRAM_PAUSE_NS).map_err(words)?;
             continue;
         }
@@ -148,7 +150,8 @@ fn read(
     Ok(telegrams)
 }
 
-/// Duration of a telegram, estimated like in the hub: the minimum of several durations.
+/// Time from the start to the end of a telegram on the line. As in the hub, the estimate is the minimum of several
+/// measured times.
 #[derive(Default)]
 struct TelegramDuration {
     duration_ns: Option<u64>,
@@ -169,24 +172,24 @@ impl TelegramDuration {
     }
 }
 
-/// Baud rate that the hub sets.
+/// Baud rate that the hub uses.
 const BAUD_RATE: u32 = 500_000;
 /// Length of a telegram of 361 beams, in bytes.
 const TELEGRAM_LEN: usize = 732;
-/// Time before the expected end of a telegram at which the baseline wakes up, in ns. The hub estimates its own time.
-/// The baseline's time is constant, so that ratios can be compared with earlier ones.
+/// Time before the expected end of a telegram at which the baseline wakes up, in nanoseconds. The hub adapts this time
+/// to the machine. For the baseline, it is constant, so that ratios can be compared with those of earlier measurements.
 pub(crate) const WAKE_AHEAD_NS: u64 = 600_000;
-/// Minimum pause between two telegrams, in ns. It is longer than the 3.2 ms within a telegram and shorter than the 8.8
-/// ms after a telegram.
+/// Minimum pause that ends a telegram, in nanoseconds. It is longer than the pause of 3.2 ms within a telegram, and
+/// shorter than the pause of 8.8 ms after a telegram.
 const TELEGRAM_PAUSE_NS: u64 = 6_000_000;
 
-/// Starts the scanner at `port`, which has `rate`, like a hub that has this rate from the beginning. Prints the time at
-/// which the scanner had confirmed the stream, and the time at which the first scan had arrived.
+/// Starts the scanner at `port`, whose baud rate is `rate`, like a hub that has this rate from the beginning. Prints
+/// the time at which the scanner had confirmed the stream, and the time at which the first scan had arrived.
 pub(crate) fn start_scanner(port: &Path, rate: u32) -> Outcome<()> {
     stream(port, rate, &[Request::Status], &[Request::Type, Request::Configuration])
 }
 
-/// Starts the scanner like [`start_scanner`], but without any request for information. This is the shortest possible
+/// Starts the scanner like [`start_scanner`], but sends no requests for information. This is the shortest possible
 /// dialog.
 pub(crate) fn start_scanner_unchecked(port: &Path, rate: u32) -> Outcome<()> {
     stream(port, rate, &[], &[])
@@ -231,7 +234,7 @@ impl LmsHost {
         Err(format!("no reply to {request:?}").into())
     }
 
-    /// Returns whether a telegram with `command` arrives before `until`.
+    /// Waits for a telegram with `command` until `until`, and returns whether it arrived.
     fn receive(&mut self, command: u8, until: u64) -> Outcome<bool> {
         loop {
             while let Some(found) = self.framer.poll() {
@@ -255,21 +258,21 @@ impl LmsHost {
 }
 
 const STREAM_BAUD: Baud = Baud::B500000;
-/// Pause between two bytes of a request, in ns. The scanner needs at least 55 us.
+/// Pause between two bytes of a request, in nanoseconds. The scanner needs at least 55 us.
 const BYTE_GAP_NS: u64 = 80_000;
-/// Pause after a change of the rate, in ns, as in the hub.
+/// Pause after a change of the baud rate, in nanoseconds. It is as long as in the hub.
 const SETTLE_TIME_NS: u64 = 20_000_000;
-/// Timeout of a reply, in ns.
+/// Timeout of a reply, in nanoseconds.
 const REPLY_TIMEOUT: u64 = 300_000_000;
-/// Timeout of the first scan, in ns.
+/// Timeout of the first scan, in nanoseconds.
 const SCAN_TIMEOUT: u64 = 2_000_000_000;
 const MAX_TRIES: u32 = 10;
 
-/// An open line, without any system call that is not needed.
+/// An open serial line. Its functions make only the necessary system calls.
 pub(crate) struct SerialLine(OwnedFd);
 
 impl SerialLine {
-    /// Opens the line at `path`, raw, at `rate` bits per second.
+    /// Opens the line at `path` in raw mode, at `rate` baud.
     pub(crate) fn open(path: &Path, rate: u32) -> Outcome<SerialLine> {
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let line = SerialLine(open(path, flags, Mode::empty())?);
@@ -277,7 +280,7 @@ impl SerialLine {
         Ok(line)
     }
 
-    /// Sets the rate.
+    /// Sets the baud rate.
     pub(crate) fn set_rate(&self, rate: u32) -> Outcome<()> {
         let mut termios = tcgetattr(&self.0)?;
         termios.make_raw();
@@ -285,7 +288,7 @@ impl SerialLine {
         Ok(tcsetattr(&self.0, OptionalActions::Now, &termios)?)
     }
 
-    /// Reads the bytes that have arrived; returns 0 if there are none.
+    /// Reads the bytes that have arrived. Returns the number of bytes, which is 0 if none have arrived.
     pub(crate) fn read(&self, buffer: &mut [u8]) -> Outcome<usize> {
         match rustix::io::read(&self.0, buffer) {
             Ok(0) => Err("the line was closed".into()),

@@ -1,5 +1,5 @@
-//! Environment of a bench: its own domain, its own directory, and the processes in it. The output of processes is read
-//! line by line. However the bench ends, the processes are ended by their IDs.
+//! Environment of a bench: its own domain, its own directory, and the processes that run in this domain. The bench
+//! reads the output of these processes line by line. However the bench ends, it ends the processes by their IDs.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use scanhub_shm::{Domain, Environment};
 
 use super::{Outcome, PART_WORD, clock};
 
-/// A domain and a directory of this process. Both are removed when it is dropped.
+/// A domain and a directory of this process. Both are removed when this value is dropped.
 pub(crate) struct BenchEnvironment {
     pub(crate) domain: Domain,
     directory: PathBuf,
@@ -25,7 +25,8 @@ impl BenchEnvironment {
         BenchEnvironment::create(&std::process::id().to_string())
     }
 
-    /// Creates domain and directory number `number` of this process, for a bench that needs several.
+    /// Creates the domain and the directory with the number `number` of this process, for a bench that needs several of
+    /// them.
     pub(crate) fn numbered(number: usize) -> Outcome<BenchEnvironment> {
         BenchEnvironment::create(&format!("{}-{number}", std::process::id()))
     }
@@ -42,7 +43,7 @@ impl BenchEnvironment {
         Ok(BenchEnvironment { domain, directory: std::env::temp_dir().join(format!("scanhub-{name}")) })
     }
 
-    /// Removes the files of interrupted benches.
+    /// Removes the files that interrupted benches have left.
     pub(crate) fn remove_leftovers() -> Outcome<()> {
         for entry in std::fs::read_dir(std::env::temp_dir())? {
             let name = entry?.file_name().to_string_lossy().into_owned();
@@ -55,42 +56,44 @@ impl BenchEnvironment {
         Ok(())
     }
 
-    /// Returns the path of a file in the directory.
+    /// Returns the path of the file `name` in the directory of this environment.
     pub(crate) fn file(&self, name: &str) -> PathBuf {
         self.directory.join(name)
     }
 
-    /// Returns the path of the file in which the simulator logs what it sent.
+    /// Returns the path of the log in which the simulator records what it has sent.
     pub(crate) fn truth(&self) -> PathBuf {
         self.directory.join("truth")
     }
 
-    /// Returns the path at which the pty of `sensor` appears.
+    /// Returns the path at which the simulator creates the pty of `sensor`.
     pub(crate) fn port(&self, sensor: &str) -> String {
         self.directory.join(sensor).display().to_string()
     }
 
-    /// Starts a simulator with idle sensors at ptys, at `rate`.
+    /// Starts a simulator with idle sensors at ptys, at the baud rate `rate`.
     pub(crate) fn simulate(&self, sensors: &[&str], rate: u32) -> Outcome<Child> {
         self.simulator(sensors, Some(&self.truth()), &["--baud", &rate.to_string()])
     }
 
-    /// Starts a simulator with sensors that stream at 500 kBd to any program that opens their ptys. It writes no log.
+    /// Starts a simulator with sensors that stream at 500 kBd to any program that opens their ptys. The simulator
+    /// writes no log.
     pub(crate) fn simulate_streaming(&self, sensors: &[&str]) -> Outcome<Child> {
         self.simulate_as(sensors, &["--baud", "500000", "--state", "streaming"])
     }
 
-    /// Starts a simulator with sensors at ptys and more `flags`. It writes no log.
+    /// Starts a simulator with sensors at ptys and more `flags`. The simulator writes no log.
     pub(crate) fn simulate_as(&self, sensors: &[&str], flags: &[&str]) -> Outcome<Child> {
         self.simulator(sensors, None, flags)
     }
 
-    /// Starts a simulator with one sensor and more `flags`. It writes a log to [`BenchEnvironment::own_truth`].
+    /// Starts a simulator with one sensor and more `flags`. The simulator writes a log to
+    /// [`BenchEnvironment::own_truth`].
     pub(crate) fn simulate_one(&self, sensor: &str, flags: &[&str]) -> Outcome<Child> {
         self.simulator(&[sensor], Some(&self.own_truth(sensor)), flags)
     }
 
-    /// Returns the path of the log of a sensor that has its own simulator.
+    /// Returns the path of the log for a sensor that has its own simulator.
     pub(crate) fn own_truth(&self, sensor: &str) -> PathBuf {
         self.directory.join(format!("truth-{sensor}"))
     }
@@ -105,7 +108,7 @@ impl BenchEnvironment {
         Ok(child)
     }
 
-    /// Starts the hub. It prints `ready` first.
+    /// Starts the hub. The first line that the hub prints is `ready`.
     pub(crate) fn start_hub(&self, sensors: &[&str]) -> Outcome<Child> {
         Child::spawn(self.hub_command(PROGRAM, sensors), Stdio::null())
     }
@@ -117,12 +120,12 @@ impl BenchEnvironment {
         Child::spawn(command, Stdio::null())
     }
 
-    /// Returns the command that starts the hub.
+    /// Returns the command that starts `program` as a hub with these sensors.
     pub(crate) fn hub_command(&self, program: &str, sensors: &[&str]) -> Command {
         self.hub_command_on(self, program, sensors)
     }
 
-    /// Returns the command that starts the hub with the sensors of the environment `lines`.
+    /// Returns the command that starts `program` as a hub in this domain, with the sensors of the environment `lines`.
     pub(crate) fn hub_command_on(
         &self,
         lines: &BenchEnvironment,
@@ -131,22 +134,23 @@ impl BenchEnvironment {
     ) -> Command {
         let mut command = Command::new(program);
         command.args(["run", "--domain", self.domain.name()]);
-        // The hub's state is removed with the environment.
+        // The hub saves its state in the directory of this environment, which is removed in the end.
         command.env("XDG_STATE_HOME", &self.directory).env_remove("STATE_DIRECTORY");
         sensors.iter().for_each(|sensor| {
-            // A fixed family avoids the time and the shared memory of a search.
+            // Set the family, because a search would need additional time and shared memory.
             command.args(["--link", &format!("{sensor}={},family=lms", lines.port(sensor))]);
         });
         command
     }
 
-    /// Starts this program as a subscriber to `topic`, with more `words`.
+    /// Starts this program as a subscriber to `topic`, with the further arguments `words`.
     pub(crate) fn start_subscriber(&self, topic: &str, sensor: &str, words: &[&str]) -> Outcome<Child> {
         self.start_part(&[&["consume", topic, self.domain.name(), sensor], words].concat())
     }
 
     /// Starts this program as the baseline. The baseline reads `count` telegrams from each port. It wakes up
-    /// `wake_ahead_ns` before the expected end of each telegram, or with 0 as long before the end as the hub does.
+    /// `wake_ahead_ns` nanoseconds before the expected end of each telegram. If `wake_ahead_ns` is 0, it wakes up as
+    /// long before the end as the hub does.
     pub(crate) fn start_baseline(
         &self,
         sensors: &[&str],
@@ -160,7 +164,7 @@ impl BenchEnvironment {
         self.start_part(&words)
     }
 
-    /// Starts this program as one of its parts.
+    /// Starts this program as one of its parts, which `words` name.
     pub(crate) fn start_part(&self, words: &[&str]) -> Outcome<Child> {
         let words: Vec<String> =
             std::iter::once(&PART_WORD).chain(words).map(|word| word.to_string()).collect();
@@ -170,7 +174,7 @@ impl BenchEnvironment {
 
 impl Drop for BenchEnvironment {
     fn drop(&mut self) {
-        // The domain's name contains the ID of this process, so no other process uses these files.
+        // The domain's name contains the ID of this process, so no other bench uses these files.
         let _ = std::fs::remove_dir_all(&self.directory);
         let _ = std::fs::remove_dir_all(self.domain.root());
         let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
@@ -206,7 +210,7 @@ impl GuardedProcess {
         self.0.id()
     }
 
-    /// Ends the process like a crash. Fails if the process has already ended.
+    /// Kills the process, as a crash would end it. Fails if the process has already ended.
     pub(crate) fn kill(mut self) -> Outcome<()> {
         if let Some(status) = self.0.try_wait()? {
             return Err(format!("process {} ended early: {status}", self.pid()).into());
@@ -243,7 +247,7 @@ impl Drop for GuardedProcess {
 pub(crate) struct Child {
     pub(crate) guard: GuardedProcess,
     lines: Receiver<OutputLine>,
-    /// CLOCK_MONOTONIC just before the start of the process.
+    /// Time of CLOCK_MONOTONIC just before the start of the process.
     pub(crate) started_ns: u64,
 }
 
@@ -309,12 +313,12 @@ impl Child {
         }
     }
 
-    /// Returns the next line.
+    /// Waits for the next line, and returns it.
     pub(crate) fn next_line(&self, timeout: Duration) -> Outcome<OutputLine> {
         self.lines.recv_timeout(timeout).map_err(|_| "no line arrived".into())
     }
 
-    /// Waits for the line that equals `word`, and returns all lines before it.
+    /// Waits for a line that equals `word`, and returns all lines that arrive before it.
     pub(crate) fn lines_until(&self, word: &str, timeout: Duration) -> Outcome<Vec<OutputLine>> {
         let end = Instant::now() + timeout;
         let mut lines = Vec::new();
@@ -327,7 +331,7 @@ impl Child {
         }
     }
 
-    /// Returns the lines that have arrived, without waiting.
+    /// Returns the lines that have arrived since the last call, without waiting.
     pub(crate) fn lines_so_far(&self) -> Vec<OutputLine> {
         self.lines.try_iter().collect()
     }

@@ -1,11 +1,11 @@
-//! Figures with their spread. A figure is a series of values with one value per run, with the baseline's values, and
-//! with the ratio for each run. There are also figures of programs that ran at the same time, and cells of tables. All
-//! of them are printed as tables, or with `--json` as one line each (`SPREAD` is `{median, least, most}` or null):
+//! Figures with their spread. A figure has a series with one value per run, the values of the baseline, and the ratio
+//! for each run. This module also has figures of programs that ran at the same time, and cells of tables. It prints all
+//! of them as tables, or with `--json` as one line each. In these lines, `SPREAD` is `{median, least, most}` or null:
 //!
 //! - `{class: "measurement", bench, name, unit, runs, hub: SPREAD, baseline: SPREAD, ratio: SPREAD, target, met}`
-//! - the same with more keys, one line for each program that ran at the same time as the hub: `sensors`, `program` (its
-//!   name), and `difference` (hub minus program) and `quotient` (hub by program), each `{mean, error}`. `baseline` is
-//!   the spread of this program, and `error` is the standard error of the mean, or null after one round.
+//! - the same line with more keys, for each program that ran at the same time as the hub: `sensors`, `program` (its
+//!   name), and `difference` (hub minus program) and `quotient` (hub divided by program), each `{mean, error}`.
+//!   `baseline` is the spread of this program, and `error` is the standard error of the mean, or null after one round.
 //! - `{class: "cell", bench, table, row, column, value: SPREAD, unit}`
 
 use serde_json::{Value, json};
@@ -25,12 +25,14 @@ pub(crate) struct Figure {
 pub(crate) struct SimultaneousFigure {
     pub(crate) name: &'static str,
     pub(crate) unit: &'static str,
-    /// One series per program, with one value per round. A series is empty if the program does not have the figure.
+    /// One series for each program, with one value per round. A series is empty if the figure does not exist for the
+    /// program.
     pub(crate) programs: Vec<Vec<f64>>,
     pub(crate) target: Target,
 }
 
-/// A cell of a table of several mechanisms or conditions. Tables, rows and columns are printed in order of appearance.
+/// A cell of a table that compares several mechanisms or conditions. Tables, rows and columns are printed in the order
+/// of their first cells.
 #[derive(Clone, Debug)]
 pub(crate) struct Cell {
     pub(crate) table: String,
@@ -46,15 +48,15 @@ pub(crate) struct Cell {
 pub(crate) enum Target {
     /// No target.
     None,
-    /// Maximum of the hub's median.
+    /// Maximum that the hub's median may have.
     Max(f64),
-    /// Minimum of the hub's median.
+    /// Minimum that the hub's median must have.
     Min(f64),
-    /// Maximum of the median of the ratios to the baseline.
+    /// Maximum that the median of the ratios to the baseline may have.
     Ratio(f64),
 }
 
-/// Median, minimum and maximum of a series.
+/// Median, minimum and maximum of a series, in this order.
 pub(crate) struct Spread(f64, f64, f64);
 
 impl Spread {
@@ -145,8 +147,8 @@ pub(crate) fn print(bench: &str, json: bool, figures: &[Figure]) {
 }
 
 impl SimultaneousFigure {
-    /// Returns the figure with the program with index `number` as baseline. The figure has a target only for the second
-    /// program, which is the usual baseline.
+    /// Returns the figure in which the program with the index `number` is the baseline. The figure has a target only if
+    /// this is the second program, which is the usual baseline.
     fn against(&self, number: usize) -> Figure {
         Figure {
             name: self.name,
@@ -157,7 +159,7 @@ impl SimultaneousFigure {
         }
     }
 
-    /// Returns the mean of the differences between the hub's values and the values of the program with index `number`.
+    /// Returns the mean difference between the values of the hub and those of the program with the index `number`.
     fn difference(&self, number: usize) -> Option<Mean> {
         let pairs = self.programs[0].iter().zip(&self.programs[number]);
         Mean::of(&pairs.map(|(hub, program)| hub - program).collect::<Vec<_>>())
@@ -204,7 +206,7 @@ pub(crate) fn print_simultaneous(
     }
 }
 
-/// Mean of a series, and its standard error, which needs at least two values.
+/// Mean of a series, and the standard error of the mean. The error is `None` for fewer than two values.
 struct Mean(f64, Option<f64>);
 
 impl Mean {
@@ -260,7 +262,7 @@ pub(crate) fn print_cells(bench: &str, json: bool, cells: &[Cell]) {
     }
 }
 
-/// Returns each name once, in order of appearance.
+/// Returns each name once, in the order in which the names first occur.
 fn in_order_of_appearance<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'a String> {
     let mut found = Vec::new();
     for name in names {
@@ -271,8 +273,8 @@ fn in_order_of_appearance<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'
     found
 }
 
-/// Returns the value below which a share `part` of the `sorted` values lies, by nearest rank. The median is the mean of
-/// the two values in the middle.
+/// Returns the percentile of the `sorted` values for the share `part` (0 to 1), by nearest rank. The median of an even
+/// number of values is the mean of the two values in the middle.
 pub(crate) fn percentile(sorted: &[f64], part: f64) -> Option<f64> {
     let last = sorted.len().checked_sub(1)?;
     if part == 0.5 {

@@ -1,8 +1,8 @@
-//! Shared code of the benches that start processes. It contains an environment with simulator, hub and subscribers, and
-//! minimal programs as baselines. It also contains CPU time and memory of processes, and figures with their spread. A
-//! bench prints what it measured. A missed target is not an error.
+//! Shared code of the benches that start processes. It has an environment with simulator, hub and subscribers, and
+//! minimal programs as baselines. It also measures the CPU time and memory of processes, and prints figures with their
+//! spread. A bench that misses a target prints this, but does not fail.
 
-#![allow(dead_code)] // Each bench uses only some items.
+#![allow(dead_code)] // Each bench uses only some items of this module.
 
 pub(crate) mod baseline;
 pub(crate) mod clock;
@@ -22,20 +22,20 @@ use rustix::process::{Signal, set_parent_process_death_signal};
 /// Result of a step of a bench. The error is a message.
 pub(crate) type Outcome<T> = Result<T, Box<dyn Error>>;
 
-/// Runs a bench. A bench starts itself as subscriber and as baseline. If the command line names a part, this function
-/// runs the part; otherwise, it measures.
+/// Runs a bench. A bench starts its own program as subscriber and as baseline, which are parts of the bench. If the
+/// command line names a part, this function runs the part. Otherwise, it measures.
 pub(crate) fn main(measure: impl FnOnce(&Options) -> Outcome<()>) -> ExitCode {
     main_with(run_part, measure)
 }
 
-/// Runs a bench that has its own parts. The bench passes unknown parts to [`run_part`].
+/// Runs a bench that has its own parts. For a part that is not its own, the bench calls [`run_part`].
 pub(crate) fn main_with(
     run_part: impl FnOnce(&[&str]) -> Outcome<()>,
     measure: impl FnOnce(&Options) -> Outcome<()>,
 ) -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        // A part ends when the process that started it ends.
+        // A part must end when the process that has started it ends.
         [PART_WORD, ref part @ ..] => set_parent_process_death_signal(Some(Signal::TERM))
             .map_err(Into::into)
             .and_then(|()| run_part(part)),
@@ -78,7 +78,7 @@ pub(crate) fn run_part(words: &[&str]) -> Outcome<()> {
 /// First word of the command line of a part.
 pub(crate) const PART_WORD: &str = "part";
 
-/// Options of a bench. Each has a default, which depends on the bench.
+/// Options of a bench. Each option has a default, which depends on the bench.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Options {
     /// Print one line of JSON per figure instead of tables.
@@ -122,23 +122,23 @@ impl Options {
         Ok(options)
     }
 
-    /// Returns the number of pairs or rounds. A pair is one run of the hub and one run of the baseline. In a round, all
-    /// programs run.
+    /// Returns the number of pairs or rounds. A pair consists of one run of the hub and one run of the baseline. In a
+    /// round, all programs run at the same time.
     pub(crate) fn pairs(&self) -> usize {
         self.pairs_or(5)
     }
 
-    /// Returns the number of pairs for a bench whose default is not five.
+    /// Returns the number of pairs for a bench whose default is `default` instead of five.
     pub(crate) fn pairs_or(&self, default: usize) -> usize {
         self.pairs.unwrap_or(default).clamp(1, 100)
     }
 
-    /// Returns the length of a run in seconds.
+    /// Returns the duration of a run in seconds.
     pub(crate) fn seconds(&self, default: u64) -> u64 {
         self.seconds.unwrap_or(default).clamp(1, 3600)
     }
 
-    /// Returns the numbers of sensors to measure with, one after the other.
+    /// Returns the numbers of sensors with which the bench measures, one after the other.
     pub(crate) fn sensors(&self, default: &[usize]) -> Vec<usize> {
         self.sensors.map_or(default.to_vec(), |sensors| vec![sensors.clamp(1, environment::ALL_AROUND.len())])
     }

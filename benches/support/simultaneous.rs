@@ -1,7 +1,7 @@
 //! Programs that are measured at the same time: the hub, two baselines and, with `--beside`, the hub of another build.
 //! Each program has its own domain and its own simulated sensors. In every round, each program reads the lines that its
-//! neighbor read in the previous round. All programs share the load of the machine. This load and the differences
-//! between simulators therefore cancel out in differences between programs.
+//! neighbor in the list read in the previous round. The load of the machine is the same for all programs, and each
+//! program reads the lines of each simulator. Both effects therefore cancel out in differences between programs.
 
 use std::process::Stdio;
 use std::time::Duration;
@@ -12,9 +12,9 @@ use super::{Options, Outcome, baseline};
 /// The programs and their lines.
 pub(crate) struct Comparison {
     pub(crate) sensors: &'static [&'static str],
-    /// The hub, two baselines and, with `--beside`, the hub of the other build, in this order.
+    /// Programs in this order: the hub, two baselines and, with `--beside`, the hub of the other build.
     pub(crate) programs: Vec<MeasuredProgram>,
-    /// Simulated sensors, one set per program.
+    /// Simulated sensors, with one set per program.
     lines: Vec<SimulatedSensors>,
 }
 
@@ -30,14 +30,14 @@ pub(crate) struct MeasuredProgram {
 pub(crate) enum ProgramKind {
     /// The hub of the program at this path.
     Hub(String),
-    /// The baseline that wakes up this long before the end of a telegram, in ns. With 0, it wakes up as long before the
-    /// end as the hub does.
+    /// The baseline that wakes up this many nanoseconds before the end of a telegram. If the number is 0, it wakes up
+    /// as long before the end as the hub does.
     Baseline(u64),
 }
 
 /// A set of simulated sensors.
 struct SimulatedSensors {
-    // Dropped before the directory with its ports is removed.
+    // This field is dropped first, before the directory with the ports of the simulator is removed.
     _simulator: Child,
     stage: BenchEnvironment,
 }
@@ -80,7 +80,7 @@ impl Comparison {
         Ok(Comparison { sensors, programs, lines })
     }
 
-    /// Returns the index of the lines that a program reads in a round.
+    /// Returns the index of the lines that the program with the index `program` reads in a round.
     pub(crate) fn line_index(&self, program: usize, round: usize) -> usize {
         (program + round) % self.lines.len()
     }
@@ -90,7 +90,8 @@ impl Comparison {
         &self.lines[line_index].stage
     }
 
-    /// Returns the number of rounds. By default, each program reads all lines twice.
+    /// Returns the number of rounds. The default is twice the number of programs, so that each program reads the lines
+    /// of each set twice.
     pub(crate) fn rounds(&self, options: &Options) -> usize {
         options.pairs_or(2 * self.programs.len())
     }
@@ -120,8 +121,8 @@ impl MeasuredProgram {
         matches!(self.program, ProgramKind::Hub(_))
     }
 
-    /// Starts a subscriber to the scans of each sensor, and waits until every subscriber has received a scan. Only hubs
-    /// support this.
+    /// Starts a subscriber to the scans of each sensor, and waits until every subscriber has received a scan. Only a
+    /// hub has topics, so the program must not be a baseline.
     pub(crate) fn subscribe_to_scans(&self, sensors: &[&str]) -> Outcome<Vec<Child>> {
         let start = |sensor: &&str| self.stage.start_subscriber("scan", sensor, &[]);
         let subscribers = sensors.iter().map(start).collect::<Outcome<Vec<_>>>()?;
@@ -134,8 +135,8 @@ impl MeasuredProgram {
 }
 
 /// Copies the program at `path` into the directory of `environment`, and returns the path of the copy. The simulators
-/// run from the program of this build. If a hub ran from the same file, the simulators would keep the hub's code in the
-/// processor's caches.
+/// run from the program file of this build. If a hub ran from the same file, the simulators would help to keep the
+/// hub's code in the caches of the processor.
 fn copy_program(path: &str, environment: &BenchEnvironment) -> Outcome<String> {
     let copy = environment.file("scanhub");
     std::fs::copy(path, &copy).map_err(|error| format!("{path}: {error}"))?;
@@ -144,6 +145,6 @@ fn copy_program(path: &str, environment: &BenchEnvironment) -> Outcome<String> {
 
 /// Name of the baseline in tables.
 const BASELINE_NAME: &str = "baseline";
-/// Time at the start of a round that does not count. The hub learns the background in 6.3 s, and estimates the duration
-/// of a telegram from the first scans.
+/// Time at the start of a round whose results do not count. In this time, the hub learns the background, which takes
+/// 6.3 s, and estimates the duration of a telegram from the first scans.
 pub(crate) const SETTLE_TIME: Duration = Duration::from_secs(8);

@@ -16,7 +16,7 @@ pub(crate) struct ScanSource {
     waker: WakeSender,
     next: u64,
     _service: TopicService<Scan>,
-    /// The topic `status`, which every hub has. If it did not exist, a gateway would request it repeatedly.
+    /// The topic `status`, which every hub has. If it did not exist, a gateway would repeatedly try to open it.
     _status: TopicService<Status>,
     _node: Node,
     _lock: HubLock,
@@ -26,7 +26,7 @@ impl ScanSource {
     pub(crate) fn open(domain: &Domain) -> Outcome<ScanSource> {
         let lock = HubLock::acquire(domain.root())?;
         let node = scanhub_shm::hub_node(domain)?;
-        // Maximum number of subscribers in any bench.
+        // This is the maximum number of subscribers in any bench.
         let limits = TopicLimits { subscribers: 200, ..TopicLimits::default() };
         let waker = WakeSender::new(&node, SENSOR)?;
         let service = Scan::create(&node, SENSOR, &limits)?;
@@ -43,7 +43,7 @@ impl ScanSource {
         })
     }
 
-    /// Publishes a scan with `wall_ns` as its stamp of the wall clock, and wakes the subscribers.
+    /// Publishes a scan with `wall_ns` as its wall-clock stamp, and wakes the subscribers.
     pub(crate) fn publish(&mut self, wall_ns: u64) -> Outcome<()> {
         let scan = scan();
         let loan = Scan::loan(&self.publisher, scan.bytes().len());
@@ -60,7 +60,7 @@ impl ScanSource {
     }
 }
 
-/// Returns a scan of 361 beams in mm, as scanners send by default.
+/// Returns a scan of 361 beams in millimeters, which is what scanners send by default.
 pub(crate) fn scan() -> Box<Scan> {
     let ranges: [u16; 361] = std::array::from_fn(|beam| 1000 + beam as u16);
     Scan::of(ScanHead::lms(ranges.len(), -90_000, 500, 1, 13), &ranges)

@@ -1,6 +1,6 @@
 //! Subscribers as separate processes. They receive a topic with the client library, sleep until they are woken, and
-//! print the time at which a sample had arrived. Many subscribers can share a process, but each one has its own thread,
-//! membership, queue and wake-ups.
+//! print the times at which samples arrived. Several subscribers can share a process. Each of them has its own thread,
+//! its own membership in the domain, its own queue and its own wake-ups.
 
 use scanhub_drivers::lms;
 use std::io::Write;
@@ -29,7 +29,7 @@ pub(crate) fn print_first_scans(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Receives the scans of `sensor` forever, and prints each: `scanned SENSOR RECEIVED_NS BOOT`.
+/// Receives the scans of `sensor` forever, and prints a line `scanned SENSOR RECEIVED_NS BOOT` for each scan.
 pub(crate) fn print_scans(domain: &str, sensor: &str) -> Outcome<()> {
     let mut scans = subscribe::<Scan>(domain, sensor)?;
     println!("attaching {sensor}");
@@ -39,9 +39,9 @@ pub(crate) fn print_scans(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Receives telegrams of `sensor` until `count` telegrams with measured data have arrived, and then prints them. With
-/// 0, receives forever and prints each telegram at once. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH
-/// READ_NS`. READ_NS is the hub's stamp of the last byte.
+/// Receives telegrams of `sensor` until `count` telegrams with measured data have arrived, and then prints these
+/// telegrams. If `count` is 0, receives forever and prints each telegram at once. The line for a telegram is `telegram
+/// SENSOR RECEIVED_NS BOOT MISSED INTACT HASH READ_NS`. READ_NS is the hub's stamp of the last byte.
 pub(crate) fn print_telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut telegrams = subscribe::<[u8]>(domain, sensor)?;
     let mut received = Vec::with_capacity(count);
@@ -83,7 +83,7 @@ pub(crate) fn print_ages(domain: &str, sensor: &str, count: usize) -> Outcome<()
     Ok(())
 }
 
-/// Receives the status of `sensor` forever, and prints each: `status SENSOR STATE SINCE_NS BOOT`.
+/// Receives the status of `sensor` forever, and prints a line `status SENSOR STATE SINCE_NS BOOT` for each sample.
 pub(crate) fn print_statuses(domain: &str, sensor: &str) -> Outcome<()> {
     let mut statuses = subscribe::<Status>(domain, sensor)?;
     println!("attaching {sensor}");
@@ -118,9 +118,9 @@ fn write(out: &mut impl Write, sensor: &str, sample: &ReceivedSample) -> Outcome
     Ok(writeln!(out, "telegram {sensor} {now} {boot} {missed} {intact} {hash} {read}")?)
 }
 
-/// Subscribes `count` times to the scans of `sensor`, and receives for `seconds` after each subscriber has a scan.
-/// Prints `followed RECEIVED MISSED PUBLISHED` for each subscriber. PUBLISHED counts from the subscriber's first sample
-/// to its last one.
+/// Attaches `count` subscribers to the scans of `sensor`. After each subscriber has received a scan, they receive for
+/// `seconds` seconds. Prints `followed RECEIVED MISSED PUBLISHED` for each subscriber. PUBLISHED is the number of scans
+/// that the hub published from the subscriber's first sample to its last one.
 pub(crate) fn count_samples(domain: &str, sensor: &str, count: usize, seconds: u64) -> Outcome<()> {
     let all = Arc::new(Barrier::new(count + 1));
     let threads: Vec<_> = (0..count)
@@ -142,7 +142,7 @@ pub(crate) fn count_samples(domain: &str, sensor: &str, count: usize, seconds: u
     Ok(())
 }
 
-/// Takes as many samples as `count` subscribers may hold, prints their number, and keeps them.
+/// Takes as many samples as `count` subscribers may hold, prints the number of samples, and keeps the samples.
 pub(crate) fn hold_samples(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut subscribers =
         (0..count).map(|_| subscribe::<Scan>(domain, sensor)).collect::<Outcome<Vec<_>>>()?;
@@ -158,8 +158,8 @@ pub(crate) fn hold_samples(domain: &str, sensor: &str, count: usize) -> Outcome<
     }
 }
 
-/// Attaches `count` subscribers and keeps them. Prints the number of attached subscribers, and the reason if one is
-/// refused.
+/// Attaches `count` subscribers and keeps them attached. Prints the number of attached subscribers, and the reason if
+/// the hub's topic refuses one of them.
 pub(crate) fn hold_slots(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut subscribers = Vec::new();
     for _ in 0..count {
@@ -195,7 +195,7 @@ fn count_scans(domain: &str, sensor: &str, all: &Barrier, seconds: u64) -> Outco
         Ok(scans)
     };
     let attached = attached();
-    // A subscriber that fails must not block the others.
+    // Wait even after an error, because a subscriber that fails must not block the others.
     all.wait();
     let mut scans = attached?;
     // Samples that were queued while other subscribers attached do not count.

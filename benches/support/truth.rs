@@ -1,4 +1,5 @@
-//! The log of the simulator, with the telegrams that it sent. The benches compare received data with it.
+//! The log of the simulator, with the telegrams that the simulator has sent. The benches compare received data with
+//! this log.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -12,7 +13,7 @@ use super::Outcome;
 #[derive(Clone, Debug)]
 pub(crate) struct SentTelegram {
     pub(crate) hash: String,
-    /// Index among all telegrams that the sensor sent.
+    /// Index of the telegram among all telegrams that the sensor sent.
     pub(crate) index: u64,
     /// Time of CLOCK_MONOTONIC after the telegram's last byte was written.
     pub(crate) at_ns: u64,
@@ -22,10 +23,10 @@ pub(crate) struct SentTelegram {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SensorTruth {
     pub(crate) sent: Vec<SentTelegram>,
-    /// Telegrams for which the host's buffer had no room or not enough room. The rest of a later telegram may complete
-    /// one of them.
+    /// Telegrams for which the buffer of the host had not enough room, or no room. If only a part of a telegram had
+    /// room, bytes of a later telegram may complete it.
     overrun: Vec<SentTelegram>,
-    /// Times at which the sensor aborted a telegram of measured data to reply to a request.
+    /// Times at which the sensor aborted a telegram of measured data in order to reply to a request.
     pub(crate) aborted_ns: Vec<u64>,
     /// Number of EEPROM writes. It is `None` until the simulator has ended.
     pub(crate) eeprom_writes: Option<u64>,
@@ -36,7 +37,7 @@ impl SensorTruth {
     pub(crate) fn read(path: &Path, sensor: &str) -> Outcome<SensorTruth> {
         let mut truth = SensorTruth::default();
         for line in std::fs::read_to_string(path)?.lines() {
-            // The last line may be incomplete.
+            // The last line may be incomplete, so skip lines that cannot be parsed.
             let Ok(value) = serde_json::from_str::<Value>(line) else { continue };
             let port = value["port"].as_str().unwrap_or_default();
             if port.rsplit('/').next() != Some(sensor) {
@@ -56,9 +57,9 @@ impl SensorTruth {
         Ok(truth)
     }
 
-    /// Returns the times at which each telegram was due, by the telegram's hash; and the total time in ns for which the
-    /// sensor could not send. The sensor sends one telegram every `every_ns`. For each telegram, the sensor sent at
-    /// least one of the telegram's neighbors in time.
+    /// Returns the times at which each telegram was due, by the hash of the telegram, and the total time in nanoseconds
+    /// for which the sensor could not send. The sensor sends one telegram every `every_ns` nanoseconds. The computation
+    /// assumes that near each telegram, the sensor sent at least one telegram in time.
     pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
         let mut all: Vec<&SentTelegram> = self.sent.iter().chain(&self.overrun).collect();
         all.sort_by_key(|sent| sent.index);
@@ -83,7 +84,7 @@ impl SensorTruth {
     }
 }
 
-/// Number of neighbors on either side of a telegram. The sensor sent at least one of them in time.
+/// Number of neighbors on either side of a telegram. At least one of them is assumed to have been sent in time.
 const NEIGHBOR_COUNT: usize = 200;
 
 /// Returns the SHA-256 of `bytes` as the simulator writes it.

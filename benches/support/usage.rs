@@ -1,4 +1,4 @@
-//! CPU time and memory of a process, and memory of its domain, as the kernel counts them.
+//! CPU time and memory of a process, and shared memory of a domain, as the kernel counts them.
 
 use std::collections::BTreeMap;
 use std::fs::{read_dir, read_to_string};
@@ -11,7 +11,7 @@ use super::Outcome;
 /// CPU time and context switches of a process, or of some of its threads.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ThreadUsage {
-    /// CPU time, in ns.
+    /// CPU time, in nanoseconds.
     pub(crate) busy_ns: u64,
     /// Number of times that a thread went to sleep.
     pub(crate) voluntary: u64,
@@ -84,8 +84,8 @@ impl ResidentMemory {
     }
 }
 
-/// Returns the number and the bytes of the files of `domain` in /dev/shm, by file name extension. The extension shows a
-/// file's purpose.
+/// Returns the number and the bytes of the files of `domain` in /dev/shm, by file name extension. The extension shows
+/// the purpose of a file.
 pub(crate) fn segments(domain: &Domain) -> Outcome<BTreeMap<String, (usize, f64)>> {
     let mut kinds = BTreeMap::<String, (usize, f64)>::new();
     for entry in read_dir("/dev/shm")? {
@@ -94,7 +94,7 @@ pub(crate) fn segments(domain: &Domain) -> Outcome<BTreeMap<String, (usize, f64)
         if !name.starts_with(&domain.prefix()) {
             continue;
         }
-        // A process that exits at this moment removes its files.
+        // Skip a file that no longer exists, because a process that exits at this moment removes its files.
         let Ok(metadata) = entry.metadata() else { continue };
         let kind = kinds.entry(name.rsplit('.').next().unwrap_or_default().to_owned()).or_default();
         kind.0 += 1;
