@@ -18,7 +18,7 @@ pub(super) struct Epochs {
 impl Epochs {
     /// Returns the file for gateways with `key`.
     pub(super) fn of(key: &Key, state: Option<StateDirectory>) -> Epochs {
-        Epochs { state, name: format!("heard-{}", key.name()) }
+        Epochs { state, name: format!("epochs-{}", key.name()) }
     }
 
     /// Returns the epochs. Invalid lines are ignored.
