@@ -30,8 +30,8 @@ section! {
         interface: Option<String> = None, example "\"eth0\"";
         /// default: all but telegram, lines, motion, early and cloud
         ///
-        /// Topics to send: `SENSOR/TOPIC`, `SENSOR/*` or `*/TOPIC`, each possibly with `:every=N`. The most specific
-        /// entry wins.
+        /// Topics to send: `SENSOR/TOPIC`, `SENSOR/*` or `*/TOPIC`, optionally with `:every=N`. The most specific entry
+        /// wins.
         topics: Option<Vec<String>> = None, example "[\"*/zones\", \"*/scan:every=4\"]";
         /// receivers of copies; default: none
         ///
@@ -50,8 +50,7 @@ section! {
         ttl: Option<i64> = None, check optional(whole_or(0..=255, "0 to 255".into()));
         /// interval at which a background is sent again; default: only new ones are sent
         ///
-        /// Interval at which a background is sent again, such as `10s`, at most once a second. Default: only new ones
-        /// are sent.
+        /// Interval at which a background is sent again, such as `10s`, at least 1 s. Default: never.
         background_every: Option<String> = None, example "\"10s\"";
         /// longest datagram in bytes, 576 to 1472
         ///

@@ -142,8 +142,7 @@ section! {
         port: Option<String> = None, check optional(port), example "\"/dev/ttyUSB0\"";
         /// expected type: lms200, lms211, lms221 or lms291
         ///
-        /// Expected type of an LMS: `lms200`, `lms211`, `lms221` or `lms291`. Settings that it does not support are
-        /// refused.
+        /// Expected type of an LMS: `lms200`, `lms211`, `lms221` or `lms291`.
         expected_type ("type"): Option<String> = None;
         /// auto: the hub finds the scanner
         ///
@@ -167,7 +166,7 @@ section! {
         resolution: Option<f64> = None, example "0.5";
         /// expected unit: mm or cm
         ///
-        /// Expected unit of an LMS: `mm` or `cm`. The hub never changes the sensor's unit.
+        /// Expected unit of an LMS: `mm` or `cm`.
         unit: Option<String> = None, example "\"mm\"";
         /// measuring mode, for a recording that does not contain it
         ///

@@ -131,39 +131,39 @@ section! {
     pub(crate) struct ZonesKeys: "keys of zones, as { radii = [1.0, 0.6] }" {
         /// meters around the robot's center: slow first, stop last
         ///
-        /// 1 to 8 circles around the robot's center, the largest first, up to 65 m. A point inside the smallest circle
-        /// means stop, and inside another circle slow.
+        /// Radii of 1 to 8 zones, the largest first, at most 65 m. A point in the smallest zone means stop, and in
+        /// another zone slow.
         radii: Vec<f64> = vec![1.0, 0.6], check radii;
         /// the robot's own body, such as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }
         ///
-        /// The robot's own body, in at most 64 sectors. Readings nearer than `range` meters at sensor angles from
-        /// `from_deg` to `to_deg` are ignored (degrees from -180 to 180: 0 ahead, 90 left). `scanhub zones SENSOR mask`
-        /// learns these sectors.
+        /// The robot's own body: at most 64 sectors, from `from_deg` to `to_deg` (-180 to 180; 0 is ahead of the
+        /// sensor, 90 left). The hub ignores readings nearer than `range` meters there. `scanhub zones SENSOR mask`
+        /// learns the sectors.
         body_mask: Vec<SectorKeys> = Vec::new(), check sectors;
         /// meters added to each radius
         ///
-        /// Meters added to every circle, up to 10.
+        /// Meters added to every radius, at most 10.
         margin: f64 = 0.0, check meters(0.0..=10.0);
         /// beams inside a circle that violate it
         ///
-        /// Minimum number of beams inside a circle that violate it.
+        /// Minimum number of beams inside a zone that violate it.
         min_beams: i64 = 1, check whole(1..=MAX_BEAMS as i64);
         /// consecutive scans in which a circle must be violated
         ///
-        /// Consecutive scans in which a circle must be violated, at most 1000. The verdict is unknown until this number
-        /// of scans has followed a start, a silence or a scan with too many invalid beams.
+        /// Consecutive scans in which a zone must be violated, at most 1000. After a start, a silence or a scan with
+        /// too many invalid beams, the verdict is unknown until this number of scans has arrived.
         min_scans: i64 = 1, check whole(1..=1000);
         /// the verdict is unknown if a larger share of the beams has no reading
         ///
-        /// The verdict is unknown if a larger share of the beams that see into the largest circle has no reading.
+        /// The verdict is unknown if a larger share of the beams into the largest zone has no reading.
         max_invalid: f64 = 0.1, check within(0.0..=1.0, "a share from 0 to 1");
         /// ignore points between the sensor and the near side of a circle
         ///
-        /// Whether a sensor outside a circle ignores points in front of the circle's near side.
+        /// Whether a sensor outside a zone ignores points in front of the zone's near side.
         exact: bool = true;
         /// whether no echo means that nothing is near
         ///
-        /// Whether no echo means that nothing is near. If false, it counts as no reading.
+        /// Whether no echo means that nothing is near. If false, the beam has no reading.
         no_return_is_far: bool = true;
     }
 }
@@ -210,8 +210,8 @@ section! {
     pub(crate) struct LinesKeys: "keys of lines, as { max = 20, refine = true }" {
         /// lines of a scan, 1 to 64
         ///
-        /// Maximum number of lines of a scan, 1 to 64. Of more lines, those that differ least are joined, and beams
-        /// that do not fit a line well are dropped.
+        /// Maximum number of lines of a scan, 1 to 64. If there are more, the hub joins those that differ least, and
+        /// drops beams that do not fit well.
         max: i64 = 64, check whole(1..=MAX_LINES as i64);
         /// beams of a line, at least 3
         ///
@@ -219,8 +219,8 @@ section! {
         min_points: i64 = 5, check whole(3..=MAX_BEAMS as i64);
         /// slower fit with a better result
         ///
-        /// Whether the cuts between lines are moved to their best positions, which is slower. The worst beams at the
-        /// ends of lines are then dropped, at most one in twenty.
+        /// Whether the hub optimizes the cuts between lines, which is slower. It then drops the worst beams at the ends
+        /// of lines, at most one in twenty.
         refine: bool = false;
     }
 }
@@ -238,8 +238,7 @@ section! {
         max_turn: f64 = 30.0, check within(1.0..=85.0, "degrees from scan to scan, from 1 to 85");
         /// share of readings on surfaces of the previous scan
         ///
-        /// Minimum share of a scan's readings that lie on surfaces of the previous scan, 0.1 to 1. With less, the step
-        /// is rejected.
+        /// Minimum share of readings on surfaces of the previous scan, 0.1 to 1. A step with less is rejected.
         min_overlap: f64 = 0.4, check within(0.1..=1.0, "a share from 0.1 to 1");
     }
 }
@@ -254,27 +253,27 @@ section! {
         method: MethodKey = MethodKey::Multi;
         /// distance from the background that still belongs to it; default: 30, 60 or 100, by the unit
         ///
-        /// Distance in mm from the background at which a reading still belongs to it, from one unit of the sensor to
-        /// 10,000. Default: 30, 60 for units of cm, 100 for dm.
+        /// Maximum distance of a background reading from the background, in mm, from one unit of the sensor to 10,000.
+        /// Default: 30, for units of cm 60, of dm 100.
         threshold_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
         /// for paper: the same distance from a candidate, with the same default
         ///
-        /// `paper`: the same distance from a candidate that may become background.
+        /// For `paper`: `threshold_mm` of a candidate that may become background.
         candidate_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
         /// scans until a surface is background; default: those of 10 s
         ///
-        /// Number of scans in which a surface must be seen before it is background, at most 8191. For `paper`, they
-        /// must be consecutive; for `multi`, 5/8 of them are enough. Default: the scans of 10 s at the full rate.
+        /// Number of scans until a surface is background, at most 8191. `paper` must see it in all of them, `multi` in
+        /// 5/8. Default: the scans of 10 s at the full rate.
         scans: Option<i64> = None, check optional(whole(1..=8_191)), example "375";
         /// for paper: first or latest
         ///
-        /// `paper`: a candidate is compared with the `first` reading of its run, or with the `latest`.
+        /// For `paper`: compare readings with the `first` or the `latest` reading of a candidate.
         candidate: CandidateKey = CandidateKey::First;
         /// empty, first-scan or a saved file; default: the saved background if it fits, or empty
         ///
-        /// Background to start with: `empty`, `first-scan`, or a file of this sensor from `scanhub background SENSOR
-        /// save`, relative to the directory in which the hub was started. Default: the background that an earlier hub
-        /// saved, if it fits, otherwise `empty`.
+        /// Background to start with: `empty`, `first-scan`, or a file from `scanhub background SENSOR save`, relative
+        /// to the working directory of the hub. Default: the background that an earlier hub saved, if it fits,
+        /// otherwise `empty`.
         start: Option<String> = None, check optional(start), example "\"empty\"";
         /// whether the next hub starts with this background
         ///
@@ -282,12 +281,12 @@ section! {
         keep: bool = true;
         /// whether no echo counts as a background far away; default: true, for paper false
         ///
-        /// Whether no echo counts as a background far away. If false, it counts as no reading. Default: true, for
+        /// Whether no echo counts as a background far away. If false, the beam has no reading. Default: true, for
         /// `paper` false.
         no_return_is_far: Option<bool> = None, example "true";
         /// on-demand or every-scan
         ///
-        /// `every-scan`; or `on-demand`: when a generation begins, and after every `scans` scans from which it learned.
+        /// `every-scan`; or `on-demand`: when a generation begins, and after every `scans` scans that it has learned.
         publish: PublishKey = PublishKey::OnDemand;
     }
 }

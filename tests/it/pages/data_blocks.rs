@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use super::blocks::{Block, blocks};
 use super::is_program;
+use super::names::{examples, rows};
 use crate::testkit::{TERM, TestEnv, output};
 
 /// Blocks of plain text. Each entry has the page, the beginning of the block, and the test that checks the block or the
@@ -83,8 +84,8 @@ fn error_in_toml(block: &Block) -> Option<String> {
     Some(format!("neither a configuration, a site nor a world: {checked}{}", world.wait()))
 }
 
-/// Returns what is wrong with a line of JSON output, or `None` if docs/output.md lists the class and all keys of the
-/// line.
+/// Returns what is wrong with a line of JSON output, unless docs/output.md lists its class, and has each of its keys in
+/// a row or an example of the class. `reference.rs` checks that the program prints the keys of the examples.
 fn error_in_json(line: &str) -> Option<String> {
     let Ok(Value::Object(keys)) = serde_json::from_str(line) else {
         return Some(format!("no object: {line}"));
@@ -92,11 +93,16 @@ fn error_in_json(line: &str) -> Option<String> {
     let page =
         fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/output.md")).expect("the page");
     let class = keys.get("class").and_then(Value::as_str).unwrap_or_default();
-    let rows = page.lines().filter(|row| row.starts_with(&format!("| `{class}` |")));
-    let quoted = rows.flat_map(|row| row.split('`').skip(1).step_by(2)).flat_map(str::split_whitespace);
-    let known: Vec<&str> = quoted.collect();
-    let unknown = keys.keys().find(|key| *key != "class" && !known.contains(&key.as_str()));
-    match (known.is_empty(), unknown) {
+    let rows = rows(&page);
+    let rows: Vec<_> = rows.iter().filter(|row| row.classes.contains(&class)).collect();
+    let examples = examples(&page);
+    let shown: Vec<_> = examples.iter().filter(|example| example.class == class).collect();
+    let is_known = |key: &str| {
+        rows.iter().any(|row| row.keys.contains(&key))
+            || shown.iter().any(|example| example.keys.iter().any(|known| known == key))
+    };
+    let unknown = keys.keys().find(|key| *key != "class" && !is_known(key));
+    match (rows.is_empty(), unknown) {
         (true, _) => Some(format!("docs/output.md has no class {class:?}: {line}")),
         (_, Some(key)) => Some(format!("docs/output.md has no key {key} in class {class}: {line}")),
         (false, None) => None,

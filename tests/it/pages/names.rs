@@ -5,6 +5,8 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
+use serde_json::Value;
+
 use crate::testkit::TestEnv;
 
 /// Words that must not be names. Each word has a list of the places in which its meaning is allowed. A place is a row
@@ -62,19 +64,86 @@ fn forbidden(used: &[Used]) -> Vec<String> {
     used.iter().filter(is_forbidden).map(|(place, name)| format!("{place}: {name}")).collect()
 }
 
-/// Returns the classes and keys in the tables of `page`, which has the form of `docs/output.md`.
-fn of_output(page: &str) -> Vec<Used> {
-    let mut used = Vec::new();
+/// Row of a table in `docs/output.md`: classes, the verbs that print them, and optional keys, which examples may lack.
+pub(super) struct OutputRow<'a> {
+    pub(super) classes: Vec<&'a str>,
+    verbs: Vec<&'a str>,
+    pub(super) keys: Vec<&'a str>,
+}
+
+/// Line of JSON in `docs/output.md`.
+pub(super) struct OutputExample<'a> {
+    /// Heading above the line.
+    heading: &'a str,
+    pub(super) class: String,
+    pub(super) keys: Vec<String>,
+}
+
+impl OutputExample<'_> {
+    /// Returns whether this is an example of `row`. A heading such as `summary of tilt` restricts its examples to the
+    /// rows of that verb.
+    fn is_of(&self, row: &OutputRow<'_>) -> bool {
+        let is_of_verb = match self.heading.split_once(" of ") {
+            Some((_, named)) => row.verbs.iter().any(|verb| {
+                let first = verb.split_whitespace().next();
+                named.split_whitespace().any(|word| Some(word) == first)
+            }),
+            None => true,
+        };
+        is_of_verb && row.classes.iter().any(|class| *class == self.class)
+    }
+}
+
+/// Returns the rows of classes in the tables of `page`.
+pub(super) fn rows(page: &str) -> Vec<OutputRow<'_>> {
+    let mut rows = Vec::new();
     for row in page.lines().filter(|row| row.starts_with("| `")) {
-        let quoted = |cell: &str| cell.split('`').skip(1).step_by(2).map(str::to_owned).collect::<Vec<_>>();
         let mut cells = row.split(" | ");
         let [classes, verbs] = [(); 2].map(|()| quoted(cells.next().unwrap_or_default()));
-        let keys: Vec<_> = cells.flat_map(quoted).collect();
-        let keys: Vec<_> = keys.iter().flat_map(|key| key.split_whitespace()).collect();
-        for class in &classes {
-            let place = format!("{class} {}", verbs.first().map_or("", String::as_str));
-            let words = keys.iter().copied().chain([class.as_str()]);
-            used.extend(words.map(|word| (place.clone(), word.to_owned())));
+        let keys = cells.flat_map(quoted).flat_map(str::split_whitespace).collect();
+        rows.push(OutputRow { classes, verbs, keys });
+    }
+    rows
+}
+
+/// Returns the texts in backticks in `cell`.
+fn quoted(cell: &str) -> Vec<&str> {
+    cell.split('`').skip(1).step_by(2).collect()
+}
+
+/// Returns the lines of JSON on `page`.
+pub(super) fn examples(page: &str) -> Vec<OutputExample<'_>> {
+    let mut examples = Vec::new();
+    let mut heading = "";
+    for line in page.lines() {
+        heading = line.strip_prefix("### ").unwrap_or(heading);
+        if line.starts_with('{')
+            && let Ok(Value::Object(object)) = serde_json::from_str(line)
+        {
+            let class = object.get("class").and_then(Value::as_str).unwrap_or_default().to_owned();
+            examples.push(OutputExample { heading, class, keys: object.keys().cloned().collect() });
+        }
+    }
+    examples
+}
+
+/// Returns the classes and keys in the tables and examples of `page`, which has the form of `docs/output.md`. An
+/// example belongs to the rows of its class in the same section, and without such a row has the class as its place.
+fn of_output(page: &str) -> Vec<Used> {
+    let mut used = Vec::new();
+    for section in page.split("\n## ") {
+        let (rows, examples) = (rows(section), examples(section));
+        for row in &rows {
+            for class in &row.classes {
+                let place = format!("{class} {}", row.verbs.first().unwrap_or(&""));
+                let shown = examples.iter().filter(|example| example.class == *class && example.is_of(row));
+                let shown = shown.flat_map(|example| &example.keys).map(String::as_str);
+                let words = row.keys.iter().copied().chain([*class]).chain(shown);
+                used.extend(words.map(|word| (place.clone(), word.to_owned())));
+            }
+        }
+        for example in examples.iter().filter(|example| !rows.iter().any(|row| example.is_of(row))) {
+            used.extend(example.keys.iter().map(|key| (example.class.clone(), key.clone())));
         }
     }
     used
@@ -142,5 +211,19 @@ fn finds_a_forbidden_name() {
     let row = "| `hz` | `hz` | `sensor topic hz received lost` (samples), `lost_on_line` |\n\
                | `lan` | `listen` | `received lost` |\n";
     assert_eq!(forbidden(&of_output(row)), ["hz hz: lost"]);
+    let example = "{\"class\":\"lan\",\"lost\":0}\n";
+    let table = "| `lan`, `lan_to` | `listen` |\n| `lan` | `gateway` |\n";
+    let cases: [(&str, &[&str]); 4] = [
+        ("lan of listen", &[]),
+        ("lan of gateway", &["lan gateway: lost"]),
+        ("lan", &["lan gateway: lost"]),
+        ("lan of bridge", &["lan: lost"]),
+    ];
+    for (heading, expected) in cases {
+        let page = format!("# A page\n\n## Network\n\n{table}\n### {heading}\n\n{example}");
+        assert_eq!(forbidden(&of_output(&page)), expected, "{heading}");
+    }
+    let other_section = format!("## Network\n\n{table}\n## Rates\n\n### lan\n\n{example}");
+    assert_eq!(forbidden(&of_output(&other_section)), ["lan: lost"]);
     assert_eq!(forbidden(&[("zones".to_owned(), "self_min".to_owned())]), ["zones: self_min"]);
 }

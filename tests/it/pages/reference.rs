@@ -7,7 +7,7 @@ use std::path::Path;
 
 use scanhub_schema::Kind;
 
-use super::names::{of_configuration, of_help};
+use super::names::{examples, of_configuration, of_help, rows};
 use crate::testkit::TestEnv;
 use crate::tidy::tree::SourceTree;
 
@@ -92,15 +92,20 @@ struct Printed {
     keys: BTreeSet<(String, String)>,
 }
 
-/// Returns the classes and keys that the sources in `tree` print.
-fn printed(tree: &SourceTree) -> Printed {
-    let mut printed = Printed::default();
+/// Returns the paths and texts of the program's sources in `tree`, without their tests.
+fn product_files(tree: &SourceTree) -> impl Iterator<Item = (&str, &str)> {
     let is_product = |path: &str| {
         ["hub/", "clients/", "schema/src/"].iter().any(|top| path.starts_with(top))
             && !["/tests", "/examples/"].iter().any(|part| path.contains(part))
     };
-    for (path, text) in tree.files(".rs").filter(|(path, _)| is_product(path)) {
-        let text = text.split("\n#[cfg(test)]").next().unwrap_or_default();
+    let files = tree.files(".rs").filter(move |(path, _)| is_product(path));
+    files.map(|(path, text)| (path, text.split("\n#[cfg(test)]").next().unwrap_or_default()))
+}
+
+/// Returns the classes and keys that the sources of `tree` print.
+fn printed(tree: &SourceTree) -> Printed {
+    let mut printed = Printed::default();
+    for (path, text) in product_files(tree) {
         printed.classes.extend(classes(text).map(|class| (class, path.to_owned())));
         let is_other = |name: &str| {
             OTHER_STRUCTS.iter().any(|(of, other)| path.starts_with(of) && name.starts_with(other))
@@ -208,8 +213,7 @@ fn snake(name: &str) -> String {
 
 /// Returns a description of each class and each key that `page` lacks.
 fn missing_output(printed: &Printed, page: &str) -> Vec<String> {
-    let rows = page.lines().filter(|line| line.starts_with("| `"));
-    let listed: BTreeSet<_> = rows.filter_map(|row| row.split('`').nth(1)).collect();
+    let listed: BTreeSet<_> = rows(page).into_iter().flat_map(|row| row.classes).collect();
     let words = quoted_words(page);
     let classes = printed.classes.iter().filter(|(class, _)| !listed.contains(class.as_str()));
     let keys = printed.keys.iter().filter(|(key, _)| key != "class" && !words.contains(key));
@@ -246,6 +250,34 @@ fn page_has_every_class_and_key() {
         let missing = missing_output(&planted, &page("output"));
         assert!(missing.len() == 1 && missing[0].contains(&format!(" {what} of")), "{what}: {missing:?}");
     }
+}
+
+/// Returns the keys in the examples and rows of `page` that no source of `tree` contains, as `CLASS.KEY`.
+fn unprinted_keys(tree: &SourceTree, page: &str) -> Vec<String> {
+    let is_separator = |c: char| !c.is_alphanumeric() && c != '_';
+    let mut words = BTreeSet::new();
+    for (_, text) in product_files(tree) {
+        words.extend(text.split(is_separator));
+    }
+    let mut keys: Vec<(String, String)> = Vec::new();
+    for example in examples(page) {
+        keys.extend(example.keys.into_iter().map(|key| (example.class.clone(), key)));
+    }
+    for row in rows(page) {
+        let class = row.classes.join(", ");
+        keys.extend(row.keys.into_iter().map(|key| (class.clone(), key.to_owned())));
+    }
+    let unprinted = keys.iter().filter(|(_, key)| !words.contains(key.as_str()));
+    unprinted.map(|(class, key)| format!("{class}.{key}")).collect()
+}
+
+#[test]
+fn examples_have_only_keys_of_the_program() {
+    let tree = SourceTree::load();
+    assert_eq!(unprinted_keys(&tree, &page("output")), Vec::<String>::new());
+    let planted = "| `zones` | `echo` | `planted_row_ms` |\n\n\
+                   {\"class\":\"zones\",\"sensor\":\"front\",\"verdikt\":\"clear\"}\n";
+    assert_eq!(unprinted_keys(&tree, planted), ["zones.verdikt", "zones.planted_row_ms"]);
 }
 
 /// All kinds of failures. A test compares this list with the source.
