@@ -280,7 +280,7 @@ R  F                  background: reset; freeze, thaw
 ? q Esc Ctrl-C        this help, quit
 
 dots  where a beam hit something; small gray: background
-o ,   foreground, its trail (colored: without the signs)
+o ,   foreground, its trail (in color instead of signs)
 * @   reflector mark, corner   ^ 1 2 robot, sensors
 0.60! circle around the robot, in m, with something inside";
 

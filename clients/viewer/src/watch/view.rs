@@ -247,7 +247,7 @@ const MIN_REACH_M: f64 = 0.5;
 const MARGIN_FACTOR: f64 = 1.1;
 /// Minimum share of the picture that the points must fill. If they fill less, the scale changes.
 const MIN_FILL_SHARE: f64 = 0.6;
-/// Divisor of the number of points that gives the number of outliers at either end.
+/// Number of points for each outlier that is ignored at either end of an axis.
 const OUTLIER_DIVISOR: usize = 50;
 
 #[cfg(test)]

@@ -144,7 +144,7 @@ fn lifetime_ns(header: &Header) -> u64 {
 
 fn sweep_text(found: &Obstacles) -> String {
     if found.has(Obstacles::UNRELIABLE) {
-        return "sweep unreliable, its angles contradict what is known".to_owned();
+        return "sweep unreliable: its angles contradict the background".to_owned();
     }
     let count = u64::from(found.dropped) + found.obstacles().len() as u64;
     let plural = if count == 1 { "" } else { "s" };
@@ -408,7 +408,7 @@ mod tests {
         (0..2 * scanhub_schema::MAX_OBSTACLES).for_each(|_| other.push(Obstacle::default()));
         assert_eq!(sweep_text(&other), "129 obstacles, nearest 1.0 m, sweep incomplete");
         other = Obstacles { flags: Obstacles::UNRELIABLE, ..Obstacles::default() };
-        assert_eq!(sweep_text(&other), "sweep unreliable, its angles contradict what is known");
+        assert_eq!(sweep_text(&other), "sweep unreliable: its angles contradict the background");
         assert_eq!((&one["texts"][0]["text"], &one["frame_id"]), (&"1.00 m".into(), &"base_link".into()));
         assert_eq!(lifetime_ns(&Header { stamp_last_ns: u64::MAX, ..header }), 121_000_000_000);
     }
