@@ -144,7 +144,7 @@ impl ZonesSource {
         ZonesSource { early: Some(Box::new((TopicReader::new(sensor), EarlyState::new()))), ..self }
     }
 
-    /// Returns whether the topic has existed at least once.
+    /// Returns whether this source has subscribed to the topic at least once.
     pub fn subscribed(&self) -> bool {
         self.reader.subscribed()
     }

@@ -66,8 +66,8 @@ impl DomainOptions {
         Domain::of_hub(&self.name, self.root.as_deref(), &Environment::of_process())
     }
 
-    /// Returns the domain in which a program publishes: the domain of the running hub, or otherwise the domain in which
-    /// a new hub would publish.
+    /// Returns the domain in which a program publishes: the domain of a running hub or listener, or otherwise the
+    /// domain in which a new hub would publish.
     ///
     /// # Errors
     ///

@@ -1,5 +1,6 @@
-//! A hub that plays a recording. This module finds the sensors in the recording and their configuration, and creates
-//! one player for all links. `reader.rs` uses the same sensors and configuration without a hub.
+//! A hub that plays a recording. This module finds the sensors in the recording, loads their configuration from the
+//! sources that the user named, and creates one player for all links. `reader.rs` uses the same sensors and
+//! configuration without a hub.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -25,7 +26,8 @@ pub struct Replay<'a> {
     pub sensor: Option<&'a str>,
     /// Family of a stream file; `None` if the hub recognizes the family from the bytes.
     pub family: Option<Family>,
-    /// Configuration of the sensors in the recording.
+    /// Sources of the configuration: files and flags. The recording itself has only a sensor's family, model, mode and
+    /// number of beams.
     pub sources: &'a Sources,
     /// Options of the player.
     pub options: PlaybackOptions,

@@ -190,8 +190,8 @@ impl WriterProgress {
     }
 }
 
-/// Maximum length of all payloads in the queue, in bytes. It is enough for 20 seconds of all topics of two sensors at
-/// their highest rate.
+/// Maximum length of all payloads in the queue, in bytes. It is enough for all topics of two sensors at
+/// their highest rate: for 20 seconds of two LMS, or 14 seconds of two RPLIDAR S2.
 const MAX_BYTES: usize = 8 << 20;
 const MAX_ENTRIES: usize = 1 << 15;
 /// Interval at which the queue is written and a chunk is closed. If the process is killed, at most the samples of this

@@ -238,10 +238,10 @@ const STEP_DOTS: f64 = 8.0;
 const INITIAL_DOT_M: f64 = 0.05;
 const MIN_DOT_M: f64 = 0.001;
 const MAX_DOT_M: f64 = 1.0;
-/// Maximum distance of the center from the robot. This distance exceeds the range of a sensor (82 m) plus the sensor's
-/// maximum distance from the robot (100 m).
+/// Maximum of the center's x and y, relative to the robot, to which the user can pan the picture. It exceeds the range of
+/// a sensor (82 m) plus the sensor's maximum distance from the robot (100 m).
 const MAX_CENTER_M: f64 = 200.0;
-/// Minimum distance around the robot that the picture shows, in meters.
+/// Minimum distance around the robot that the picture shows while it is fitted to the points, in meters.
 const MIN_REACH_M: f64 = 0.5;
 /// Size of the picture relative to the area of the points.
 const MARGIN_FACTOR: f64 = 1.1;
