@@ -265,10 +265,10 @@ fn slow_recording_has_no_false_silence() {
     let mut last = Value::Null;
     wait_until("an unknown verdict", || {
         last = env.run(&["echo", "--json", "front/zones", "-n", "1"]).lines()[0].clone();
-        is_unknown(&last)
+        // If the sample arrives late, on a busy machine, `echo` itself reports that the verdict is unknown.
+        is_unknown(&last) && last["stale"].is_null()
     });
     assert_eq!((number(&last, "topic_seq"), number(&last, "seq")), (13, 11), "{last}");
-    assert_eq!(last["stale"], Value::Null);
 }
 
 #[test]

@@ -179,11 +179,12 @@ fn demo_shows_watch_on_a_terminal() {
     }
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     let temporary = tempfile::tempdir().expect("a directory");
-    command.args(["demo", "--for=3s"]).env("TMPDIR", temporary.path());
-    let demo = TerminalSession::start(&command, (80, 30));
+    command.arg("demo").env("TMPDIR", temporary.path());
+    let mut demo = TerminalSession::start(&command, (80, 30));
     let name = format!("demo-{}", demo.pid());
     demo.wait_for_text("1 front    streaming");
     demo.wait_for_text("2 rear     streaming");
+    demo.press("q");
     let (code, below, is_whole) = demo.finish();
     assert!(code == Some(0) && is_whole, "{code:?} {below:?}");
     assert_eq!(below.matches(" 0 lost in ").count(), 2, "{below:?}");
