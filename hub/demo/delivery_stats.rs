@@ -254,7 +254,7 @@ impl DeliveryStats {
                 crate::to_json_line(&summary)
             } else {
                 format!(
-                    "{:6} {}: {} sent, {} received, {lost} lost in {:.1} s, {} on the line, {} missed, {} Hz, \
+                    "{:6} {}: {} sent, {} received, {lost} lost in {:.1} s, {} lost on the line, {} missed, {} Hz, \
                      nearest {}, hub {:.1} % of a processor, {} EEPROM writes",
                     summary.sensor,
                     summary.state,

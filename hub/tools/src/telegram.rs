@@ -24,7 +24,7 @@ use serde::Serialize;
 
 use parser::{Item, StreamParser};
 
-/// Explain telegrams field by field
+/// Explain telegrams of an LMS field by field
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct TelegramArgs {
