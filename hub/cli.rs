@@ -86,10 +86,10 @@ fn refuse_json(command: &mut Command, matches: &ArgMatches) -> Result<(), clap::
 /// Options of all verbs.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct GlobalOptions {
-    /// Name of the hub, if several run on this machine: 1 to 16 of a-z, 0-9 and -
+    /// Domain of the hub, which distinguishes several hubs on a machine: 1 to 16 characters of a-z, 0-9 and -
     #[arg(long, global = true, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
     pub(crate) domain: String,
-    /// Use the hub in this directory
+    /// Directory that contains the directory of the domain, in place of the default locations
     #[arg(long, global = true, value_name = "DIR")]
     pub(crate) root: Option<PathBuf>,
     /// Print one JSON object per line
@@ -207,7 +207,7 @@ fn help_template(command: &Command) -> StyledStr {
 const START: [(&str, &str); 3] = [
     ("scanhub demo", "Show simulated scanners in this terminal; no hardware is needed"),
     ("scanhub probe /dev/ttyUSB0", "Identify the scanner at a port"),
-    ("scanhub run --link front=/dev/ttyUSB0", "Run the hub for it. In another terminal: scanhub watch"),
+    ("scanhub run --link front=/dev/ttyUSB0", "Run the hub. Then, in another terminal: scanhub watch"),
 ];
 
 /// Parses the name of a family.

@@ -31,7 +31,7 @@ use participants::{Families, World};
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Demo {
-    /// Show no picture. At the end, print a line for each sensor, and exit with 5 if a telegram was lost
+    /// Show no picture. At the end, print a line for each sensor, and exit with code 5 if a telegram was lost
     #[arg(long)]
     headless: bool,
     /// Stop after this time, for example 10s [default: at Ctrl-C]

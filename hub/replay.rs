@@ -38,19 +38,19 @@ pub(crate) struct Replay {
     /// Speed relative to the recording, 0.015625 to 64. max: as fast as possible
     #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = parse_rate)]
     rate: PlaybackRate,
-    /// Restart at the end, until Ctrl-C. Each restart discards what was learned
+    /// Restart the recording at its end, until Ctrl-C. At each restart, the hub discards what it has learned
     #[arg(long = "loop", conflicts_with = "hold")]
     is_looped: bool,
-    /// Start publishing at this time, for example 90s. The part before it is only used for learning
+    /// Time in the recording at which publishing starts, for example 90s. From the part before, the hub only learns
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     start: Option<Duration>,
-    /// Stop publishing at this time
+    /// Time in the recording at which publishing stops
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     end: Option<Duration>,
-    /// Pause before the first telegram, until a key or `scanhub control SENSOR resume`
+    /// Pause before the first telegram, until you press space or run `scanhub control SENSOR resume`
     #[arg(long)]
     paused: bool,
-    /// Keep running at the end, without publishing, until Ctrl-C
+    /// Keep the hub running after the end of the recording, without publishing, until Ctrl-C
     #[arg(long)]
     hold: bool,
     /// Play only this sensor, and no mounts. For a stream file or a log: name of the sensor [default: front]
@@ -288,7 +288,7 @@ Examples:
 
 Keys:
   space         pause, and continue
-  . or right    play one telegram, of the sensor that has the next one, and pause
+  . or right    play the next telegram of any sensor, and pause
   + and -       twice as fast, half as fast
   q             quit";
 

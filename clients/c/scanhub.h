@@ -72,17 +72,17 @@ enum scanhub_method {
     SCANHUB_MOTION_FIRST = 0, /* The first scan, which has no step. */
     /* No step explains the scan. Step and summed pose are unknown, and their numbers are 0. */
     SCANHUB_MOTION_REFUSED = 1,
-    SCANHUB_MOTION_BEAMS = 2, /* Beams alone, without a common corner or line. */
-    SCANHUB_MOTION_POINTS = 3, /* Corners in both scans. */
-    SCANHUB_MOTION_LINES = 4, /* Lines in both scans. */
-    SCANHUB_MOTION_BOTH = 5 /* Corners and lines in both scans. */
+    SCANHUB_MOTION_BEAMS = 2, /* Only beams were matched, because both scans have no corner or line in common. */
+    SCANHUB_MOTION_POINTS = 3, /* Corners of both scans were matched. */
+    SCANHUB_MOTION_LINES = 4, /* Lines of both scans were matched. */
+    SCANHUB_MOTION_BOTH = 5 /* Corners and lines of both scans were matched. */
 };
 
 /* State of a track. */
 enum scanhub_track_state {
     SCANHUB_TENTATIVE = 0, /* The track may not be a person. */
     SCANHUB_CONFIRMED = 1, /* The person is seen. */
-    SCANHUB_HIDDEN = 2, /* The person is not seen, and is where no sensor could see them. */
+    SCANHUB_HIDDEN = 2, /* The person is not seen, and is at a position that no sensor can see. */
     SCANHUB_BETWEEN_ROOMS = 3 /* The person is on a path that no sensor covers. */
 };
 
@@ -112,7 +112,7 @@ enum scanhub_datagram_at {
     SCANHUB_DATAGRAM_AT_FLAGS = 7, /* Flags: 1 authenticated, 2 simulated, 4 replayed, 8 stamp_estimated, 16 suspect. */
     SCANHUB_DATAGRAM_AT_HUB = 8, /* Random number of the gateway, the same in all its runs. */
     SCANHUB_DATAGRAM_AT_EPOCH = 16, /* Number of the gateway's run, higher than in every earlier run. */
-    /* Number of the sample among those of this sensor and topic, from 0 in each epoch. */
+    /* Number of the sample among the samples of this sensor and topic, from 0 in each epoch. */
     SCANHUB_DATAGRAM_AT_SEQUENCE = 20,
     SCANHUB_DATAGRAM_AT_STAMP_NS = 24, /* Wall clock of the telegram's first byte, in ns since 1970. */
     SCANHUB_DATAGRAM_AT_SENSOR = 32, /* Position of the sensor's link in the hub's configuration, from 0. */
@@ -400,11 +400,12 @@ struct scanhub_scan {
     uint32_t beam_time_ns; /* Time from one beam to the next in ns. */
     int32_t first_beam_ns; /* Time of beam 0, in ns after the sample's first stamp; mostly negative. */
     uint32_t unit_um; /* Micrometers per device unit. */
-    uint16_t count; /* Number of beams, at most 8192; they are in the order of their measurement. */
+    uint16_t count; /* Number of beams, at most 8192. The beams are in the order of their measurement. */
     uint16_t valid_to; /* Highest value that is a range; all higher values are codes. */
     uint16_t no_return; /* Code of a beam without an echo. */
     uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has no such code. */
-    /* Number of points that were dropped because another point has the same beam; also points without a return. */
+    /* Number of points that were dropped because another point has the same beam. Points without a return are
+     * included. */
     uint16_t collisions;
     uint8_t family; /* Family of the scanner: enum scanhub_family. */
     uint8_t incomplete; /* 1: Packets of the revolution are missing. */
@@ -473,9 +474,9 @@ struct scanhub_mark {
     uint32_t range_dmm; /* Range in 1/10 mm. */
     uint16_t weight; /* Sum of the intensities. */
     uint8_t peak; /* Highest intensity. */
-    uint8_t edge; /* 1 if the mark touches the first or the last beam, so a part of it may be outside. */
-    uint16_t first_beam; /* First beam. */
-    uint16_t last_beam; /* Last beam. */
+    uint8_t edge; /* 1 if the mark touches the first or the last beam, so a part of it may be out of view. */
+    uint16_t first_beam; /* First beam of the mark. */
+    uint16_t last_beam; /* Last beam of the mark. */
 };
 /* Returns element i of `marks`, i below `count`. */
 static inline struct scanhub_mark scanhub_mark(const struct scanhub_marks *marks, unsigned i)
@@ -518,14 +519,15 @@ struct scanhub_zones {
     /* Distance of the nearest point from the center in mm, rounded down; 4294967295 if there is none. */
     uint32_t nearest_mm;
     uint16_t invalid_beams; /* Number of beams without a valid reading among the beams that cross the largest zone. */
-    uint8_t provisional; /* 1: There were fewer scans than a violation requires. */
+    /* 1: No zone can be violated yet, because fewer scans have arrived than a violation requires. */
+    uint8_t provisional;
     const uint8_t *zones; /* The zones, the largest first. See scanhub_zone. */
 };
 /* One zone: a circle around the robot's center. */
 struct scanhub_zone {
     uint16_t radius_mm; /* Radius in mm. */
     uint16_t beams; /* Number of beams of this scan that end inside the zone. */
-    uint8_t violated; /* 1 if enough beams ended inside the zone in enough scans. */
+    uint8_t violated; /* 1 if enough beams ended inside the zone in enough consecutive scans. */
 };
 /* Returns element i of `zones`, i below `count`. */
 static inline struct scanhub_zone scanhub_zone(const struct scanhub_zones *zones, unsigned i)
@@ -560,7 +562,7 @@ static inline enum scanhub_result scanhub_read_zones(const struct scanhub_datagr
 
 /* A foreground. 24 bytes. */
 struct scanhub_foreground {
-    uint32_t generation; /* Generation of the compared background. */
+    uint32_t generation; /* Generation of the background that the scan was compared with. */
     uint32_t unit_um; /* Micrometers per device unit. */
     uint16_t count; /* Number of beams of the scan. */
     uint16_t beams; /* Number of beams in the foreground. */
@@ -719,7 +721,7 @@ static inline enum scanhub_result scanhub_read_status(const struct scanhub_datag
 struct scanhub_lines {
     uint8_t count; /* Number of lines, at most 64. */
     uint8_t corner_count; /* Number of corners, at most 64. */
-    uint8_t overflow; /* 1: There are more lines than `lines.max`; the others were joined or dropped. */
+    uint8_t overflow; /* 1: There were more lines than `lines.max`, so some were joined or dropped. */
     uint16_t readings; /* Number of beams of the scan that have a range. */
     uint16_t on_lines; /* Number of beams with a range that end on a line. */
     float noise_m; /* Standard deviation of the ranges in meters, estimated from this scan. */
@@ -736,8 +738,8 @@ struct scanhub_line {
     float alpha_rad; /* Direction from the center to the line's nearest point, in radians from -pi to pi. */
     float sd_r_m; /* Standard deviation of `r_m` in meters. */
     float sd_alpha_rad; /* Standard deviation of `alpha_rad` in radians. */
-    uint16_t first; /* First beam. */
-    uint16_t last; /* Last beam. */
+    uint16_t first; /* First beam of the line. */
+    uint16_t last; /* Last beam of the line. */
     uint16_t points; /* Number of beams on the line that have a range. */
 };
 /* Returns element i of `lines`, i below `count`. */
@@ -824,13 +826,13 @@ struct scanhub_motion {
     float dy_m; /* Step: meters to the left. */
     float dyaw_rad; /* Step: radians counterclockwise. */
     float covariance[9]; /* Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2. */
-    float overlap; /* Share of this scan's readings on surfaces of the compared scan, 0 to 1. */
+    float overlap; /* Share of this scan's readings on surfaces of the scan that it was matched with, 0 to 1. */
     uint8_t method; /* Method: enum scanhub_method. Treat every other number as refused. */
     uint8_t valid; /* 1: the summed pose is known, and none of its steps was degenerate. */
     /* 1: The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is
      * large in this direction. */
     uint8_t degenerate;
-    /* Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them. */
+    /* Number of refused steps since the start; 65535 means 65535 or more. The summed pose does not contain them. */
     uint16_t refused_steps;
     /* Covariance of the summed pose in the frame of the start, in the layout of `covariance`, without refused steps. It
      * is 0 for the first scan, for an invalid pose, and from a sender with revision 1. */
@@ -1000,8 +1002,8 @@ struct scanhub_events {
     uint8_t kind; /* Kind of the event: enum scanhub_event_kind. */
     char room[25]; /* Name of the room after the event; empty outside of all rooms. */
     char door[25]; /* Name of the door; empty if the kind is not `door`. */
-    char from[25]; /* Room that the person came from, or `outside`; empty for other events. */
-    char to[25]; /* Room that the person went to, or `outside`; empty for other events. */
+    char from[25]; /* Room that the person came from, or `outside`; empty if the kind is not `door`. */
+    char to[25]; /* Room that the person went to, or `outside`; empty if the kind is not `door`. */
 };
 static inline enum scanhub_result scanhub_read_events(const struct scanhub_datagram *datagram,
     struct scanhub_events *out)
@@ -1045,7 +1047,8 @@ static inline enum scanhub_result scanhub_read_tilt(const struct scanhub_datagra
 /* A cloud. 16 bytes. */
 struct scanhub_cloud {
     uint32_t sweep; /* Number of the sweep, from 0. */
-    uint32_t generation; /* Generation of the compared background; each reset increases it by 1. */
+    /* Generation of the background that the points were compared with; each reset increases it by 1. */
+    uint32_t generation;
     uint16_t count; /* Number of points, at most 8192. */
     uint8_t first; /* 1: The first sample of its sweep. */
     uint8_t last; /* 1: The last sample of its sweep. */

@@ -124,7 +124,7 @@ class _ScanHead:
     unit_um: int
     """Micrometers per device unit."""
     count: int
-    """Number of beams, at most 8192; they are in the order of their measurement."""
+    """Number of beams, at most 8192. The beams are in the order of their measurement."""
     first_angle: float
     """Angle of beam 0 in radians; 0 is ahead of the sensor, counterclockwise is positive."""
     step: float
@@ -146,7 +146,8 @@ class _ScanHead:
     beyond: int
     """Code of an echo from beyond the range limit; `no_return` if the family has no such code."""
     collisions: int
-    """Number of points that were dropped because another point has the same beam; also points without a return."""
+    """Number of points that were dropped because another point has the same beam. Points without a return are
+    included."""
     incomplete: bool
     """Packets of the revolution are missing."""
     intensity_bits: int
@@ -166,11 +167,11 @@ class Mark:
     peak: int
     """Highest intensity."""
     edge: int
-    """1 if the mark touches the first or the last beam, so a part of it may be outside."""
+    """1 if the mark touches the first or the last beam, so a part of it may be out of view."""
     first_beam: int
-    """First beam."""
+    """First beam of the mark."""
     last_beam: int
-    """Last beam."""
+    """Last beam of the mark."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ class Zone:
     beams: int
     """Number of beams of this scan that end inside the zone."""
     violated: bool
-    """True if enough beams ended inside the zone in enough scans."""
+    """True if enough beams ended inside the zone in enough consecutive scans."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +212,7 @@ class Zones:
     invalid_beams: int
     """Number of beams without a valid reading among the beams that cross the largest zone."""
     provisional: bool
-    """There were fewer scans than a violation requires."""
+    """No zone can be violated yet, because fewer scans have arrived than a violation requires."""
     zones: "tuple[Zone, ...]"
     """The zones, the largest first."""
 
@@ -241,7 +242,7 @@ class _ForegroundHead:
     """Head of a foreground, before the arrays. 24 bytes."""
 
     generation: int
-    """Generation of the compared background."""
+    """Generation of the background that the scan was compared with."""
     count: int
     """Number of beams of the scan."""
     unit_um: int
@@ -342,9 +343,9 @@ class Line:
     sd_alpha_rad: float
     """Standard deviation of `alpha_rad` in radians."""
     first: int
-    """First beam."""
+    """First beam of the line."""
     last: int
-    """Last beam."""
+    """Last beam of the line."""
     points: int
     """Number of beams on the line that have a range."""
 
@@ -368,7 +369,7 @@ class Lines:
     """The payload of topic `lines`, 3340 bytes: one sample per scan, in the robot's frame."""
 
     overflow: bool
-    """There are more lines than `lines.max`; the others were joined or dropped."""
+    """There were more lines than `lines.max`, so some were joined or dropped."""
     readings: int
     """Number of beams of the scan that have a range."""
     on_lines: int
@@ -400,7 +401,7 @@ class Motion:
     covariance: "tuple[float, ...]"
     """Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2."""
     overlap: float
-    """Share of this scan's readings on surfaces of the compared scan, 0 to 1."""
+    """Share of this scan's readings on surfaces of the scan that it was matched with, 0 to 1."""
     method: str
     """Method: one of METHODS."""
     valid: bool
@@ -409,7 +410,7 @@ class Motion:
     """The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is large
     in this direction."""
     refused_steps: int
-    """Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them."""
+    """Number of refused steps since the start; 65535 means 65535 or more. The summed pose does not contain them."""
     pose_covariance: "tuple[float, ...]"
     """Covariance of the summed pose in the frame of the start, in the layout of `covariance`, without refused steps. It
     is 0 for the first scan, for an invalid pose, and from a sender with revision 1."""
@@ -503,9 +504,9 @@ class Event:
     door: str
     """Name of the door; empty if the kind is not `door`."""
     from_room: str
-    """Room that the person came from, or `outside`; empty for other events."""
+    """Room that the person came from, or `outside`; empty if the kind is not `door`."""
     to_room: str
-    """Room that the person went to, or `outside`; empty for other events."""
+    """Room that the person went to, or `outside`; empty if the kind is not `door`."""
 
 
 @dataclass(frozen=True)
@@ -542,7 +543,7 @@ class Cloud:
     sweep: int
     """Number of the sweep, from 0."""
     generation: int
-    """Generation of the compared background; each reset increases it by 1."""
+    """Generation of the background that the points were compared with; each reset increases it by 1."""
     first: bool
     """The first sample of its sweep."""
     last: bool

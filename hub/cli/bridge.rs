@@ -10,7 +10,7 @@ use scanhub_schema::{Failure, Kind};
 use scanhub_tools::bridge_program::{PROGRAM, find, search_directories};
 use scanhub_verbs::context::Context;
 
-/// Send and receive topics over Zenoh, through a router or as one (program scanhub-bridge)
+/// Send and receive topics over Zenoh, through a router or as a router (program scanhub-bridge)
 #[derive(Args, Debug)]
 #[command(disable_help_flag = true)]
 #[command(after_help = EXAMPLES)]

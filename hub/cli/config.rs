@@ -28,13 +28,13 @@ Examples:
 
 #[derive(Debug, Subcommand)]
 enum ConfigCommand {
-    /// Print a configuration with all default values, to start from
+    /// Print a configuration with all default values, as a start for your own
     #[command(after_help = "Example:\n  scanhub config default > scanhub.toml")]
     Default,
-    /// Check the configuration. If it has an error, show where, and exit with 78
+    /// Check the configuration. If it has an error, show the position of the error, and exit with code 78
     #[command(after_help = "Example:\n  scanhub config check scanhub.toml")]
     Check {
-        /// Check only this file
+        /// File to check, in place of those in /etc/scanhub and of --config
         file: Option<PathBuf>,
         #[command(flatten)]
         run: Run,

@@ -21,8 +21,8 @@ pub(crate) struct Convert {
     /// Recording to read, even a damaged one: MCAP file, stream file or CARMEN log, plain or gzipped
     #[arg(value_name = "IN")]
     input: PathBuf,
-    /// Output file. Its ending selects the format: .mcap, .bin (stream file), .log (CARMEN) or .csv (a row per scan or mark).
-    /// All but .mcap can end with .gz. - is a stream on stdout
+    /// Output file. Its ending selects the format: .mcap, .bin (stream file), .log (CARMEN) or .csv (a row per scan or
+    /// mark). All but .mcap can have .gz after it. -: a stream file on stdout
     #[arg(value_name = "OUT")]
     output: PathBuf,
     /// Convert only this sensor. For a stream file or a log: name of the sensor [default: front]
@@ -34,7 +34,8 @@ pub(crate) struct Convert {
     /// Write an MCAP file of ROS 2 messages only: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
     #[arg(long)]
     ros2: bool,
-    /// With --ros2: also write each scan as sensor_msgs/msg/PointCloud2, for viewers without LaserScan (rerun)
+    /// With --ros2: also write each scan as sensor_msgs/msg/PointCloud2, for viewers that cannot show LaserScan, such
+    /// as rerun
     #[arg(long)]
     points: bool,
     /// With --ros2 or .csv: measuring mode of a recording that does not contain it, such as 0x01

@@ -217,7 +217,7 @@ complete -c scanhub -a '(set -l typed (commandline -opc); $typed[1] complete -- 
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Man {
-    /// Write one page per verb to this directory, scanhub-run.1 ..; without it, print the page of the program
+    /// Directory for a page of each verb: scanhub-run.1 .. Without a directory, the page of the program is printed
     #[arg(value_name = "DIR")]
     directory: Option<PathBuf>,
 }

@@ -25,8 +25,8 @@ pub(crate) struct Simulate {
     /// Create a pty for a scanner, and a symlink to it at this path. Can be repeated
     #[arg(long, value_name = "PATH")]
     port: Vec<PathBuf>,
-    /// Offer the scanner on this TCP address, like a serial server. Port 0: any free port, shown in the line `ready`. The hub
-    /// opens it as tcp:HOST:PORT. Scanners of --tcp are numbered after those of --port
+    /// TCP address at which a scanner is offered, as behind a serial server. Port 0: any free port, which the line
+    /// `ready` shows. A hub opens the scanner as tcp:HOST:PORT. Scanners of --tcp are numbered after those of --port
     #[arg(long, value_name = "HOST:PORT")]
     tcp: Vec<String>,
     /// Baud rate of the line at the start: 9600, 19200, 38400 or 500000 [default: the permanent rate]
@@ -53,8 +53,8 @@ pub(crate) struct Simulate {
     /// order. docs/worlds.md lists the worlds with a mount
     #[arg(long, value_name = "NAME", conflicts_with = "replay")]
     pub(crate) angles: Vec<String>,
-    /// Send a recording instead of a simulated world: MCAP file, telegram stream or CARMEN log, plain or gzipped. Family ld:
-    /// an MCAP file or raw bytes. Not available for rplidar
+    /// Recording to send instead of a simulated world: MCAP file, stream file or CARMEN log, plain or gzipped. Family
+    /// ld: an MCAP file or raw bytes. Not available for rplidar
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
     /// Sensor of the recording, if it has several: one for all ports, or one for each port, in the same order
@@ -63,7 +63,7 @@ pub(crate) struct Simulate {
     /// Restart the recording at its end
     #[arg(long = "loop")]
     looped: bool,
-    /// Speed relative to real time. It also applies to the time of a bit on the line
+    /// Speed relative to real time. It also changes the time of a bit on the line
     #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
     speed: f64,
     /// Seed of worlds, delays and faults
@@ -85,7 +85,7 @@ pub(crate) struct Simulate {
     /// or c1 [default: a1]
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
-    /// Type of the scanners, for family lms. It limits what they support: lms200, lms211, lms221 or lms291
+    /// Type of the scanners, for family lms: lms200, lms211, lms221 or lms291. It limits what the scanners support
     #[arg(long = "type", default_value = options::DEFAULT_TYPE, value_name = "TYPE")]
     scanner_type: String,
     /// Angle and resolution, for family lms [default: that of the recording, or 180/0.5; lms211: 100/0.5]

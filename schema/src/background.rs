@@ -135,7 +135,7 @@ pub const MAX_SEGMENTS: usize = 64;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ForegroundHead {
-    /// Generation of the compared background.
+    /// Generation of the background that the scan was compared with.
     pub generation: u32,
     /// Micrometers per device unit.
     pub unit_um: u32,

@@ -51,7 +51,7 @@ struct DatagramHead {
     hub: u64,
     /// Number of the gateway's run, higher than in every earlier run.
     epoch: u32,
-    /// Number of the sample among those of this sensor and topic, from 0 in each epoch. The number wraps.
+    /// Number of the sample among the samples of this sensor and topic, from 0 in each epoch. The number wraps.
     sequence: u32,
     /// Wall clock of the telegram's first byte, in ns since 1970. For announcements and `status`, the time of sending.
     stamp_ns: u64,
@@ -62,7 +62,7 @@ struct DatagramHead {
     /// Number of parts of the sample, mostly 1.
     parts: u8,
     /// Family of the sensor: [`Family`](crate::Family); 255 while the hub searches for the scanner. Other numbers
-    /// belong to later versions, whose telegrams are just bytes.
+    /// are families of later versions. The format of their telegrams is unknown.
     family: u8,
     /// Length in bytes of the payload, or of this part of it, without the MAC.
     payload_len: u16,

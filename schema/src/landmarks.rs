@@ -37,11 +37,11 @@ pub struct Mark {
     pub weight: u16,
     /// Highest intensity.
     pub peak: u8,
-    /// 1 if the mark touches the first or the last beam, so a part of it may be outside.
+    /// 1 if the mark touches the first or the last beam, so a part of it may be out of view.
     pub edge: u8,
-    /// First beam.
+    /// First beam of the mark.
     pub first_beam: u16,
-    /// Last beam.
+    /// Last beam of the mark.
     pub last_beam: u16,
 }
 
@@ -135,9 +135,9 @@ pub struct Line {
     pub sd_r_m: f32,
     /// Standard deviation of `alpha_rad` in radians.
     pub sd_alpha_rad: f32,
-    /// First beam.
+    /// First beam of the line.
     pub first: u16,
-    /// Last beam.
+    /// Last beam of the line.
     pub last: u16,
     /// Number of beams on the line that have a range.
     pub points: u16,
@@ -186,7 +186,7 @@ impl FixedPayload for Lines {
 }
 
 impl Lines {
-    /// Flag: there are more lines than `lines.max`; the others were joined or dropped.
+    /// Flag: there were more lines than `lines.max`, so some were joined or dropped.
     pub const OVERFLOW: u8 = 1;
 
     /// Returns the used lines.

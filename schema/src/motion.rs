@@ -31,13 +31,13 @@ pub struct Motion {
     pub dyaw_rad: f32,
     /// Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2.
     pub covariance: [f32; 9],
-    /// Share of this scan's readings on surfaces of the compared scan, 0 to 1.
+    /// Share of this scan's readings on surfaces of the scan that it was matched with, 0 to 1.
     pub overlap: f32,
     /// Method: [`MotionMethod`]. Treat every other number as refused.
     pub method: u8,
     /// Flags: [`Motion::DEGENERATE`], [`Motion::OPEN`].
     pub flags: u8,
-    /// Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them.
+    /// Number of refused steps since the start; 65535 means 65535 or more. The summed pose does not contain them.
     pub refused_steps: u16,
     /// Covariance of the summed pose in the frame of the start, in the layout of [`Motion::covariance`], without
     /// refused steps. It is 0 for the first scan, for an invalid pose, and from a sender with revision 1. See
@@ -55,13 +55,13 @@ pub enum MotionMethod {
     First,
     /// No step explains the scan. Step and summed pose are unknown, and their numbers are 0.
     Refused,
-    /// Beams alone, without a common corner or line.
+    /// Only beams were matched, because both scans have no corner or line in common.
     Beams,
-    /// Corners in both scans.
+    /// Corners of both scans were matched.
     Points,
-    /// Lines in both scans.
+    /// Lines of both scans were matched.
     Lines,
-    /// Corners and lines in both scans.
+    /// Corners and lines of both scans were matched.
     Both,
 }
 

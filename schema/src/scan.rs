@@ -48,7 +48,7 @@ pub struct ScanHead {
     pub first_beam_ns: i32,
     /// Micrometers per device unit.
     pub unit_um: u32,
-    /// Number of beams, at most [`MAX_BEAMS`]; they are in the order of their measurement.
+    /// Number of beams, at most [`MAX_BEAMS`]. The beams are in the order of their measurement.
     pub count: u16,
     /// Highest value that is a range; all higher values are codes.
     pub valid_to: u16,
@@ -56,7 +56,8 @@ pub struct ScanHead {
     pub no_return: u16,
     /// Code of an echo from beyond the range limit; [`no_return`](Self::no_return) if the family has no such code.
     pub beyond: u16,
-    /// Number of points that were dropped because another point has the same beam; also points without a return.
+    /// Number of points that were dropped because another point has the same beam. Points without a return are
+    /// included.
     pub collisions: u16,
     /// Family of the scanner: [`Family`].
     pub family: u8,

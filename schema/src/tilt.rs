@@ -53,7 +53,7 @@ impl Tilt {
 pub struct CloudHead {
     /// Number of the sweep, from 0.
     pub sweep: u32,
-    /// Generation of the compared background; each reset increases it by 1.
+    /// Generation of the background that the points were compared with; each reset increases it by 1.
     pub generation: u32,
     /// Number of points, at most [`MAX_BEAMS`](crate::MAX_BEAMS).
     pub count: u16,

@@ -89,7 +89,7 @@ pub enum TrackState {
     Tentative,
     /// The person is seen.
     Confirmed,
-    /// The person is not seen, and is where no sensor could see them.
+    /// The person is not seen, and is at a position that no sensor can see.
     Hidden,
     /// The person is on a path that no sensor covers.
     BetweenRooms,
@@ -222,9 +222,9 @@ pub struct Event {
     pub room_text: [u8; 24],
     /// Name of the door; empty if the kind is not `door`.
     pub door_text: [u8; 24],
-    /// Room that the person came from, or `outside`; empty for other events.
+    /// Room that the person came from, or `outside`; empty if the kind is not `door`.
     pub from_text: [u8; 24],
-    /// Room that the person went to, or `outside`; empty for other events.
+    /// Room that the person went to, or `outside`; empty if the kind is not `door`.
     pub to_text: [u8; 24],
 }
 

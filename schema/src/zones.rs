@@ -42,7 +42,7 @@ pub struct Zone {
     pub radius_mm: u16,
     /// Number of beams of this scan that end inside the zone.
     pub beams: u16,
-    /// 1 if enough beams ended inside the zone in enough scans.
+    /// 1 if enough beams ended inside the zone in enough consecutive scans.
     pub violated: u8,
     /// 0.
     pub reserved: [u8; 3],
@@ -63,7 +63,7 @@ impl Zones {
     pub const NO_BEAM: u16 = u16::MAX;
     /// Value of [`Zones::nearest_mm`] if there is no nearest point.
     pub const NO_DISTANCE: u32 = u32::MAX;
-    /// Flag: there were fewer scans than a violation requires.
+    /// Flag: no zone can be violated yet, because fewer scans have arrived than a violation requires.
     pub const PROVISIONAL: u8 = 1;
 
     /// Returns a payload without zones, with verdict unknown.

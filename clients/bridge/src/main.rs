@@ -16,46 +16,48 @@ use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Printable};
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, publisher_domain};
 
-/// Send and receive topics over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet
+/// Send and receive topics over Zenoh, through a router or as a router: to other rooms, over Wi-Fi, over the internet
 #[derive(Debug, Parser)]
 #[command(name = "scanhub-bridge", version, max_term_width = 100, after_help = EXAMPLES, args_override_self = true)]
 struct Cli {
     /// Router to connect to: tcp/HOST:PORT or tls/HOST:PORT. Can be repeated; the first one that responds is used
     #[arg(long, value_name = "ADDRESS")]
     connect: Vec<String>,
-    /// Run as a router that listens here: tcp/0.0.0.0:7447, or tls/.. with certificates. Can be repeated
+    /// Address on which the bridge listens as a router: tcp/0.0.0.0:7447, or tls/.. with certificates. Can be repeated
     #[arg(long, value_name = "ADDRESS")]
     listen: Vec<String>,
-    /// Zenoh's own configuration, JSON5: TLS, users, access control. --connect and --listen are added to it
+    /// Configuration file of Zenoh in JSON5, for TLS, users and access control. --connect and --listen are added to it
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
-    /// every fourth telegram. Can be repeated [default: all topics except telegram, lines, motion, early and cloud, of
-    /// all sensors]. With --publish, also the topics to receive, each in the form */scan
+    /// Topics to send: front/scan, */scan for all sensors, or front/* for all topics of a sensor. With :every=4, only
+    /// the samples of every fourth telegram. Can be repeated [default: all topics except telegram, lines, motion, early
+    /// and cloud, of all sensors]. With --publish, also the topics to receive, each in the form */scan
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
-    /// Publish topics of other machines in this machine's domain, as HUB.SENSOR; then nothing is sent without --send
+    /// Publish topics of other machines in a domain of this machine, as HUB.SENSOR/TOPIC. The bridge then sends only
+    /// with --send
     #[arg(long)]
     publish: bool,
-    /// Also send, in addition to --publish or --ros2
+    /// Send topics in addition to --publish or --ros2
     #[arg(long)]
     send: bool,
-    /// Name a hub, instead of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
+    /// Name for a hub, in place of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
     #[arg(long = "name", value_name = "NAME=HUB", requires = "publish")]
     names: Vec<String>,
-    /// Hub to publish, by its 16 hex digits or its name from --name [default: all]
+    /// Hub to publish: its 16 hex digits, or its name from --name [default: all]
     #[arg(long = "hub", value_name = "HUB", requires = "publish")]
     hubs: Vec<String>,
-    /// Subscriber slots of each published topic, 1 to 250
+    /// Maximum number of subscribers of each published topic, 1 to 250
     #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
     subscribers: u16,
     /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is refused
     #[arg(long, value_name = "MB", requires = "publish", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
     memory: u32,
-    /// Connect, print problems with their remedies, and exit; nothing is sent or published
+    /// Connect, print problems with their remedies, and exit, without sending or publishing topics
     #[arg(long, conflicts_with = "publish")]
     check: bool,
-    /// Run as a ROS 2 node (rmw_zenoh) that publishes the hub's topics; then nothing else is sent without --send
+    /// Run as a ROS 2 node (rmw_zenoh) that publishes the hub's topics. The bridge then sends topics in Zenoh's own
+    /// form only with --send
     #[arg(long)]
     ros2: bool,
     /// ROS 2 release of the nodes that receive the topics: humble, jazzy, kilted or rolling
@@ -73,10 +75,10 @@ struct Cli {
     /// Frame of a sensor in ROS 2, for example front=laser [default: its name]
     #[arg(long = "frame", value_name = "SENSOR=FRAME", requires = "ros2")]
     frames: Vec<String>,
-    /// Name of the hub, if several run on this machine: 1 to 16 of a-z, 0-9 and -
+    /// Domain of the hub, which distinguishes several hubs on a machine: 1 to 16 characters of a-z, 0-9 and -
     #[arg(long, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
     domain: String,
-    /// Use the hub in this directory
+    /// Directory that contains the directory of the domain, in place of the default locations
     #[arg(long, value_name = "DIR")]
     root: Option<PathBuf>,
     /// Print one JSON object per line

@@ -36,22 +36,22 @@ use udp_destination::{DestinationEvent, UdpDestination};
 #[derive(Args, Clone, Debug, Default)]
 #[command(after_help = after_help())]
 pub struct GatewayArgs {
-    /// Network interface for the groups: everyone on that network can read what is sent. Without it, nothing is sent
-    /// to groups, and --to must name hosts. lo: this machine only
+    /// Network interface for the multicast groups. Everyone on its network can read the data. lo: this machine only.
+    /// Without an interface, nothing is sent to groups, and --to must name hosts
     #[arg(long, value_name = "NAME")]
     pub interface: Option<String>,
-    /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
-    /// every fourth telegram. Can be repeated [default: all topics except telegram, lines, motion, early and cloud, of
-    /// all sensors]
+    /// Topics to send: front/scan, */scan for all sensors, or front/* for all topics of a sensor. With :every=4, only
+    /// the samples of every fourth telegram. Can be repeated [default: all topics except telegram, lines, motion, early
+    /// and cloud, of all sensors]
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     pub topics: Vec<String>,
     // In help texts, brackets are not links.
     #[allow(rustdoc::broken_intra_doc_links)]
-    /// Host that gets copies, HOST:PORT or [IPV6]:PORT; a name is resolved again while the gateway runs. Can be
-    /// repeated
+    /// Host that gets copies of the datagrams: HOST:PORT or [IPV6]:PORT. The gateway resolves a name again while it
+    /// runs. Can be repeated
     #[arg(long, value_name = "HOST:PORT")]
     pub to: Vec<String>,
-    /// Send only telegrams, without a header, each sensor on its own port
+    /// Send only telegrams, without a header, and each sensor to a port of its own
     #[arg(long, conflicts_with = "background_every")]
     pub bare: bool,
     /// Authenticate every datagram with the key in this file, for `listen --key-file`. `scanhub key new` creates one
@@ -60,10 +60,10 @@ pub struct GatewayArgs {
     /// Maximum number of networks that datagrams to the groups cross, including the first one [default: 1]
     #[arg(long, value_name = "N")]
     pub ttl: Option<u8>,
-    /// Send the background also at this interval, not only when it is new, for example 10s
+    /// Interval at which the background is sent again, for example 10s [default: only when it is new]
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     pub background_every: Option<Duration>,
-    /// Longest datagram in bytes, up to 1472 if no tunnel is on the way [default: 1372]
+    /// Maximum size of a datagram in bytes, 576 to 1472. Through a tunnel, 1472 is too large [default: 1372]
     #[arg(long, value_name = "BYTES")]
     pub mtu: Option<usize>,
 }
@@ -504,7 +504,7 @@ fn after_help() -> String {
     for (address, topics) in groups_and_topics() {
         text += &format!("  {address}  {topics}\n");
     }
-    text + "bare: 239.255.76.83, port 22201 for the first sensor, 22202 for the second ..\nSIGUSR1: print the counts so far"
+    text + "With --bare: 239.255.76.83, port 22201 for the first sensor, 22202 for the second ..\nSIGUSR1: print the counts so far"
 }
 
 /// Returns the address of each multicast group, and the names of the topics that are sent to it.

@@ -27,10 +27,10 @@ pub struct KeyArgs {
 
 #[derive(Debug, Subcommand)]
 enum KeyCommand {
-    /// Make a file with a new key, readable for this user only
+    /// Create a file with a new key, which only this user can read
     #[command(after_help = "Example:\n  scanhub key new lan.key")]
     New {
-        /// The file; it must not exist
+        /// File to create; it must not exist yet
         file: PathBuf,
     },
 }

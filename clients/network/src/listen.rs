@@ -39,24 +39,24 @@ pub struct ListenArgs {
     /// Network interface to listen on [default: all that have a link]
     #[arg(long, value_name = "IF")]
     interface: Option<String>,
-    /// Topic to listen to, of all sensors, for example zones [default: all topics]
+    /// Topic to receive from all sensors, for example zones [default: all topics]
     #[arg(long = "topic", value_name = "TOPIC")]
     topics: Vec<String>,
-    /// Name a hub, instead of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
+    /// Name for a hub, in place of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
     #[arg(long = "name", value_name = "NAME=HUB")]
     names: Vec<String>,
-    /// Hub to listen to, by its 16 hex digits or its name from --name [default: all]
+    /// Hub to receive from: its 16 hex digits, or its name from --name [default: all]
     #[arg(long = "hub", value_name = "HUB")]
     hubs: Vec<String>,
-    /// Accept only datagrams that are authenticated with the key in this file, and each of them once. Clocks must agree
-    /// within 5 s
+    /// Accept only datagrams that are authenticated with the key in this file, and each of them once. The clocks of
+    /// sender and receiver must agree within 5 s
     #[arg(long, value_name = "FILE")]
     key_file: Option<PathBuf>,
     /// Print only the counts: received, lost, duplicate, reordered, refused
     #[arg(long)]
     stats: bool,
-    /// Publish the samples in this machine's domain as HUB.SENSOR instead of printing them, so that all programs here
-    /// can use them like sensors of a hub
+    /// Publish the received topics in a domain of this machine as HUB.SENSOR/TOPIC, instead of printing them. All
+    /// programs here can use them like topics of a hub
     #[arg(long)]
     publish: bool,
     /// Maximum number of subscribers of each published topic, 1 to 250

@@ -35,22 +35,22 @@ pub struct BackgroundArgs {
 /// Request about a background model.
 #[derive(Clone, Debug, PartialEq, Eq, Subcommand)]
 pub enum ModelRequest {
-    /// Show how many beams are known; with --json, every range
+    /// Show how many beams have a known background. With --json, show the range of each beam
     #[command(after_help = "Example:\n  scanhub background front show")]
     Show,
-    /// Forget the model and learn it again
+    /// Discard the model and learn it again
     #[command(after_help = "Example:\n  scanhub background front reset")]
     Reset,
-    /// Freeze the model: stop learning
+    /// Stop learning, and keep the model as it is
     #[command(after_help = "Example:\n  scanhub background front freeze")]
     Freeze,
-    /// Continue learning
+    /// Continue learning after `freeze`
     #[command(after_help = "Example:\n  scanhub background front thaw")]
     Thaw,
     /// Save the model to a file
     #[command(after_help = "Example:\n  scanhub background front save front.json")]
     Save {
-        /// The file; - is stdout
+        /// File to write; - is stdout
         file: PathBuf,
         /// Overwrite an existing file
         #[arg(short, long)]
@@ -59,7 +59,7 @@ pub enum ModelRequest {
     /// Load a saved model
     #[command(after_help = "Example:\n  scanhub background front load front.json")]
     Load {
-        /// The file; - is stdin
+        /// File to read; - is stdin
         file: PathBuf,
         /// Accept a model of another sensor
         #[arg(long)]

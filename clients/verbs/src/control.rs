@@ -19,7 +19,7 @@ use crate::output::{Output, verb_result};
 pub struct ControlArgs {
     /// The sensor
     sensor: String,
-    /// pause: stop the sensor; resume: stream again; resync: restart the session with the sensor
+    /// pause: stop the scans of the sensor. resume: continue the scans. resync: restart the session with the scanner
     #[arg(value_parser = verbs())]
     verb: Verb,
 }

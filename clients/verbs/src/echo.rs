@@ -16,17 +16,17 @@ use crate::{json, show, text};
 #[derive(Args, Clone, Debug, Default)]
 #[command(after_help = EXAMPLES)]
 pub struct EchoArgs {
-    /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics; robot/zones for the verdict over all
-    /// sensors
+    /// Topics to print: front/scan, */scan for all sensors, or front/* for all topics of a sensor. robot/zones is the
+    /// combined verdict of all sensors
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
     pub topics: Vec<String>,
     /// Print comma-separated values
     #[arg(long, conflicts_with_all = ["json", "raw"])]
     pub csv: bool,
-    /// With --csv: ranges in meters
+    /// With --csv: print ranges in meters
     #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
     pub meters: bool,
-    /// With --csv: columns intensity_0 .. after the ranges
+    /// With --csv: add the columns intensity_0 .. after the ranges
     #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
     pub intensities: bool,
     /// Print raw bytes: telegrams, or the payload of another topic

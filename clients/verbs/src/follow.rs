@@ -20,13 +20,13 @@ use crate::{json, text};
 /// Limits at which a verb ends by itself. They are arguments of every verb that subscribes to topics.
 #[derive(clap::Args, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RunLimits {
-    /// Stop after this number of samples
+    /// Stop after this number of samples of all topics together
     #[arg(short = 'n', value_name = "COUNT", value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
     /// Stop after this time, for example 10s, 250ms, 5m
     #[arg(long = "for", value_name = "DURATION", value_parser = crate::duration::parse)]
     pub run_for: Option<Duration>,
-    /// Exit with 3 after this time without a sample
+    /// Exit with code 3 if no sample arrives for this time
     #[arg(long, value_name = "DURATION", value_parser = crate::duration::parse)]
     pub timeout: Option<Duration>,
 }

@@ -21,7 +21,7 @@ use crate::{duration, json, text};
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  scanhub hz front/scan --for 10s")]
 pub struct HzArgs {
-    /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics [default: all]
+    /// Topics to measure: front/scan, */scan for all sensors, or front/* for all topics of a sensor [default: all]
     #[arg(value_name = "SENSOR/TOPIC")]
     pub topics: Vec<String>,
     /// Time span that each line covers, at least 0.5s

@@ -18,7 +18,7 @@ use crate::output::{Output, table, verb_result};
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  scanhub info front")]
 pub struct InfoArgs {
-    /// Show only this sensor
+    /// Sensor to show [default: all]
     pub sensor: Option<String>,
 }
 

@@ -31,13 +31,13 @@ use crate::{duration, json, text};
 #[derive(Args, Clone, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct LatencyArgs {
-    /// Topics to follow: front/scan, rear/telegram, robot1.front/zones ..
+    /// Topics to measure, for example front/scan, rear/telegram or robot1.front/zones
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
     topics: Vec<String>,
-    /// Exit with 5 if more than one in a hundred samples of a topic is older on arrival, for example 1ms
+    /// Maximum age on arrival, for example 1ms. The exit code is 5 if more than 1 in 100 samples of a topic is older
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     max_p99: Option<Duration>,
-    /// How to wait for samples
+    /// Method of waiting for samples
     #[arg(long, value_enum, default_value = "doorbell")]
     wait: WaitMethod,
     /// Do not request real-time priority and locked memory
@@ -49,11 +49,11 @@ pub struct LatencyArgs {
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum WaitMethod {
-    /// Sleep on a word in shared memory; one call of the hub wakes all
+    /// Sleep on a word in shared memory. One call of the hub wakes all subscribers
     Doorbell,
-    /// Sleep on the event; the hub sends one message to each subscriber
+    /// Sleep on the library's event service. The hub sends one message to each subscriber
     Event,
-    /// Do not sleep; uses a whole CPU
+    /// Poll without sleeping, which uses a whole CPU
     Spin,
 }
 
@@ -61,9 +61,15 @@ const AFTER_HELP: &str = "\
 Example:
   scanhub latency front/scan --for 10s --max-p99 1ms
 
-line: first byte to last; network: a remote sensor's first byte to the arrival on this \
-machine, by the wall clocks of both; hub: last byte until sent; wake: sent until received; age: last byte, or arrival on \
-this machine, until received, which --max-p99 checks; total: all of it\n\n\
+Times of a sample:
+  line     from the telegram's first byte to its last byte
+  hub      from the last byte until the hub sent the sample
+  wake     from then until this program received the sample
+  age      hub and wake together, which --max-p99 checks
+  total    line, hub and wake together
+  network  from a remote sensor's first byte to the arrival on this machine, by the wall clocks of both machines.
+           For a remote sensor, age starts at the arrival, and total is network and age together
+
 To check a hundred scans: scanhub latency front/scan -n 100 --timeout 5s --max-p99 1ms";
 
 /// Interval between two lines of a topic.

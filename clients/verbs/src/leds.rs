@@ -27,19 +27,19 @@ use crate::{duration, json, text};
 #[derive(Args, Clone, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct LedsArgs {
-    /// The sensor, or robot for the verdict over all sensors
+    /// Sensor, or robot for the combined verdict of all sensors
     sensor: String,
-    /// LEDs of this machine that show the lights too: green=NAME, yellow=NAME, red=NAME, mark=NAME, separated by commas;
-    /// red is lit when the verdict is unknown, and after the end
+    /// LEDs of this machine that also show the lights: green=NAME, yellow=NAME, red=NAME, mark=NAME, separated by
+    /// commas. After the run, the red LED stays on
     #[arg(long = "led", value_name = "LIGHT=NAME", value_delimiter = ',')]
     leds: Vec<String>,
     /// Directory of the LEDs
     #[arg(long, default_value = "/sys/class/leds", value_name = "DIR")]
     led_root: PathBuf,
-    /// How long a better verdict must last before it is shown; a worse one is shown at once
+    /// Time that a better verdict must last before it is shown. A worse verdict is shown at once
     #[arg(long, default_value = "300ms", value_name = "DURATION", value_parser = duration::parse)]
     hold: Duration,
-    /// Show early warnings too, before a scan is complete (docs/early.md)
+    /// Include early warnings, which arrive before a scan is complete (docs/early.md)
     #[arg(long)]
     early: bool,
     #[command(flatten)]
@@ -51,7 +51,7 @@ Examples:
   scanhub leds front
   scanhub leds robot --led green=led0
 
-green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector mark";
+Lights: green for clear, yellow for slow, red for stop or unknown, mark for at least one reflector mark";
 
 impl LedsArgs {
     /// Shows the lights on stdout and on the LEDs until the limits are reached or a signal ends the run. Notices go to

@@ -19,7 +19,7 @@ use crate::output::{Output, table, verb_result};
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  scanhub list")]
 pub struct ListArgs {
-    /// List every live domain of this user instead
+    /// List the domains that are in use, instead of the sensors of one domain
     #[arg(long)]
     pub domains: bool,
 }

@@ -50,8 +50,9 @@ use crate::receive_stats::ReceiveStats;
 #[derive(Args, Clone, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct RecordArgs {
-    /// Topics to record: front/telegram, */scan for all sensors, or front/* for all topics [default: telegram, marks,
-    /// zones, foreground and status of all sensors, tracks and events of trackers, tilt and obstacles of mounts]
+    /// Topics to record: front/telegram, */scan for all sensors, or front/* for all topics of a sensor [default:
+    /// telegram, marks, zones, foreground and status of all sensors, tracks and events of trackers, tilt of mounts and
+    /// obstacles]
     #[arg(value_name = "SENSOR/TOPIC")]
     topics: Vec<String>,
     /// Record every topic of all sensors
@@ -66,13 +67,15 @@ pub struct RecordArgs {
     /// File to write; - for stdout [default: scanhub-DATE-TIME.mcap]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Overwrite an existing file; with --split, continue after the existing numbers, and let --keep remove older files
+    /// Overwrite an existing file. With --split, keep existing files, continue after their numbers, and let --keep
+    /// remove them later
     #[arg(short, long)]
     force: bool,
-    /// Start another file after this size or time: 512MiB, 1h; the files are called FILE-0001.mcap ..
+    /// Size or time after which another file starts, for example 512MiB or 1h. The files are called FILE-0001.mcap,
+    /// FILE-0002.mcap ..
     #[arg(long, value_name = "SIZE|DURATION", value_parser = Split::parse)]
     split: Option<Split>,
-    /// Keep only the last COUNT files of this run; with --force, files FILE-NNNN.mcap of earlier runs count too
+    /// Keep only the last COUNT files of this run. With --force, files FILE-NNNN.mcap of earlier runs count too
     #[arg(long, value_name = "COUNT", requires = "split", value_parser = clap::value_parser!(u32).range(1..))]
     keep: Option<u32>,
     #[command(flatten)]
@@ -86,8 +89,8 @@ Examples:
   scanhub record --all --split 512MiB --keep 20
   scanhub record -o walk.mcap --split 1h --keep 20 --force
 
-The files are MCAP: any MCAP reader opens them, `scanhub replay FILE` plays them. Ctrl-C finishes the file. On a full
-disk it waits and continues; it reports what is missing, which is a gap in the file's numbers.";
+Any MCAP reader opens the files, and `scanhub replay FILE` plays them. Ctrl-C finishes the file. If the disk is full,
+record waits for space and continues. It reports the missing samples, which are a gap in the file's sequence numbers.";
 
 /// Topics that are recorded by default: telegrams, from which all others can be computed again, and the most important
 /// results.

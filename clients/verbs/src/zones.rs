@@ -22,7 +22,7 @@ use crate::names::{TopicName, as_argument};
 use crate::output::{ExitReason, Output, verb_result};
 use crate::{duration, text};
 
-/// Learn which part of a sensor's view is the robot itself
+/// Find the robot itself in a sensor's view, to mask it
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  scanhub zones front mask --for 10s")]
 pub struct ZonesArgs {
@@ -34,15 +34,14 @@ pub struct ZonesArgs {
 
 #[derive(Clone, Debug, Subcommand)]
 enum ZonesCommand {
-    /// Learn which readings of the sensor are its own robot, and print them as configuration. Place the robot in an open
-    /// area with no one near it
+    /// Find the beams that hit the robot itself, and print the configuration that masks them. First place the robot in
+    /// an open area with no one near it
     #[command(after_help = "Example:\n  scanhub zones front mask --for 10s")]
     Mask {
-        /// How long to observe, for example 10s
+        /// Time to observe the sensor, for example 10s
         #[arg(long = "for", default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
         run_for: Duration,
-        /// Only points within this distance (meters) of the robot's center can be its body [default: the largest
-        /// zone]
+        /// Maximum distance of the robot's body from its center, in meters [default: the radius of the largest zone]
         #[arg(long, value_name = "RADIUS")]
         within: Option<f64>,
     },

@@ -38,26 +38,25 @@ pub struct WebArgs {
     /// Sensors to show [default: all]
     #[arg(value_name = "SENSOR")]
     sensors: Vec<String>,
-    /// Address to listen on: an IP address or localhost, a port, or both. 0.0.0.0 or :: for other machines, which needs
-    /// --token. If the port is in use, the next free one
+    /// Address to listen on: an IP address or localhost, a port, or both. If the port is in use, the next free port is
+    /// taken. For viewers on other machines, use 0.0.0.0 or ::, with --token, --token-file or --open
     #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT", value_parser = listen_address)]
     listen: SocketAddr,
-    /// Word that page and viewers must know: it goes into the address, as ?token=WORD. It travels unencrypted, and
-    /// other users of this machine see it in the list of processes, unless it comes from the environment or
-    /// --token-file
+    /// Word that viewers need, as ?token=WORD in the address. The network carries it unencrypted. Other users of this
+    /// machine can see this flag in the list of processes, but not the variable, and not the file of --token-file
     #[arg(long, value_name = "WORD", env = "SCANHUB_WEB_TOKEN", hide_env_values = true, value_parser = token)]
     token: Option<String>,
-    /// File with the word as its only line, which only this user can read. It takes precedence over --token
+    /// File that only this user can read, with the word as its only line. It takes precedence over --token
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
     /// Serve everyone who can reach the address, without a token
     #[arg(long, conflicts_with_all = ["token", "token_file"])]
     open: bool,
-    /// Accept viewers that are served from this URL. Can be repeated
+    /// Web site whose pages may connect, as a URL. Can be repeated
     #[arg(long = "allow-origin", value_name = "URL")]
     origins: Vec<String>,
-    /// Show this recording instead of a hub: a private hub plays it, and the page has the keys of the player. Files:
-    /// MCAP, telegram stream or CARMEN log, plain or gzipped
+    /// Recording to show: MCAP file, stream file or CARMEN log, plain or gzipped. A private hub plays it, and keys of
+    /// the page control the player
     #[arg(long, value_name = "FILE")]
     pub replay: Option<PathBuf>,
     /// Start the recording again at its end
@@ -73,7 +72,8 @@ Examples:
   scanhub web --listen 8090
   scanhub web --listen 0.0.0.0 --token carrot
 
-Open the printed address in a browser. Foxglove and Lichtblick: open connection, Foxglove WebSocket, the same address with ws:.";
+Open the printed address in a browser. In Foxglove or Lichtblick, open a connection of the type Foxglove WebSocket to this
+address, with ws: in place of http:.";
 
 /// Port if `--listen` names only an address.
 const DEFAULT_PORT: u16 = 8080;

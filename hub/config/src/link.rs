@@ -146,7 +146,7 @@ section! {
         expected_type ("type"): Option<String> = None;
         /// auto: the hub finds the scanner
         ///
-        /// `lms`, `ld`, `rplidar`, or `auto`, the default: the hub finds the scanner.
+        /// `lms`, `ld` or `rplidar`. With `auto`, the default, the hub finds the family.
         family: Option<String> = None, example "\"auto\"";
         /// auto, or the name of a model
         ///
@@ -154,7 +154,7 @@ section! {
         model: Option<String> = None, example "\"auto\"";
         /// beams per scan, 2 to 8192; default: as many points as the model measures per revolution
         ///
-        /// Beams per scan of a rotating scanner, 2 to 8192. Default: as many as the model measures per revolution.
+        /// Beams per scan of a rotating scanner, 2 to 8192. Default: the points that the model measures per revolution.
         beams: Option<i64> = None, example "450";
         /// degrees, 100 or 180
         ///
@@ -174,7 +174,7 @@ section! {
         mode: Option<toml::Value> = None, example "0x01";
         /// run, or stop: the motor stops while no program subscribes
         ///
-        /// `run`, or `stop`: the motor of an RPLIDAR stops while no program subscribes.
+        /// `run` or `stop`. With `stop`, the motor of an RPLIDAR stops while no program subscribes.
         idle: Option<String> = None, example "\"run\"";
         /// baud rate of the stream: 500000, 38400, 19200 or 9600
         ///

@@ -131,14 +131,14 @@ section! {
     pub(crate) struct ZonesKeys: "keys of zones, as { radii = [1.0, 0.6] }" {
         /// meters around the robot's center: slow first, stop last
         ///
-        /// Radii of 1 to 8 zones, the largest first, at most 65 m. A point in the smallest zone means stop, and in
-        /// another zone slow.
+        /// Radii of 1 to 8 zones, the largest first, at most 65 m. A point in the smallest zone means `stop`, and a
+        /// point in another zone `slow`.
         radii: Vec<f64> = vec![1.0, 0.6], check radii;
         /// the robot's own body, such as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }
         ///
         /// The robot's own body: at most 64 sectors, from `from_deg` to `to_deg` (-180 to 180; 0 is ahead of the
-        /// sensor, 90 left). The hub ignores readings nearer than `range` meters there. `scanhub zones SENSOR mask`
-        /// learns the sectors.
+        /// sensor, 90 left). In a sector, the hub ignores readings nearer than `range` meters. `scanhub zones SENSOR
+        /// mask` learns the sectors.
         body_mask: Vec<SectorKeys> = Vec::new(), check sectors;
         /// meters added to each radius
         ///
@@ -146,7 +146,7 @@ section! {
         margin: f64 = 0.0, check meters(0.0..=10.0);
         /// beams inside a circle that violate it
         ///
-        /// Minimum number of beams inside a zone that violate it.
+        /// Minimum number of beams that violate a zone by ending in it.
         min_beams: i64 = 1, check whole(1..=MAX_BEAMS as i64);
         /// consecutive scans in which a circle must be violated
         ///
@@ -159,11 +159,11 @@ section! {
         max_invalid: f64 = 0.1, check within(0.0..=1.0, "a share from 0 to 1");
         /// ignore points between the sensor and the near side of a circle
         ///
-        /// Whether a sensor outside a zone ignores points in front of the zone's near side.
+        /// Whether a sensor outside a zone ignores points between itself and the zone.
         exact: bool = true;
         /// whether no echo means that nothing is near
         ///
-        /// Whether no echo means that nothing is near. If false, the beam has no reading.
+        /// Whether a beam without an echo means that nothing is near. If false, it has no reading.
         no_return_is_far: bool = true;
     }
 }
@@ -210,8 +210,8 @@ section! {
     pub(crate) struct LinesKeys: "keys of lines, as { max = 20, refine = true }" {
         /// lines of a scan, 1 to 64
         ///
-        /// Maximum number of lines of a scan, 1 to 64. If there are more, the hub joins those that differ least, and
-        /// drops beams that do not fit well.
+        /// Maximum number of lines of a scan, 1 to 64. If a scan has more, the hub joins the lines that differ least,
+        /// and drops beams that do not fit well.
         max: i64 = 64, check whole(1..=MAX_LINES as i64);
         /// beams of a line, at least 3
         ///
@@ -219,8 +219,8 @@ section! {
         min_points: i64 = 5, check whole(3..=MAX_BEAMS as i64);
         /// slower fit with a better result
         ///
-        /// Whether the hub optimizes the cuts between lines, which is slower. It then drops the worst beams at the ends
-        /// of lines, at most one in twenty.
+        /// Whether the hub optimizes the borders between lines, which is slower. The hub then drops the worst beams at
+        /// the ends of lines, at most one in twenty.
         refine: bool = false;
     }
 }
@@ -238,7 +238,8 @@ section! {
         max_turn: f64 = 30.0, check within(1.0..=85.0, "degrees from scan to scan, from 1 to 85");
         /// share of readings on surfaces of the previous scan
         ///
-        /// Minimum share of readings on surfaces of the previous scan, 0.1 to 1. A step with less is rejected.
+        /// Minimum share of readings on surfaces of the previous scan, 0.1 to 1. A step with a smaller share is
+        /// rejected.
         min_overlap: f64 = 0.4, check within(0.1..=1.0, "a share from 0.1 to 1");
     }
 }
@@ -248,22 +249,22 @@ section! {
     pub(crate) struct BackgroundKeys: "keys of background, as { method = \"multi\" }" {
         /// multi, paper, moving (for a robot that drives) or off
         ///
-        /// `multi`; `paper`, a simpler published method; [`moving`](#moving), for a robot that drives; or `off`:
-        /// neither foreground nor background is published.
+        /// `multi`; `paper`, a simpler published method; [`moving`](#moving), for a robot that drives; or `off`. With
+        /// `off`, neither foreground nor background is published.
         method: MethodKey = MethodKey::Multi;
         /// distance from the background that still belongs to it; default: 30, 60 or 100, by the unit
         ///
-        /// Maximum distance of a background reading from the background, in mm, from one unit of the sensor to 10,000.
-        /// Default: 30, for units of cm 60, of dm 100.
+        /// Distance from the background, in mm, within which a reading is background, from one unit of the sensor to
+        /// 10,000. Default: 30 for units of mm, 60 for cm, 100 for dm.
         threshold_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
         /// for paper: the same distance from a candidate, with the same default
         ///
-        /// For `paper`: `threshold_mm` of a candidate that may become background.
+        /// For `paper`: like `threshold_mm`, for a candidate that may become background.
         candidate_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
         /// scans until a surface is background; default: those of 10 s
         ///
-        /// Number of scans until a surface is background, at most 8191. `paper` must see it in all of them, `multi` in
-        /// 5/8. Default: the scans of 10 s at the full rate.
+        /// Number of scans until a surface is background, at most 8191. `paper` must see the surface in all of them,
+        /// `multi` in 5/8. Default: the scans of 10 s at the full rate.
         scans: Option<i64> = None, check optional(whole(1..=8_191)), example "375";
         /// for paper: first or latest
         ///
@@ -281,12 +282,13 @@ section! {
         keep: bool = true;
         /// whether no echo counts as a background far away; default: true, for paper false
         ///
-        /// Whether no echo counts as a background far away. If false, the beam has no reading. Default: true, for
-        /// `paper` false.
+        /// Whether a beam without an echo counts as a background far away. If false, it has no reading. Default: true,
+        /// for `paper` false.
         no_return_is_far: Option<bool> = None, example "true";
         /// on-demand or every-scan
         ///
-        /// `every-scan`; or `on-demand`: when a generation begins, and after every `scans` scans that it has learned.
+        /// When to publish the background: `every-scan`, or `on-demand`, which is when a generation begins, and after
+        /// every `scans` scans that it has learned.
         publish: PublishKey = PublishKey::OnDemand;
     }
 }

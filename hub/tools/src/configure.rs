@@ -34,7 +34,7 @@ use crate::terminal::{Progress, print};
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct ConfigureArgs {
-    /// Port of the sensor: a tty or tcp:HOST:PORT
+    /// Port of the scanner: a tty or tcp:HOST:PORT
     #[arg(value_name = "PORT")]
     port: String,
     /// Settings to write: unit=mm|cm, mode=NAME|0x01, availability=1|2|3, indices=on|off,

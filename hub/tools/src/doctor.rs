@@ -34,15 +34,16 @@ use machine::MachineState;
 /// Check the setup and show how to fix what is wrong
 #[derive(Args, Debug)]
 pub struct DoctorArgs {
-    /// Ports to check: a tty or tcp:HOST:PORT, or the name of a link of the running hub; without one, the ports of the
-    /// configuration, or all ports if there are none, and the links of the running hub
+    /// Ports to check: a tty, tcp:HOST:PORT, or the name of a link of the running hub. Without a port, doctor checks
+    /// the links of the running hub and the ports of the configuration. If the configuration has no port, doctor checks
+    /// all ports of this machine
     #[arg(value_name = "PORT")]
     ports: Vec<String>,
-    /// First remove what dead processes left in this domain, unless a hub runs there
+    /// Before the checks, remove what dead processes left in this domain, unless a hub runs in it
     #[arg(long)]
     clean: bool,
-    /// Router that a bridge of this machine connects to, as in `scanhub bridge --connect`: checks whether that would
-    /// work. Can be repeated
+    /// Router to which a bridge of this machine connects, as in `scanhub bridge --connect`. doctor checks whether the
+    /// connection would work. Can be repeated
     #[arg(long, value_name = "ADDRESS")]
     bridge: Vec<String>,
     /// Configuration of Zenoh to check, as in `scanhub bridge --config`

@@ -31,10 +31,10 @@ pub(crate) use description::{describe_mode, hex};
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct ProbeArgs {
-    /// Port to look at: a tty or tcp:HOST:PORT; without one, the ports of this machine are listed
+    /// Port of the scanner: a tty or tcp:HOST:PORT. Without a port, the ports of this machine are listed
     #[arg(value_name = "PORT")]
     port: Option<String>,
-    /// Print only the link for a configuration file
+    /// Print only the section of the link for a configuration file
     #[arg(long, requires = "port", conflicts_with = "json")]
     toml: bool,
 }

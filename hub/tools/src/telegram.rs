@@ -39,14 +39,14 @@ Examples:
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Decode bytes to text: the telegrams in a recording, a pipe, or text such as 02 00 01 00 31 15 12
+    /// Explain the telegrams in a recording, in a pipe, or in text such as 02 00 01 00 31 15 12
     Decode(DecodeArgs),
 }
 
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 struct DecodeArgs {
-    /// File with the bytes, raw or as text, or an MCAP recording; - or nothing is stdin
+    /// File to decode: raw bytes, bytes as text, or an MCAP recording. - or no file: stdin
     file: Option<PathBuf>,
     /// Decode only this sensor, if the recording has several
     #[arg(long, value_name = "NAME")]

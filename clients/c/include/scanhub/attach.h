@@ -150,11 +150,12 @@ struct scanhub_scan_v2 {
     uint32_t beam_time_ns; /* Time from one beam to the next in ns. */
     int32_t first_beam_ns; /* Time of beam 0, in ns after the sample's first stamp; mostly negative. */
     uint32_t unit_um; /* Micrometers per device unit. */
-    uint16_t count; /* Number of beams, at most 8192; they are in the order of their measurement. */
+    uint16_t count; /* Number of beams, at most 8192. The beams are in the order of their measurement. */
     uint16_t valid_to; /* Highest value that is a range; all higher values are codes. */
     uint16_t no_return; /* Code of a beam without an echo. */
     uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has no such code. */
-    /* Number of points that were dropped because another point has the same beam; also points without a return. */
+    /* Number of points that were dropped because another point has the same beam. Points without a return are
+     * included. */
     uint16_t collisions;
     uint8_t family; /* Family of the scanner: SCANHUB_FAMILY_... */
     uint8_t flags; /* Flags: SCANHUB_SCAN_FLAG_... */
@@ -173,9 +174,9 @@ struct scanhub_mark_v2 {
     uint32_t range_dmm; /* Range in 1/10 mm. */
     uint16_t weight; /* Sum of the intensities. */
     uint8_t peak; /* Highest intensity. */
-    uint8_t edge; /* 1 if the mark touches the first or the last beam, so a part of it may be outside. */
-    uint16_t first_beam; /* First beam. */
-    uint16_t last_beam; /* Last beam. */
+    uint8_t edge; /* 1 if the mark touches the first or the last beam, so a part of it may be out of view. */
+    uint16_t first_beam; /* First beam of the mark. */
+    uint16_t last_beam; /* Last beam of the mark. */
 };
 
 /* Flags of struct scanhub_marks_v2. */
@@ -197,7 +198,7 @@ struct scanhub_marks_v2 {
 struct scanhub_zone_v2 {
     uint16_t radius_mm; /* Radius in mm. */
     uint16_t beams; /* Number of beams of this scan that end inside the zone. */
-    uint8_t violated; /* 1 if enough beams ended inside the zone in enough scans. */
+    uint8_t violated; /* 1 if enough beams ended inside the zone in enough consecutive scans. */
     uint8_t reserved[3];
 };
 
@@ -208,7 +209,8 @@ struct scanhub_zone_v2 {
 #define SCANHUB_VERDICT_UNKNOWN 3 /* Too many beams have no reading, or there are no scans. Treat it as stop. */
 
 /* Flags of struct scanhub_zones_v2. */
-#define SCANHUB_ZONES_PROVISIONAL 1 /* There were fewer scans than a violation requires. */
+/* No zone can be violated yet, because fewer scans have arrived than a violation requires. */
+#define SCANHUB_ZONES_PROVISIONAL 1
 
 /* The payload of topic `zones`, 76 bytes. There is one sample per scan, and one with verdict unknown when scans
  * stop. */
@@ -237,7 +239,7 @@ struct scanhub_segment_v2 {
 /* Head of a foreground, before the arrays. 24 bytes. The arrays that follow: segments (struct scanhub_segment_v2), bits
  * (uint8_t), ranges (uint16_t). Use the functions below to read them. */
 struct scanhub_foreground_v2 {
-    uint32_t generation; /* Generation of the compared background. */
+    uint32_t generation; /* Generation of the background that the scan was compared with. */
     uint32_t unit_um; /* Micrometers per device unit. */
     uint16_t count; /* Number of beams of the scan. */
     uint16_t beams; /* Number of beams in the foreground. */
@@ -346,8 +348,8 @@ struct scanhub_line_v2 {
     float alpha_rad; /* Direction from the center to the line's nearest point, in radians from -pi to pi. */
     float sd_r_m; /* Standard deviation of `r_m` in meters. */
     float sd_alpha_rad; /* Standard deviation of `alpha_rad` in radians. */
-    uint16_t first; /* First beam. */
-    uint16_t last; /* Last beam. */
+    uint16_t first; /* First beam of the line. */
+    uint16_t last; /* Last beam of the line. */
     uint16_t points; /* Number of beams on the line that have a range. */
     uint16_t reserved;
 };
@@ -361,7 +363,7 @@ struct scanhub_corner_v2 {
 };
 
 /* Flags of struct scanhub_lines_v2. */
-#define SCANHUB_LINES_OVERFLOW 1 /* There are more lines than `lines.max`; the others were joined or dropped. */
+#define SCANHUB_LINES_OVERFLOW 1 /* There were more lines than `lines.max`, so some were joined or dropped. */
 
 /* The payload of topic `lines`, 3340 bytes: one sample per scan, in the robot's frame. */
 struct scanhub_lines_v2 {
@@ -380,10 +382,10 @@ struct scanhub_lines_v2 {
 #define SCANHUB_METHOD_FIRST   0 /* The first scan, which has no step. */
 /* No step explains the scan. Step and summed pose are unknown, and their numbers are 0. */
 #define SCANHUB_METHOD_REFUSED 1
-#define SCANHUB_METHOD_BEAMS   2 /* Beams alone, without a common corner or line. */
-#define SCANHUB_METHOD_POINTS  3 /* Corners in both scans. */
-#define SCANHUB_METHOD_LINES   4 /* Lines in both scans. */
-#define SCANHUB_METHOD_BOTH    5 /* Corners and lines in both scans. */
+#define SCANHUB_METHOD_BEAMS   2 /* Only beams were matched, because both scans have no corner or line in common. */
+#define SCANHUB_METHOD_POINTS  3 /* Corners of both scans were matched. */
+#define SCANHUB_METHOD_LINES   4 /* Lines of both scans were matched. */
+#define SCANHUB_METHOD_BOTH    5 /* Corners and lines of both scans were matched. */
 
 /* Flags of struct scanhub_motion_v2. */
 /* The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is large in
@@ -402,10 +404,10 @@ struct scanhub_motion_v2 {
     float dy_m; /* Step: meters to the left. */
     float dyaw_rad; /* Step: radians counterclockwise. */
     float covariance[9]; /* Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2. */
-    float overlap; /* Share of this scan's readings on surfaces of the compared scan, 0 to 1. */
+    float overlap; /* Share of this scan's readings on surfaces of the scan that it was matched with, 0 to 1. */
     uint8_t method; /* Method: SCANHUB_METHOD_... Treat every other number as refused. */
     uint8_t flags; /* Flags: SCANHUB_MOTION_... */
-    /* Number of refused steps since the start; 65535 is that many and more. The summed pose does not contain them. */
+    /* Number of refused steps since the start; 65535 means 65535 or more. The summed pose does not contain them. */
     uint16_t refused_steps;
     /* Covariance of the summed pose in the frame of the start, in the layout of `covariance`, without refused steps. It
      * is 0 for the first scan, for an invalid pose, and from a sender with revision 1. */
@@ -431,7 +433,7 @@ struct scanhub_early_v2 {
 /* State of a track. */
 #define SCANHUB_TRACK_TENTATIVE     0 /* The track may not be a person. */
 #define SCANHUB_TRACK_CONFIRMED     1 /* The person is seen. */
-#define SCANHUB_TRACK_HIDDEN        2 /* The person is not seen, and is where no sensor could see them. */
+#define SCANHUB_TRACK_HIDDEN        2 /* The person is not seen, and is at a position that no sensor can see. */
 #define SCANHUB_TRACK_BETWEEN_ROOMS 3 /* The person is on a path that no sensor covers. */
 
 /* One person. */
@@ -486,11 +488,11 @@ struct scanhub_event_v2 {
     char room_text[24];
     /* Name of the door; empty if the kind is not `door`. UTF-8, padded with 0; a text that fills it has no 0. */
     char door_text[24];
-    /* Room that the person came from, or `outside`; empty for other events. UTF-8, padded with 0; a text that fills it
-     * has no 0. */
+    /* Room that the person came from, or `outside`; empty if the kind is not `door`. UTF-8, padded with 0; a text that
+     * fills it has no 0. */
     char from_text[24];
-    /* Room that the person went to, or `outside`; empty for other events. UTF-8, padded with 0; a text that fills it
-     * has no 0. */
+    /* Room that the person went to, or `outside`; empty if the kind is not `door`. UTF-8, padded with 0; a text that
+     * fills it has no 0. */
     char to_text[24];
 };
 
@@ -526,7 +528,8 @@ struct scanhub_cloud_point_v2 {
  * functions below to read them. */
 struct scanhub_cloud_v2 {
     uint32_t sweep; /* Number of the sweep, from 0. */
-    uint32_t generation; /* Generation of the compared background; each reset increases it by 1. */
+    /* Generation of the background that the points were compared with; each reset increases it by 1. */
+    uint32_t generation;
     uint16_t count; /* Number of points, at most 8192. */
     uint8_t flags; /* Flags: SCANHUB_SWEEP_... */
     uint8_t reserved[5];

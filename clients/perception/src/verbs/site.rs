@@ -24,10 +24,10 @@ pub struct SiteArgs {
 
 #[derive(Clone, Debug, Subcommand)]
 enum SiteCommand {
-    /// Check a site file; if it has an error, show its position and exit with 78
+    /// Check a site file. If it has an error, show the position of the error, and exit with code 78
     #[command(after_help = "Example:\n  scanhub site check house.toml --svg house.svg")]
     Check {
-        /// The site file: sensors, rooms and doors
+        /// Site file with sensors, rooms and doors
         file: PathBuf,
         /// Draw the plan into this file
         #[arg(long, value_name = "OUT")]

@@ -21,11 +21,11 @@ use super::own_name;
 use super::results::{Results, Topics};
 use crate::tilt::{Angle, Counts, DropReason, Mount, MountCheck, Point, Settings, Sweep, TiltScanner};
 
-/// 3D from a tilting scanner: points, background, obstacles
+/// Find obstacles in three dimensions with a scanner on a tilting mount
 #[derive(Args, Clone, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct TiltArgs {
-    /// The scanner
+    /// Sensor whose scanner is on the mount
     #[arg(value_name = "SENSOR")]
     sensor: String,
     /// Name under which a program publishes the angles of the mount
@@ -34,13 +34,14 @@ pub struct TiltArgs {
     /// Also publish the topics NAME/cloud and NAME/obstacles. NAME must not be in use
     #[arg(long = "as", value_name = "NAME", value_parser = own_name)]
     name: Option<String>,
-    /// A point of the mount's axis in the robot's frame, in meters: x ahead, y left, z above the floor
+    /// Point on the mount's axis in the robot's frame, in meters: x ahead, y left, z above the floor
     #[arg(long, value_name = "X,Y,Z", value_parser = numbers::<3>, allow_hyphen_values = true)]
     axis_at: [f64; 3],
-    /// Direction of the mount's axis. Angles are right-handed: around y, a larger angle tilts the scanner down
+    /// Direction of the mount's axis. Angles are right-handed: with the default axis, a larger angle tilts the scanner
+    /// down
     #[arg(long, default_value = "0,1,0", value_name = "X,Y,Z", value_parser = axis, allow_hyphen_values = true)]
     axis: [f64; 3],
-    /// Origin of the beams while the mount is level [default: the point of --axis-at]
+    /// Origin of the beams while the mount is level, in the robot's frame, in meters [default: the point of --axis-at]
     #[arg(long, value_name = "X,Y,Z", value_parser = numbers::<3>, allow_hyphen_values = true)]
     sensor_at: Option<[f64; 3]>,
     /// Angle of the mount at which the scanner is level
@@ -52,19 +53,21 @@ pub struct TiltArgs {
     /// The scanner is mounted upside down
     #[arg(long)]
     upside_down: bool,
-    /// Report every object in this box, even if it is background: MIN_X,MAX_X,MIN_Y,MAX_Y,MIN_Z,MAX_Z, in meters
+    /// Box in which every object is an obstacle, even if it belongs to the background:
+    /// MIN_X,MAX_X,MIN_Y,MAX_Y,MIN_Z,MAX_Z, in meters
     #[arg(long, value_name = "X,X,Y,Y,Z,Z", value_parser = cuboid, allow_hyphen_values = true)]
     near: Option<[[f64; 2]; 3]>,
-    /// Sweeps in which a surface must be seen before it is background
+    /// Number of sweeps that must contain a surface before it is background
     #[arg(long, default_value_t = Settings::default().sweeps, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     sweeps: u16,
-    /// Only check axis, arm and level against a flat floor and a wall ahead, and exit: with 5 if one of them is wrong
+    /// Check --axis-at, --axis, --sensor-at and --level with the points of a flat floor and a wall ahead, and exit. The
+    /// exit code is 5 if a value is wrong
     #[arg(long, conflicts_with_all = ["name", "near"])]
     check: bool,
     /// Stop after this time, for example 10s, 250ms, 5m
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
     run_for: Option<Duration>,
-    /// Exit with 3 after this time without a scan and without an angle
+    /// Exit with code 3 if neither a scan nor an angle arrives for this time
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     timeout: Option<Duration>,
 }

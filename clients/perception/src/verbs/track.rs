@@ -25,22 +25,22 @@ use crate::track::{self, Counts, MisplacedSensor, PeopleTracker, SNAPSHOT_INTERV
 #[derive(Args, Clone, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct TrackArgs {
-    /// The site file: sensors, rooms and doors
+    /// Site file with sensors, rooms and doors
     #[arg(long, value_name = "FILE")]
     site: PathBuf,
     /// Also publish the topics NAME/tracks and NAME/events. NAME must not be in use
     #[arg(long = "as", value_name = "NAME", value_parser = own_name)]
     name: Option<String>,
-    /// Print only how many went through this door, each time that someone does. Can be repeated
+    /// Print only how many people went through this door in each direction, whenever someone does. Can be repeated
     #[arg(long, value_name = "DOOR")]
     count: Vec<String>,
-    /// How long to wait for a sensor's scan after other sensors have sent later ones
+    /// Time to wait for a scan of one sensor after a later scan of another sensor has arrived
     #[arg(long, default_value = "80ms", value_name = "DURATION", value_parser = duration::parse)]
     delay: Duration,
     /// Stop after this time, for example 10s, 250ms, 5m
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
     run_for: Option<Duration>,
-    /// Exit with 3 after this time without a scan
+    /// Exit with code 3 if no scan arrives for this time
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     timeout: Option<Duration>,
 }
