@@ -112,11 +112,11 @@ impl GatewayArgs {
         let selection = Selection::parse(&self.topics, self.bare)?;
         if self.bare && self.background_every.is_some() {
             let what = "background_every is set, but bare sends only telegrams";
-            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every out"));
+            return Err(Failure::new(Kind::Configuration, what, "remove bare or background_every"));
         }
         if self.bare && self.key_file.is_some() {
             let what = "bare telegrams have no room for a MAC";
-            return Err(Failure::new(Kind::Configuration, what, "leave bare or key_file out"));
+            return Err(Failure::new(Kind::Configuration, what, "remove bare or key_file"));
         }
         Ok(selection)
     }
