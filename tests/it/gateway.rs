@@ -278,7 +278,7 @@ fn replaced_hub_and_gateway_change_boot_and_epoch() {
         let of_second = received
             .iter()
             .position(|bytes| decode_datagram(bytes).head.epoch != decode_datagram(&received[0]).head.epoch);
-        let (of_first, of_second) = received.split_at(of_second.expect("another life"));
+        let (of_first, of_second) = received.split_at(of_second.expect("another run"));
         check_counters(of_first, &outcome);
         let mut boots: Vec<_> =
             of_first.iter().filter_map(|bytes| read_announcement(bytes)).map(|it| it.boot).collect();

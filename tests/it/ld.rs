@@ -212,7 +212,7 @@ fn doctor_checks_a_rotating_scanner() {
         assert_eq!(of_port(name).0, "ok", "{}", of_port(name).1);
     }
     assert!(of_port("sensor").1.contains("LD19 at 230400 Bd, family ld"), "{}", of_port("sensor").1);
-    assert!(of_port("health").1.contains("revolutions a second"));
+    assert!(of_port("health").1.contains("revolutions per second"));
     let link = env.link("front");
     let wrong = check(&[&link, "--set=link.front.family=ld", "--set=link.front.model=stl27l"], 0);
     assert_eq!(wrong("settings").0, "warning");

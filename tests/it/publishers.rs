@@ -96,10 +96,10 @@ fn angles_arrive_with_their_stamps_and_wake_waiters() {
         for (number, rate_rad_s) in [0.25, f64::NAN, -1.5].into_iter().enumerate() {
             let tilt = Tilt { angle_rad: 0.1 * number as f64 - 0.05, rate_rad_s };
             let stamp_ns = if number == 2 { 0 } else { begin_ns - 300_000_000 };
-            let rung = Topic::ALL.map(|topic| doorbell.ring_count(topic.spec().doorbell_word));
+            let counts = Topic::ALL.map(|topic| doorbell.ring_count(topic.spec().doorbell_word));
             mount.send(&tilt, stamp_ns);
             let ring = |topic: Topic| {
-                doorbell.ring_count(topic.spec().doorbell_word).wrapping_sub(rung[topic as usize])
+                doorbell.ring_count(topic.spec().doorbell_word).wrapping_sub(counts[topic as usize])
             };
             assert_eq!([Topic::Tilt, Topic::Scan, Topic::Early].map(ring), [1, 0, 0]);
             assert_eq!(scanhub_shm::take_wakeups(&[&wake_listener]), Ok(true));

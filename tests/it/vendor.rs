@@ -90,6 +90,7 @@ fn run_simulator(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
 fn vendor_driver_reads_the_room_in_all_packet_forms() {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/it/vendor/scans.py");
     let world = World::of_toml("room.toml", ROOM_WORLD).expect("a world");
+    let mut crashes = 0;
     for (model, id, mode, points) in [
         (Model::A1, 0x18, "Standard", 266),
         (Model::A2m8, 0x28, "Express", 394),
@@ -111,7 +112,8 @@ fn vendor_driver_reads_the_room_in_all_packet_forms() {
         run_simulator(&mut unit, &pty, &driver);
         let outcome = driver.wait();
         // `None` is a crash of the vendor's code, seen once on a busy machine. The scans that it has printed count.
-        let is_ended = outcome.exit_code.is_none_or(|code| code == 0);
+        crashes += u32::from(outcome.exit_code.is_none());
+        let is_ended = outcome.exit_code.is_none_or(|code| code == 0) && crashes < 2;
         assert!(is_ended && unit.eeprom_writes() == 0, "{}: {outcome}", model.name());
         let result = outcome.lines().pop().unwrap_or_else(|| panic!("{}: {outcome}", model.name()));
         assert_eq!(result["model"], id, "{}", model.name());

@@ -197,6 +197,19 @@ fn demo_shows_watch_on_a_terminal() {
 }
 
 #[test]
+fn demo_on_a_terminal_ends_after_its_time() {
+    if !can_open_terminal() {
+        return;
+    }
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    let temporary = tempfile::tempdir().expect("a directory");
+    command.args(["demo", "--for=3s"]).env("TMPDIR", temporary.path());
+    let (code, below, is_whole) = TerminalSession::start(&command, (80, 30)).finish();
+    assert!(code == Some(0) && is_whole, "{code:?} {below:?}");
+    assert_eq!(below.matches(" sent, ").count(), 2, "{below:?}");
+}
+
+#[test]
 fn closed_terminal_ends_watch_without_error() {
     if !can_open_terminal() {
         return;

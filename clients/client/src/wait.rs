@@ -89,18 +89,18 @@ impl Wakeups {
         if self.has_rung() {
             return Ok(());
         }
-        let bells: Vec<_> = self.sensors.iter().flat_map(Sensor::doorbells).collect();
+        let doorbells: Vec<_> = self.sensors.iter().flat_map(Sensor::doorbells).collect();
         let until_ns = clock::now_ns().saturating_add(left.as_nanos() as u64);
         let slept = match self.wait {
-            _ if bells.is_empty() => {
+            _ if doorbells.is_empty() => {
                 std::thread::sleep(left.min(MAX_SLEEP_WITHOUT_DOORBELL));
                 Ok(())
             }
             Wait::Spin => {
-                spin(&bells, until_ns);
+                spin(&doorbells, until_ns);
                 Ok(())
             }
-            _ => scanhub_shm::wait_on_doorbells(&bells, until_ns),
+            _ => scanhub_shm::wait_on_doorbells(&doorbells, until_ns),
         };
         match slept {
             Ok(()) => {
@@ -225,15 +225,17 @@ impl Sensor {
         let watched = DoorbellWord::ALL
             .into_iter()
             .zip(self.ring_counts)
-            .filter_map(|(ring, rung)| Some((ring, rung?)));
-        self.doorbell.iter().flat_map(move |bell| watched.clone().map(move |(ring, rung)| (bell, ring, rung)))
+            .filter_map(|(word, count)| Some((word, count?)));
+        self.doorbell
+            .iter()
+            .flat_map(move |doorbell| watched.clone().map(move |(word, count)| (doorbell, word, count)))
     }
 }
 
-fn spin(bells: &[(&Doorbell, DoorbellWord, u32)], until_ns: u64) {
+fn spin(doorbells: &[(&Doorbell, DoorbellWord, u32)], until_ns: u64) {
     while clock::now_ns() < until_ns {
         for _ in 0..POLLS_PER_CLOCK_READ {
-            if bells.iter().any(|(bell, ring, rung)| bell.ring_count(*ring) != *rung) {
+            if doorbells.iter().any(|(doorbell, word, count)| doorbell.ring_count(*word) != *count) {
                 return;
             }
             std::hint::spin_loop();

@@ -488,7 +488,7 @@ mod tests {
     fn scan_header(scan: &str) -> Header {
         let (boot, seq) = scan.split_once(':').expect("LIFE:NUMBER");
         Header {
-            boot: boot.parse().expect("a life"),
+            boot: boot.parse().expect("a boot ID"),
             seq: seq.parse().expect("a number"),
             ..Header::default()
         }

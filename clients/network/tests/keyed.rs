@@ -195,19 +195,19 @@ fn vector_list() -> String {
     let next_zone = |sequence| {
         sealed_datagram(&key(), Head { epoch: epoch + 1, ..head(Topic::Zones, sequence) }, &zones())
     };
-    right("a later life, not announced", 60, &next_zone(0), "untimely");
+    right("a later run, not announced", 60, &next_zone(0), "untimely");
     right(
         "announced when it was recorded",
         70,
         &announcement(epoch + 1, 0, START_S + 60, [0; 3]),
         "untimely",
     );
-    right("a later life", 70, &announcement(epoch + 1, 1, START_S + 70, [0, 0, u32::MAX]), "taken");
+    right("a later run", 70, &announcement(epoch + 1, 1, START_S + 70, [0, 0, u32::MAX]), "taken");
     right("before its numbers wrap", 70, &next_zone(u32::MAX), "taken");
     right("after they did", 70, &next_zone(1), "taken");
     right("between", 70, &next_zone(0), "taken");
     right("before it began", 70, &next_zone(u32::MAX - 1), "stale");
-    right("of the life before", 70, &zone(5001), "epoch");
+    right("of the run before", 70, &zone(5001), "epoch");
     right("its announcement", 70, &announcement(epoch, 90, START_S + 70, [0; 3]), "epoch");
     let all = announcement_of(epoch + 1, 2, START_S + 70, Topic::ALL.into_iter().zip(std::iter::repeat(5)));
     right("all topics", 70, &all, "taken");

@@ -125,7 +125,7 @@ impl LineLossCounter {
     /// Adds the counters in a status of the hub with this `boot`.
     pub(crate) fn note(&mut self, boot: u64, counters: &Counters) {
         match &mut self.current_run {
-            Some((life, _, last)) if *life == boot => *last = *counters,
+            Some((run, _, last)) if *run == boot => *last = *counters,
             Some(_) => {
                 self.previous_runs = self.sums();
                 // The hub was started during the run of the verb, so all counts of the hub belong to the run of the

@@ -336,7 +336,7 @@ fn parse_encoding_line(line: &str) -> Option<Encoding> {
 /// # Errors
 ///
 /// Returns [`Kind::Input`] if the file cannot be read, or if no line of the file is a valid scan.
-pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
+pub(crate) fn contents(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
     let mut contents = Contents { form: Form::Carmen, ..Contents::default() };
     let (mut log, mut stats, mut refusal) = (LogReader::new(reader), RangeStats::default(), None);
     loop {

@@ -84,8 +84,8 @@ impl Recording {
             ));
         }
         let contents = match form {
-            Form::Carmen => carmen::survey(&path, reader)?,
-            _ => survey_stream(&path, family)?,
+            Form::Carmen => carmen::contents(&path, reader)?,
+            _ => stream_contents(&path, family)?,
         };
         if form == Form::Carmen && contents.telegrams == 0 {
             return Err(unusable(&path, "is a CARMEN log without a scan"));
@@ -366,15 +366,15 @@ impl Recording {
 /// # Errors
 ///
 /// Returns [`Kind::Input`] if the file cannot be read, or if its family is neither named nor recognized.
-fn survey_stream(path: &Path, named: Option<Family>) -> Result<Contents, Failure> {
+fn stream_contents(path: &Path, named: Option<Family>) -> Result<Contents, Failure> {
     let head = head(path, EXAMINED_BYTES).map_err(|error| unreadable(path, &error))?;
-    let survey = |family| stream::survey(path, family, &head);
-    let of_named = named.map(survey).transpose()?;
+    let contents_of = |family| stream::contents(path, family, &head);
+    let of_named = named.map(contents_of).transpose()?;
     if let Some(contents) = of_named.as_ref().filter(|contents| contents.telegrams > 0) {
         return Ok(contents.clone());
     }
     match (family_of(&head), of_named) {
-        (Some(family), _) => survey(family),
+        (Some(family), _) => contents_of(family),
         (None, Some(contents)) => Ok(contents),
         (None, None) if bytes_by_family(&head)[0].1 == 0 => Err(without_telegram(path)),
         (None, None) => Err(unrecognized(path, &head)),

@@ -156,7 +156,7 @@ impl PacketReader {
 /// # Errors
 ///
 /// Returns [`Kind::Input`](scanhub_schema::Kind::Input) if the stream cannot be read.
-pub(crate) fn survey(path: &Path, family: Family, head: &[u8]) -> Result<Contents, Failure> {
+pub(crate) fn contents(path: &Path, family: Family, head: &[u8]) -> Result<Contents, Failure> {
     let mut stream = StreamReader::new(family, head, reader(path)?);
     let mut contents = Contents { form: Form::Telegrams, family: family as u8, ..Contents::default() };
     loop {

@@ -62,17 +62,17 @@ fn equal_domains_below_two_roots_have_own_doorbells() {
     let [here, there] = [&test_domain.domain, &other].map(|domain| scanhub_shm::hub_node(domain).unwrap());
     let mine = WakeSender::new(&here, "front").unwrap();
     let doorbell = Doorbell::open(&here, "front").unwrap().expect("the hub hung it");
-    let rung = doorbell.ring_count(DoorbellWord::First);
+    let count = doorbell.ring_count(DoorbellWord::First);
     assert!(Doorbell::open(&there, "front").unwrap().is_none(), "no process created one there");
     let theirs = WakeSender::new(&there, "front").unwrap();
     theirs.wake(WakeEvent::Telegram).unwrap();
     drop(theirs);
     assert!(
-        doorbell.ring_count(DoorbellWord::First) == rung && !doorbell.is_closed(),
+        doorbell.ring_count(DoorbellWord::First) == count && !doorbell.is_closed(),
         "another hub's end is none of ours"
     );
     mine.wake(WakeEvent::Telegram).unwrap();
-    assert_ne!(doorbell.ring_count(DoorbellWord::First), rung);
+    assert_ne!(doorbell.ring_count(DoorbellWord::First), count);
     assert!(Doorbell::open(&here, "front").unwrap().is_some());
 }
 

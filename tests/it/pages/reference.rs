@@ -252,22 +252,30 @@ fn page_has_every_class_and_key() {
     }
 }
 
-/// Returns the keys in the examples and rows of `page` that no source of `tree` contains, as `CLASS.KEY`.
+/// Returns the keys in the examples and rows of `page` that the sources of `tree` do not print, as `CLASS.KEY`. A source
+/// prints a key as a field of a struct or as a word in a string. Another class may print the key.
 fn unprinted_keys(tree: &SourceTree, page: &str) -> Vec<String> {
     let is_separator = |c: char| !c.is_alphanumeric() && c != '_';
-    let mut words = BTreeSet::new();
+    let keys = printed(tree).keys;
+    let mut words: BTreeSet<&str> = keys.iter().map(|(key, _)| key.as_str()).collect();
     for (_, text) in product_files(tree) {
-        words.extend(text.split(is_separator));
+        let code = text.lines().filter(|line| !line.trim_start().starts_with("//"));
+        let fields = code.clone().filter_map(|line| line.trim_start().split_once(": "));
+        words.extend(
+            fields.map(|(name, _)| name.trim_start_matches("pub(crate) ").trim_start_matches("pub ")),
+        );
+        let strings = code.flat_map(|line| line.split('"').skip(1).step_by(2));
+        words.extend(strings.flat_map(|text| text.split(is_separator)));
     }
-    let mut keys: Vec<(String, String)> = Vec::new();
+    let mut keys_of_page: Vec<(String, String)> = Vec::new();
     for example in examples(page) {
-        keys.extend(example.keys.into_iter().map(|key| (example.class.clone(), key)));
+        keys_of_page.extend(example.keys.into_iter().map(|key| (example.class.clone(), key)));
     }
     for row in rows(page) {
         let class = row.classes.join(", ");
-        keys.extend(row.keys.into_iter().map(|key| (class.clone(), key.to_owned())));
+        keys_of_page.extend(row.keys.into_iter().map(|key| (class.clone(), key.to_owned())));
     }
-    let unprinted = keys.iter().filter(|(_, key)| !words.contains(key.as_str()));
+    let unprinted = keys_of_page.iter().filter(|(_, key)| !words.contains(key.as_str()));
     unprinted.map(|(class, key)| format!("{class}.{key}")).collect()
 }
 

@@ -27,14 +27,19 @@ fn links_have_targets(tree: &SourceTree) -> Vec<String> {
             .filter_map(|rest| rest.split_once(')'));
         for (link, _) in links.filter(|(link, _)| !link.contains("://")) {
             let (file, anchor) = link.split_once('#').unwrap_or((link, ""));
-            let target = if file.is_empty() { path.to_owned() } else { joined(path, file) };
+            let target = if file.is_empty() { Some(path.to_owned()) } else { joined(path, file) };
+            let target = target.unwrap_or_default();
             let page = tree.files(&target).find(|(found, _)| *found == target).map(|(_, text)| text);
             let has_anchor = |text: &str| {
                 prose_lines(text).filter_map(heading).any(|heading| anchor_of(heading) == anchor)
             };
             let is_right = match page {
                 Some(text) => anchor.is_empty() || has_anchor(text),
-                None => anchor.is_empty() && Path::new(env!("CARGO_MANIFEST_DIR")).join(&target).exists(),
+                None => {
+                    anchor.is_empty()
+                        && !target.is_empty()
+                        && Path::new(env!("CARGO_MANIFEST_DIR")).join(&target).exists()
+                }
             };
             if !is_right {
                 wrong.push(format!("{path}: the link {link} has no target"));
@@ -60,24 +65,27 @@ fn anchor_of(heading: &str) -> String {
     kept.map(|c| if c == ' ' { '-' } else { c.to_ascii_lowercase() }).collect()
 }
 
-/// Returns the path of `file`, which is relative to the directory of the page at `path`.
-fn joined(path: &str, file: &str) -> String {
+/// Returns the path of `file`, which is relative to the directory of the page at `path`. `None` if it is outside the
+/// project.
+fn joined(path: &str, file: &str) -> Option<String> {
     let mut parts: Vec<&str> = path.split('/').collect();
     parts.pop();
     for part in file.split('/') {
         match part {
             "." => {}
-            ".." => drop(parts.pop()),
+            ".." => drop(parts.pop()?),
             part => parts.push(part),
         }
     }
-    parts.join("/")
+    Some(parts.join("/"))
 }
 
 #[test]
 fn links_between_pages_have_targets() {
     assert_rule(links_have_targets, |tree| {
         let page = |link: &str| tree.with("docs/new.md", &format!("# New\n\nSee [this]({link}).\n"));
-        ["missing.md", "design.md#no-such-heading", "#missing", "../hub/missing.rs"].map(page).into()
+        ["missing.md", "design.md#no-such-heading", "#missing", "../hub/missing.rs", "../../README.md"]
+            .map(page)
+            .into()
     });
 }

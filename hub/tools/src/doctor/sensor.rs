@@ -249,7 +249,7 @@ fn model(scanner: &DetectedScanner, link: Option<&Link>) -> Finding {
     let text = match (&scanner.introduction, scanner.model) {
         (None, _) => {
             format!(
-                "{:.0} points a second, {:.0} per revolution",
+                "{:.0} points per second, {:.0} per revolution",
                 scanner.points_per_second,
                 scanner.points()
             )
@@ -284,7 +284,7 @@ fn model(scanner: &DetectedScanner, link: Option<&Link>) -> Finding {
 fn rotation(scanner: &DetectedScanner) -> Finding {
     const NAME: &str = "health";
     if scanner.revolutions_per_second > 0.0 {
-        return Finding::ok(NAME, format!("{:.1} revolutions a second", scanner.revolutions_per_second));
+        return Finding::ok(NAME, format!("{:.1} revolutions per second", scanner.revolutions_per_second));
     }
     let what = scanner.problem.as_deref().unwrap_or("packets arrive, but no revolution was complete");
     let (what, _) = what.split_once(": ").unwrap_or((what, ""));
