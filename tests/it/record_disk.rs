@@ -120,7 +120,7 @@ fn keeps_the_last_files_of_all_runs_when_forced() {
     let outcome = env.run(&[&words[..], &["-n", "50"]].concat());
     let text = String::from_utf8_lossy(&outcome.stdout).into_owned();
     let first = format!(
-        "records into {}; its first sample removes 1 file of an earlier run (--keep)",
+        "records into {}; the first sample in it removes 1 file of an earlier run (--keep)",
         env.path_argument("walk-0004.mcap")
     );
     assert_eq!((outcome.exit_code, text.lines().next()), (Some(0), Some(&first[..])), "{outcome}");

@@ -29,7 +29,7 @@ pub struct EchoArgs {
     /// With --csv: add the columns intensity_0 .. after the ranges
     #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
     pub intensities: bool,
-    /// Print raw bytes: telegrams, or the payload of another topic
+    /// Print raw bytes: the telegrams of topic telegram, or the payloads of any other topic
     #[arg(long, conflicts_with = "json")]
     pub raw: bool,
     /// Limits of the run.

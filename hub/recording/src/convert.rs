@@ -372,7 +372,7 @@ fn target_of(options: &ConvertOptions) -> Result<(Target, Option<&str>), Failure
             usage("--mode is for scans; marks are copied as they were recorded", "leave --mode out")
         }
         Target::MarksCsv if options.intensities => usage(
-            "--intensities is for scans; columns peak and weight of a mark are its intensities",
+            "--intensities is for scans, not for marks, which have the columns peak and weight",
             "leave --intensities out",
         ),
         Target::Recording(_) | Target::Ros2 if options.intensities => {

@@ -413,7 +413,11 @@ fn without_telegram(path: &Path) -> Failure {
         "recording {} is neither an MCAP file nor a CARMEN log, and there is no telegram in it",
         path.display()
     );
-    Failure::new(Kind::Input, message, format!("{FORMS_REMEDY}; a link to a file of noise needs family=NAME"))
+    Failure::new(
+        Kind::Input,
+        message,
+        format!("{FORMS_REMEDY}; a link to a file without a valid telegram needs family=NAME"),
+    )
 }
 
 /// Returns whether `error` means that a packed file ends early or is damaged, in contrast to an error of the disk.

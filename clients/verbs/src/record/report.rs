@@ -96,8 +96,8 @@ impl<'a> Report<'a> {
             write!(line, "records into {}", path.display())?;
             match older {
                 0 => Ok(()),
-                1 => write!(line, "; its first sample removes 1 file of an earlier run (--keep)"),
-                _ => write!(line, "; its first sample removes {older} files of earlier runs (--keep)"),
+                1 => write!(line, "; the first sample in it removes 1 file of an earlier run (--keep)"),
+                _ => write!(line, "; the first sample in it removes {older} files of earlier runs (--keep)"),
             }
         })
     }
