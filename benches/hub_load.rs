@@ -81,7 +81,7 @@ impl Load {
     }
 }
 
-/// Runs all programs of a round. Returns the resources that each program used, in each second.
+/// Runs all programs of a round. Returns the resources that each program used per second.
 fn load_of_round(comparison: &Comparison, round: usize, seconds: u64) -> Outcome<Vec<Vec<Load>>> {
     let sensors = comparison.sensors;
     let mut running = Vec::new();

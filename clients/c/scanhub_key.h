@@ -177,8 +177,7 @@ static inline enum scanhub_result scanhub_read_with(const struct scanhub_key *ke
 
 /* Maximum number of gateways. */
 #define SCANHUB_HUBS 16
-/* Maximum number of topics of the sensors of all gateways, including announcements: enough for 16 sensors that have all
- * topics. */
+/* Maximum number of topics that the gateways send, including announcements. 16 sensors may have all topics. */
 #define SCANHUB_STREAMS (16 * SCANHUB_TOPICS)
 
 /* A gateway, and the greatest epoch that was received from it. */

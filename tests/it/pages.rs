@@ -6,6 +6,7 @@ mod blocks;
 mod data_blocks;
 mod lines;
 mod names;
+mod output_page;
 mod program;
 mod reference;
 mod shell;

@@ -21,7 +21,7 @@ pub(crate) fn silence_number(silence: &Silence) -> c_int {
     }
 }
 
-/// Returns the reason. A second line has the remedy, if there is one, as in the message of an error.
+/// Returns the reason. If the silence has a remedy, it follows on a second line, as in the message of an error.
 pub(crate) fn silence_text(silence: &Silence) -> String {
     let remedy = silence.remedy();
     if remedy.is_empty() { silence.to_string() } else { format!("{silence}\n  {remedy}") }

@@ -105,9 +105,9 @@ pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Setting
     }
 }
 
-/// Creates the probe of a scanner of `family`. The port is open at `rate`, in bits per second. `rate` is `None` for a
-/// serial server, on which the user sets the baud rate. Returns `None` for a family [without a
-/// probe](Features::has_probe).
+/// Creates the identity probe of a scanner of `family`. The port is open at `rate`, in bits per second. `rate` is `None`
+/// for a serial server, on which the user sets the baud rate. Returns `None` for a family [without an identity
+/// probe](Features::has_identity_probe).
 pub fn identity_probe(family: Family, rate: Option<u32>, now: Nanos) -> Option<IdentityProbe> {
     match family {
         Family::Lms => Some(IdentityProbe::begin(rate, now)),
@@ -126,7 +126,7 @@ pub const ANY_FAMILY: Features = {
         can_stop_motor: false,
         streams_unrequested: false,
         has_whole_telegrams: true,
-        has_probe: false,
+        has_identity_probe: false,
         array_flags: 0,
         max_telegram: 0,
     };

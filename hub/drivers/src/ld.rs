@@ -29,7 +29,7 @@ pub const FEATURES: Features = Features {
     can_stop_motor: false,
     streams_unrequested: true,
     has_whole_telegrams: false,
-    has_probe: false,
+    has_identity_probe: false,
     array_flags: ArrayFlags::REVOLUTION,
     max_telegram: session::MAX_PACKETS_PER_SAMPLE * PACKET_LEN,
 };

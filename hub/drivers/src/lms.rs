@@ -152,7 +152,7 @@ pub const FEATURES: Features = Features {
     can_stop_motor: false,
     streams_unrequested: false,
     has_whole_telegrams: true,
-    has_probe: true,
+    has_identity_probe: true,
     array_flags: ArrayFlags::UPPER,
     max_telegram: MAX_TELEGRAM,
 };

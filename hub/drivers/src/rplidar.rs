@@ -34,7 +34,7 @@ pub const FEATURES: Features = Features {
     can_stop_motor: true,
     streams_unrequested: false,
     has_whole_telegrams: false,
-    has_probe: false,
+    has_identity_probe: false,
     array_flags: ArrayFlags::REVOLUTION,
     max_telegram: stream::MAX_SAMPLE_LEN,
 };

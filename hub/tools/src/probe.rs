@@ -275,7 +275,7 @@ pub(crate) fn find(
     mut on_rate: impl FnMut(u32),
 ) -> Result<FoundScanner, Failure> {
     // A family with a probe needs no search, because its probe also finds the rate.
-    let known = only.filter(|&family| features(family).has_probe);
+    let known = only.filter(|&family| features(family).has_identity_probe);
     let found = match known {
         Some(family) => search::FoundScanner { family, model: None, rate: None },
         None => driver::search(port, only, stop, &mut on_rate)?

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::blocks::{Block, blocks};
 use super::is_program;
-use super::names::{examples, rows};
+use super::output_page::{examples, rows};
 use crate::testkit::{TERM, TestEnv, output};
 
 /// Blocks of plain text. Each entry has the page, the beginning of the block, and the test that checks the block or the

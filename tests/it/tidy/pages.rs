@@ -22,31 +22,27 @@ pub(crate) fn first_program_page_matches_the_example(tree: &SourceTree) -> Vec<S
 fn links_have_targets(tree: &SourceTree) -> Vec<String> {
     let mut wrong = Vec::new();
     for (path, text) in tree.files(".md") {
-        let links = prose_lines(text)
-            .flat_map(|line| line.split("](").skip(1))
-            .filter_map(|rest| rest.split_once(')'));
-        for (link, _) in links.filter(|(link, _)| !link.contains("://")) {
-            let (file, anchor) = link.split_once('#').unwrap_or((link, ""));
-            let target = if file.is_empty() { Some(path.to_owned()) } else { joined(path, file) };
-            let target = target.unwrap_or_default();
-            let page = tree.files(&target).find(|(found, _)| *found == target).map(|(_, text)| text);
-            let has_anchor = |text: &str| {
-                prose_lines(text).filter_map(heading).any(|heading| anchor_of(heading) == anchor)
-            };
-            let is_right = match page {
-                Some(text) => anchor.is_empty() || has_anchor(text),
-                None => {
-                    anchor.is_empty()
-                        && !target.is_empty()
-                        && Path::new(env!("CARGO_MANIFEST_DIR")).join(&target).exists()
-                }
-            };
-            if !is_right {
-                wrong.push(format!("{path}: the link {link} has no target"));
-            }
-        }
+        let rests = prose_lines(text).flat_map(|line| line.split("](").skip(1));
+        let links = rests.filter_map(|rest| rest.split_once(')')).map(|(link, _)| link);
+        let lost = links.filter(|link| !link.contains("://") && !has_target(tree, path, link));
+        wrong.extend(lost.map(|link| format!("{path}: the link {link} has no target")));
     }
     wrong
+}
+
+/// Returns whether the file and the heading of `link`, which is on the page at `path`, exist.
+fn has_target(tree: &SourceTree, path: &str, link: &str) -> bool {
+    let (file, anchor) = link.split_once('#').unwrap_or((link, ""));
+    let target = if file.is_empty() { Some(path.to_owned()) } else { joined(path, file) };
+    let Some(target) = target else { return false };
+    let page = tree.files(&target).find(|(found, _)| *found == target);
+    match page {
+        _ if anchor.is_empty() => {
+            page.is_some() || Path::new(env!("CARGO_MANIFEST_DIR")).join(&target).exists()
+        }
+        Some((_, text)) => prose_lines(text).filter_map(heading).any(|heading| anchor_of(heading) == anchor),
+        None => false,
+    }
 }
 
 /// Returns the lines of a page that are outside its code blocks.

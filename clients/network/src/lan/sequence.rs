@@ -224,16 +224,9 @@ mod tests {
             row.record(sequence);
             missed
         };
-        let mut row_of_sensor = row(70);
-        assert_eq!(
-            take(&mut row_of_sensor, 70),
-            0,
-            "numbers before the first one were not sent to this receiver"
-        );
-        assert_eq!(
-            [take(&mut row_of_sensor, 74), take(&mut row_of_sensor, 72), take(&mut row_of_sensor, 75)],
-            [3, 0, 0]
-        );
+        let mut tracked = row(70);
+        assert_eq!(take(&mut tracked, 70), 0, "numbers before the first one were not sent to this receiver");
+        assert_eq!([take(&mut tracked, 74), take(&mut tracked, 72), take(&mut tracked, 75)], [3, 0, 0]);
         let mut announced = row(80);
         announced.announce(85);
         assert_eq!(take(&mut announced, 82), 2);

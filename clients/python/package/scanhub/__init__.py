@@ -215,7 +215,7 @@ def _end_wait(subscriber: _Subscriber) -> None:
 
 def _close(subscriber: _Subscriber, close: Callable[[], None]) -> None:
     """Calls `close` after the descriptor of `subscriber` is removed from the loop of the waiting task. Only the thread
-    of the loop may remove it: if another thread closes the object, that thread of the loop calls `close` later."""
+    of the loop may remove it: if another thread closes the object, the thread of the loop calls `close` later."""
     waiting = _waiting.get(subscriber)
     if waiting is not None:
         try:

@@ -27,7 +27,7 @@ pub struct Features {
     /// packets form a scan.
     pub has_whole_telegrams: bool,
     /// Whether the scanner reports its settings outside a session, to a [probe](crate::identity_probe).
-    pub has_probe: bool,
+    pub has_identity_probe: bool,
     /// Flags for the arrays that a scan contains: bits of [`scanhub_schema::ArrayFlags`].
     pub array_flags: u8,
     /// Maximum length of a telegram, or of packets that arrive together, in bytes.

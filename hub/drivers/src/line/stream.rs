@@ -218,8 +218,8 @@ impl StreamCounters {
         self.revolution_start = (self.damaged, tally.in_packets);
     }
 
-    /// Returns the problem of a stream whose next revolution is overdue: `blocked` if at most 1 % of the bytes since
-    /// the last revolution were damaged, `damaged` if at most 50 % were, and `None` if more were. The hub itself
+    /// Returns the problem of a stream whose next revolution is overdue: `blocked` if less than 2 % of the bytes
+    /// since the last revolution were damaged, `damaged` if less than 51 % were damaged, and otherwise `None`. The hub itself
     /// reports a line that damages most bytes.
     pub fn overdue_problem<P>(&self, tally: &ByteCounters, blocked: P, damaged: P) -> Option<P> {
         let (damaged_start, intact_start) = self.revolution_start;

@@ -47,7 +47,7 @@ enum Phase {
         attempt: usize,
     },
     Requesting {
-        question: usize,
+        index: usize,
     },
     /// Bytes have arrived, but none of them were a reply. The probe checks at each rate whether the bytes are a stream.
     ListeningPerRate {
@@ -155,7 +155,7 @@ impl IdentityProbe {
         match REQUESTS.get(index) {
             Some(Request::Counters) if !self.has_counters() => self.phase = Phase::Done,
             Some(&request) => {
-                self.phase = Phase::Requesting { question: index };
+                self.phase = Phase::Requesting { index };
                 self.channel.send_request(request, self.channel.now, TRIES);
             }
             None => self.phase = Phase::Done,
@@ -215,7 +215,7 @@ impl IdentityProbe {
                 self.channel.send_request(Request::Status, now, 1);
             }
             Phase::Searching { attempt } => self.search(attempt + 1, now + SETTLE_TIME),
-            Phase::Requesting { question } => self.request_next(REQUESTS[question]),
+            Phase::Requesting { index } => self.request_next(REQUESTS[index]),
             Phase::Listening { .. } | Phase::ListeningPerRate { .. } | Phase::Done => {}
         }
     }
@@ -359,7 +359,7 @@ impl Report {
 
 /// Returns the index of `request` in [`REQUESTS`].
 fn request_index(request: Request) -> Option<usize> {
-    REQUESTS.iter().position(|&question| question == request)
+    REQUESTS.iter().position(|&other| other == request)
 }
 
 /// Requests of a probe, in the order in which it sends them. The reply to the first request proves the baud rate.

@@ -55,7 +55,7 @@ enum Phase {
     /// Starts the stream of a scanner that receives requests.
     Starting(Start),
     /// Receives measured data.
-    Streaming { header: StreamHeader, silent_at: Nanos, questions: StreamQueries },
+    Streaming { header: StreamHeader, silent_at: Nanos, queries: StreamQueries },
     /// Reads a recording.
     Replaying,
     /// Has stopped the scanner. If a stream continues, the session sends up to `stops_left` more stop requests.
@@ -609,19 +609,19 @@ impl ProtocolState {
         } else {
             now
         };
-        self.phase = Phase::Streaming { header, silent_at, questions: StreamQueries::new(first_request_at) };
+        self.phase = Phase::Streaming { header, silent_at, queries: StreamQueries::new(first_request_at) };
         self.send_question(now);
     }
 
     /// Sends the next of the [`StreamQueries`] right after a scan. A reply costs the scan that it interrupts, so the
     /// session sends at most one request per scan.
     fn send_question(&mut self, now: Nanos) {
-        let Phase::Streaming { questions, .. } = &mut self.phase else { return };
+        let Phase::Streaming { queries, .. } = &mut self.phase else { return };
         if self.open_request.is_some() {
             return;
         }
-        match questions.next(&self.sensor, now) {
-            NextQuery::Send(question) => self.send_request(question, now, 1),
+        match queries.next(&self.sensor, now) {
+            NextQuery::Send(request) => self.send_request(request, now, 1),
             NextQuery::Later => {}
             NextQuery::Done => {
                 self.sensor.accept_unconfirmed();

@@ -152,18 +152,18 @@ impl StreamQueries {
         if now < self.next_at {
             return NextQuery::Later;
         }
-        let is_unanswered = |question: Request| match question {
+        let is_unanswered = |request: Request| match request {
             Request::Type => sensor.kind().is_empty(),
             Request::Status => sensor.defective.is_none() || sensor.needs_confirmation(),
             _ => sensor.mode.is_none(),
         };
-        while let Some((&question, rest)) = self.remaining.split_first() {
+        while let Some((&request, rest)) = self.remaining.split_first() {
             self.remaining = rest;
-            if is_unanswered(question) {
-                return NextQuery::Send(question);
+            if is_unanswered(request) {
+                return NextQuery::Send(request);
             }
         }
-        if STATUS_REQUESTS.iter().any(|&question| is_unanswered(question)) && self.rounds < ROUNDS - 1 {
+        if STATUS_REQUESTS.iter().any(|&request| is_unanswered(request)) && self.rounds < ROUNDS - 1 {
             self.rounds += 1;
             self.remaining = STATUS_REQUESTS;
             NextQuery::Later

@@ -321,7 +321,11 @@ mod tests {
     #[test]
     fn family_has_a_probe_exactly_if_its_features_say_so() {
         for family in Family::ALL {
-            assert_eq!(identity_probe(family, None, 0).is_some(), features(family).has_probe, "{family:?}");
+            assert_eq!(
+                identity_probe(family, None, 0).is_some(),
+                features(family).has_identity_probe,
+                "{family:?}"
+            );
         }
     }
 }
